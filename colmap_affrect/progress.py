@@ -1,6 +1,7 @@
 """Progress of long stages, a tqdm bar, plain lines or silence, and how long a whole run takes."""
 
 import logging
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -135,6 +136,21 @@ class Progress:
         """Write to a stream, at most so many lines a stage without a terminal; None is silence."""
         self._stream, self._num_plain_lines = stream, num_plain_lines
         self._forecast: Forecast | None = None
+        self._title = ""
+
+    @property
+    def file_number(self) -> int:
+        """Descriptor of the stream for another process, that of nothing where there is none."""
+        try:
+            return self._stream.fileno() if self._stream else subprocess.DEVNULL
+        except OSError:  # only in this process
+            return subprocess.DEVNULL
+
+    def titled(self, title: str) -> Self:
+        """Return the same whose names of stages begin with a title."""
+        new = copy(self)
+        new._title += title
+        return new
 
     def with_forecast(self, forecast: Forecast) -> Self:
         """Return the same that also says how long all stages take, there and in the log."""
@@ -148,7 +164,7 @@ class Progress:
         forecast = self._forecast
         if forecast:
             forecast.begin(name, total)
-        with self._display(name, total, unit) as show_more:
+        with self._display(self._title + name, total, unit) as show_more:
             if show_more is None:
                 yield lambda _: None
             else:

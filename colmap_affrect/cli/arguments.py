@@ -230,8 +230,6 @@ COMPARISON = (
     _path("--ground-truth-path", "MODEL",
         "folder of a COLMAP model with true poses of the photographs, in any frame"),
 )  # fmt: skip
-VIEWER = _flag("--viewer",
-    "also comparison.rrd for rerun (pip install 'colmap-affrect[viewer]')")  # fmt: skip
 
 EVALUATION = (
     _choice("protocol", ["evd", "svp", "imc", "pairs"],
@@ -247,7 +245,7 @@ EVALUATION = (
         "equal budget: match only the strongest N features of each image, warps included",
         type=int),
     _value("--protocol-options", "KEY=VALUE",
-        "settings of the protocol, e.g. magsac_threshold_px=1 (evd), max_num_iterations=1000 "
+        "settings of the protocol, e.g. threshold_px=1, max_num_iterations=1000 "
         "(svp, imc: what the code of the paper did)", **MANY),
 )  # fmt: skip
 

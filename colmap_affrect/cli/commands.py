@@ -159,10 +159,7 @@ def compare(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.methods import parse_methods
     from colmap_affrect.comparison.tables import summary, to_json
     from colmap_affrect.comparison.task import CompareOptions
-    from colmap_affrect.comparison.viewer import log_comparison, require_viewer
 
-    if options.viewer:
-        require_viewer()
     depth = given.depth_settings(options)
     methods = options.methods and parse_methods(options.methods, depth)
     comparison = compare(
@@ -180,9 +177,6 @@ def compare(options: argparse.Namespace) -> int:
     show(to_json(comparison) if options.json else summary(comparison))
     if not options.json:
         show(f"\npictures: {options.output_path / 'report.html'}")
-    if options.viewer:
-        path = log_comparison(comparison, options.output_path)
-        show(f"for rerun: {path}", file=sys.stderr)
     return _comparison_exit_code(comparison, options)
 
 
@@ -211,7 +205,7 @@ def evaluate(options: argparse.Namespace) -> int:
     )
     show(evaluation.to_json() if options.json else evaluation.summary())
     if not options.json:
-        show(f"\nplots, all pairs: {options.output_path}")
+        show(f"\nplot, all pairs: {options.output_path}")
     failures = {name: why for recipe in evaluation.recipes for name, why in recipe.failures.items()}
     return _exit_code(failures, options)
 
@@ -304,12 +298,7 @@ def align(options: argparse.Namespace) -> None:
 def doctor(options: argparse.Namespace) -> int:
     from colmap_affrect.doctor import diagnose
 
-    diagnosis = diagnose(
-        options.path,
-        image_path=options.image_path,
-        weights_path=options.weights,
-        progress=given.progress(options),
-    )
+    diagnosis = diagnose(options.path, image_path=options.image_path, weights_path=options.weights)
     show(diagnosis.to_json() if options.json else diagnosis.summary())
     return EXIT_FAILED if diagnosis.num_errors else EXIT_OK
 

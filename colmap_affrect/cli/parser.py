@@ -172,7 +172,7 @@ COMMANDS: dict[str, Command] = {
         "how many photographs, and which, COLMAP's SIFT and recipes register; with pictures",
         (*args.RESULTS, *args.IMAGES, *args.COMPARISON, *args.RESOURCES, *args.DEPTH,
         args.PAIR_LIST, args.PRESET, *args.MAPPER,
-        args.json("print comparison.json, no summary"), args.VIEWER)),
+        args.json("print comparison.json, no summary"))),
     "evaluate": (commands.evaluate,
         "score recipes on pairs of images with a known truth, as the paper does on its datasets",
         (*args.RESULTS, *args.EVALUATION, *args.RESOURCES, *args.DEPTH,

@@ -7,7 +7,7 @@ itself, of databases of all versions of COLMAP.
 import sqlite3
 import struct
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from colmap_affrect.colmap.tables import (
 from colmap_affrect.colmap.useless_keypoints import MAX_SIDE_PX, useless
 from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
+from colmap_affrect.images.headers import header_size
 from colmap_affrect.project.outputs import leads_outside
 
 Severity = Literal["error", "warning", "note"]
@@ -35,8 +36,6 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 Check = tuple[Severity, str, str]  # how serious a problem is, what it is, and what to do about it
 
 CHECKS: dict[str, Check] = {
-    "no-images": ("warning", "holds no images",
-        "import some, e.g. by 'colmap feature_extractor --database_path {path} --image_path X'"),
     "no-parent": ("error",
         "images whose camera does not exist, or rows of rigs and frames that belong to nothing",
         "import these images again into a new database"),
@@ -51,9 +50,6 @@ CHECKS: dict[str, Check] = {
         "cameras with focal lengths that hardly any photograph has, in px of the image and longer "
         "sides",
         "give the right ones in a table (--cameras-path), or none: --ignore-exif"),
-    "no-prior-focal": ("note", "cameras whose focal length is a guess",
-        "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
-        "--ImageReader.camera_params in COLMAP"),
     "no-frame": ("error", "images without a frame while others have one, at which mapping aborts",
         "give each of them a frame (pycolmap.Database.write_frame), or begin anew with "
         "'colmap-affrect run --database-path {path}', which adds frames to its copy"),
@@ -63,10 +59,6 @@ CHECKS: dict[str, Check] = {
         "geometric_verifier'"),
     "bad-name": ("error", "images without a name, or with one that is not UTF-8",
         "rename these files and import them again into a new database"),
-    "unsafe-name": ("warning", "image names that lead out of the image folder",
-        "rename these images; programs that write a file per image would write elsewhere"),
-    "no-keypoints": ("warning", "images without keypoints, which cannot be registered",
-        "extract their features, unless they are blank"),
     "keypoint-data": ("error",
         "images whose keypoints do not have 2, 4 or 6 columns, or are more or fewer than recorded",
         "extract these images again into a new database"),
@@ -78,23 +70,10 @@ CHECKS: dict[str, Check] = {
         "extract these images again; 'map --from-database' leaves these keypoints out"),
     "keypoints-outside": ("warning", "images with keypoints outside of them",
         "see that they were found in the images as stored: not rotated, not resized"),
-    "descriptor-data": ("error",
-        "images with another number of descriptors than of keypoints, or with several types, which "
-        "COLMAP does not match",
-        "extract all images with the same features into a new database"),
-    "no-matches": ("note", "no pairs are matched yet",
-        "match them, e.g. by 'colmap exhaustive_matcher --database_path {path}'"),
     "match-data": ("error",
         "pairs with matches of keypoints that do not exist, of images that do not exist or of one "
         "with itself, or not in 2 columns, at which COLMAP crashes",
         "delete the matches of these pairs and match them again"),
-    "no-geometry": ("warning",
-        "matched pairs without a two-view geometry, which mapping does not see",
-        "run 'colmap geometric_verifier --database_path {path}'"),
-    "undefined-geometry": ("warning",
-        "two-view geometries of undefined configuration, which mapping passes over",
-        "verify these pairs again: in a copy, delete their two-view geometries and run 'colmap "
-        "geometric_verifier'"),
     "file-missing": ("warning", "images whose file is missing or cannot be read",
         "put the files back, or give another --image-path"),
     "file-size": ("error", "images of another size than their camera",
@@ -123,7 +102,6 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 length is a prior, and the number of parameters that follow, float64."""
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
-UNDEFINED = 0  # configuration of a two-view geometry that COLMAP 4.2 passes over
 
 
 def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
@@ -159,31 +137,20 @@ def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems
         _check_links(connection, found)
         _check_matrices(connection, found)
         _check_cameras_of_pairs(connection, found)
-        if tables.names:
-            _check_images(tables, found)
-            _check_keypoints(connection, tables, found)
-        else:
-            found["no-images"] = []
-        _check_descriptors(tables, found)
-        if tables.matches or tables.geometries:
-            _check_pairs(connection, tables, found)
-        elif tables.names:
-            found["no-matches"] = []
+        _check_images(tables, found)
+        _check_keypoints(connection, tables, found)
+        _check_pairs(connection, tables, found)
     except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
         raise DatabaseError(f"{path}: damaged ({error})") from error
     return tables, dict(found)
 
 
-def check_image_files(
-    tables: Tables, image_path: Path, sizes: Mapping[str, tuple[int, int] | None]
-) -> Problems:
-    """Compare a database with the (width, height) of its images' files, None if unreadable."""
+def check_image_files(tables: Tables, image_path: Path) -> Problems:
+    """Compare a database with the (width, height) of its images' files."""
     found: Problems = defaultdict(list)
     for image_id, name in tables.names.items():
-        if leads_outside(name):
-            continue
         camera = tables.cameras.get(tables.camera_ids[image_id])
-        size = sizes.get(name) if (image_path / name).is_file() else None
+        size = None if leads_outside(name) else header_size(image_path / name)
         if size is None:
             found["file-missing"].append(name)
         elif camera and size != (camera.width, camera.height):
@@ -273,18 +240,12 @@ def _check_images(tables: Tables, found: Problems) -> None:
             found["no-parent"].append(name)
         if tables.num_frames and image_id not in tables.frame_images:
             found["no-frame"].append(name)
-        if leads_outside(name):
-            found["unsafe-name"].append(name)
-    for camera_id, camera in tables.cameras.items():
-        if not camera.has_prior_focal:
-            found["no-prior-focal"].append(f"camera {camera_id} ({camera.width} x {camera.height})")
 
 
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     query = "SELECT data FROM keypoints WHERE image_id = ?"
     for image_id, name in tables.names.items():
         if image_id not in tables.keypoints:
-            found["no-keypoints"].append(name)
             continue
         count, width = tables.keypoints[image_id]
         if count and width not in KEYPOINT_COLUMNS:
@@ -294,9 +255,7 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
         keypoints = _array(blob, count, width, np.dtype("<f4"))
         if keypoints is None:
             found["keypoint-data"].append(name)
-        elif not count:
-            found["no-keypoints"].append(name)
-        else:
+        elif count:
             camera = tables.cameras.get(tables.camera_ids[image_id])
             for kind in useless(keypoints, (camera.width, camera.height) if camera else None):
                 found[kind].append(name)
@@ -308,16 +267,6 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
     if not isinstance(blob, bytes) or len(blob) != rows * columns * dtype.itemsize:
         return None
     return np.frombuffer(blob, dtype).reshape(rows, columns)
-
-
-def _check_descriptors(tables: Tables, found: Problems) -> None:
-    for image_id, (_, rows) in tables.descriptors.items():
-        count, _ = tables.keypoints.get(image_id, (0, 0))
-        if image_id in tables.names and rows != count:
-            found["descriptor-data"].append(f"{tables.names[image_id]} has {rows} of {count}")
-    types = sorted({kind for kind, rows in tables.descriptors.values() if rows})
-    if len(types) > 1:
-        found["descriptor-data"] = [f"type {kind}" for kind in types]
 
 
 def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
@@ -333,9 +282,3 @@ def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems
                 counts = [tables.keypoints.get(image, (0, 0))[0] for image in images]
                 if (indices.max(axis=0) >= counts).any():
                     found["match-data"].append(label)
-    for pair_id, count in tables.matches.items():
-        if count and pair_id not in tables.geometries:
-            found["no-geometry"].append(tables.pair_label(pair_id))
-    for pair_id, (count, config) in tables.geometries.items():
-        if count and config == UNDEFINED:
-            found["undefined-geometry"].append(tables.pair_label(pair_id))

@@ -54,7 +54,6 @@ class Camera:
 
     width: int
     height: int
-    has_prior_focal: bool
     model: int
     params: Any
 
@@ -69,7 +68,6 @@ class Tables:
     frame_images: set[int]  # ids of the images that are in a frame
     num_frames: int  # number of frames
     keypoints: dict[int, tuple[int, int]]  # rows and columns by image id
-    descriptors: dict[int, tuple[int, int]]  # type and rows by image id
     matches: dict[int, int]  # number of raw matches by pair id
     geometries: dict[int, tuple[int, int]]  # number of inliers and configuration by pair id
 
@@ -106,11 +104,11 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
     """Read all tables but the data of keypoints, descriptors and matches."""
     rows = partial(rows_of, connection)
     images = list(rows("image_id name camera_id", "images"))
-    cameras = rows("camera_id width height prior_focal_length model params", "cameras")
+    cameras = rows("camera_id width height model params", "cameras")
     return Tables(
         cameras={
-            int(key): Camera(int(width), int(height), bool(prior), int(model), params)
-            for key, width, height, prior, model, params in cameras
+            int(key): Camera(int(width), int(height), int(model), params)
+            for key, width, height, model, params in cameras
         },
         names={int(key): str(name) for key, name, _ in images},
         camera_ids={int(key): int(camera_id) for key, _, camera_id in images},
@@ -121,7 +119,6 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
         },
         num_frames=sum(1 for _ in rows("frame_id", "frames")),
         keypoints=_numbers(rows("image_id rows cols", "keypoints")),
-        descriptors=_numbers(rows("image_id type rows", "descriptors")),
         matches={int(key): int(count) for key, count in rows("pair_id rows", "matches")},
         geometries=_numbers(rows("pair_id rows config", "two_view_geometries")),
     )

@@ -10,35 +10,29 @@ import pickle
 import signal
 from base64 import b64encode
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
-from colmap_affrect.colmap.cameras import read_camera_records
-from colmap_affrect.colmap.database import image_ids
-from colmap_affrect.colmap.database_copy import copy_without_features
-from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.colmap.poses import Poses, read_poses
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
 from colmap_affrect.comparison.methods import Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.pose_scores import disagreeing_images, pose_scores
-from colmap_affrect.comparison.results import Comparison, MethodResult
+from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.tables import to_json
-from colmap_affrect.comparison.task import CompareOptions, Layout, MethodTask
+from colmap_affrect.comparison.task import METHODS, CompareOptions, MethodTask
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
 from colmap_affrect.features.weights import install_hint, resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import Options
 from colmap_affrect.pairs.base import Pair, PairOptions
-from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.parallel.subprocesses import child
-from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import content_of
-from colmap_affrect.project.outputs import new_results, remove_own
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
@@ -63,7 +57,7 @@ def compare(
     """
     options = options or CompareOptions()
     Workspace(output_path).require_own(image_path)
-    plan = _Plan.checked(image_path, Layout(output_path), options)
+    plan = _Plan.checked(image_path, output_path, options)
     tasks = [
         MethodTask(method, output_path.resolve(), image_path.resolve(), plan.options)
         for method in plan.methods
@@ -72,14 +66,13 @@ def compare(
     keys = {key for recipe in todo if recipe for key in recipe.weights}
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
     with Workspace(output_path).locked():
-        unreadable = _share(plan, overwrite=overwrite)
+        _require_same_inputs(plan, overwrite=overwrite)
         for task in tasks:
             task.begin(overwrite=overwrite)
         results = []
         for number, task in enumerate(tasks, 1):
-            title = f"method {number} of {len(tasks)}, {task.method.label}"
-            result = task.finished() or _run(task, progress, title)
-            results.append(replace(result, failures={**unreadable, **result.failures}))
+            title = f"method {number} of {len(tasks)}, {task.method.label}: "
+            results.append(task.finished() or _run(task, progress, title))
         comparison = Comparison(
             image_names=tuple(plan.names),
             image_path=str(image_path.resolve()),
@@ -99,7 +92,7 @@ class _Plan:
     """A comparison whose options have been checked."""
 
     image_path: Path
-    layout: Layout
+    output_path: Path
     options: CompareOptions
     methods: tuple[Method, ...]
     names: list[str]
@@ -108,7 +101,7 @@ class _Plan:
     not_compared: str  # learned methods without their weights, and how these are had
 
     @classmethod
-    def checked(cls, image_path: Path, layout: Layout, options: CompareOptions) -> Self:
+    def checked(cls, image_path: Path, output_path: Path, options: CompareOptions) -> Self:
         """Refuse what cannot work before anything is written."""
         lacking = without_weights(options.resources.weights_path) if not options.methods else {}
         learned = [name for name in LEARNED_METHODS if name not in lacking]
@@ -118,7 +111,6 @@ class _Plan:
         options.resources.require_device()
         for seed in options.seeds:
             options.verification.changed(random_seed=seed)
-        mapping = MAPPERS.make(options.mapping).options
         inputs = options.inputs(image_path)
         inputs.check()
         names = inputs.names()
@@ -128,34 +120,32 @@ class _Plan:
                 "needs at least two images"
             )
         inputs.check_names(names)
-        pairs = exhaustive_pairs(names)
         if options.pairs != PairOptions(match_list_path=options.pairs.match_list_path):
             raise OptionError("pairs: a comparison matches all pairs, or those of match_list_path")
-        if options.pairs.match_list_path:
-            pairs = list(read_pairs(Path(options.pairs.match_list_path), names))
+        pairs = list(options.pairs_of(names))
         truth = _ground_truth(options.ground_truth_path, names)
-        options = replace(options, mapping=mapping)
+        options = replace(options, mapping=MAPPERS.make(options.mapping).options)
         files = {file.file_name: file for group in lacking.values() for file in group}
         hint = install_hint(files.values()).removesuffix(", or ")
         absent = f"{', '.join(lacking)}: {hint}" if lacking else ""
-        return cls(image_path, layout, options, methods, names, pairs, truth, absent)
+        return cls(image_path, output_path, options, methods, names, pairs, truth, absent)
 
     @cached_property
     def inputs(self) -> dict[str, Any]:
         """What all methods begin with, for the record; digests stand for the files."""
-        options = self.options
-        given = options.inputs(self.image_path)
+        given = self.options.inputs(self.image_path)
         files = {name: given.photographs.files(name) for name in self.names}
         files[""] = given.camera_files
         digests = {name: content_of(paths).digest[:NUM_DIGITS] for name, paths in files.items()}
+        masks = self.options.masks.to_mapping()
         return {
             "photographs": digests,
             "images": _fingerprint(self.names),
             "pairs": _fingerprint([f"{first}\n{second}" for first, second in self.pairs]),
-            "camera": options.cameras.to_mapping(),
-            "masks": {key: bool(path) for key, path in options.masks.to_mapping().items()},
-            "verification": _without_seed(options.verification),
-            "mapping": _without_seed(options.mapping),
+            "camera": self.options.cameras.to_mapping(),
+            "masks": {key: bool(path) for key, path in masks.items()},
+            "verification": _without_seed(self.options.verification),
+            "mapping": _without_seed(self.options.mapping),
         }
 
     def settings(self) -> dict[str, Any]:
@@ -163,14 +153,12 @@ class _Plan:
         keys = ("image_list_path", "from_database", "ground_truth_path")
         paths: dict[str, Path | None] = {key: getattr(self.options, key) for key in keys}
         return {
-            "camera": self.inputs["camera"],
+            **{key: self.inputs[key] for key in ("camera", "verification", "mapping")},
             "masks": self.options.masks.to_mapping(),
             **{key: str(path.resolve()) if path else "" for key, path in paths.items()},
             "match_list_path": self.options.pairs.match_list_path,
             "not_compared": self.not_compared,
             "preset": self.options.mapping.preset_name,
-            "verification": self.inputs["verification"],
-            "mapping": self.inputs["mapping"],
         }
 
 
@@ -197,118 +185,69 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
     return truth
 
 
-def _share(plan: _Plan, *, overwrite: bool) -> dict[str, str]:
-    """Make the database and the lists that all methods begin with, unless they are there.
-
-    Returns the images that COLMAP does not take, with the reason. Raises StaleStoreError when the
-    lists were made for something else.
-    """
-    layout = plan.layout
-    if layout.inputs.exists():
-        known = json.loads(layout.inputs.read_text(encoding="utf-8"))
+def _require_same_inputs(plan: _Plan, *, overwrite: bool) -> None:
+    """Refuse methods that were run there on something else; ``overwrite`` discards them."""
+    methods = plan.output_path / METHODS
+    record = methods / "inputs.json"
+    if record.exists():
+        known = json.loads(record.read_text(encoding="utf-8"))
         if difference := first_difference(known, plan.inputs):
             if not overwrite:
                 raise StaleStoreError(
-                    f"{layout.path}: methods were compared there with {difference}; use "
+                    f"{plan.output_path}: methods were compared there with {difference}; use "
                     "--overwrite to discard these results, or another --output-path"
                 )
-            remove_own([layout.methods, layout.shared])
-    elif layout.shared.exists() or layout.methods.exists():
+            remove_own([methods])
+    elif methods.exists():
         raise StaleStoreError(
-            f"{layout.path}: has a folder named shared or methods that was not made here; it is "
-            "left as it is, use another --output-path"
+            f"{methods}: was not made here, or by an older version; it is left as it is, use "
+            "another --output-path"
         )
-    if not layout.shared.exists():
-        _make_shared(plan)
-    reason = f"COLMAP cannot read it, or does not take it (camera mode {plan.options.cameras.mode})"
-    return dict.fromkeys(sorted(set(plan.names) - set(layout.image_names())), reason)
-
-
-def _make_shared(plan: _Plan) -> None:
-    """Make the shared folder, which appears as a whole."""
-    with new_results(plan.layout.shared) as (folder,):
-        new, options = Layout(folder.parent), plan.options
-        folder.mkdir()
-        initial, known = None, None
-        if options.from_database:
-            copy_without_features(options.from_database, new.database)
-            known = read_camera_records(options.from_database.with_name(new.cameras.name))
-        else:
-            import_images(new.database, plan.image_path, plan.names, options.cameras)
-            initial = options.inputs(plan.image_path).initial_cameras
-        record_cameras(new.database, new.cameras, initial, known)
-        taken = image_ids(new.database)
-        names = [name for name in plan.names if name in taken]
-        pairs = [pair for pair in plan.pairs if set(pair) <= taken.keys()]
-        if not pairs:
-            raise ComparisonError(
-                f"{plan.image_path}: COLMAP can use {len(names)} of the {len(plan.names)} images, "
-                "and no pair that is to be matched; a comparison needs at least two images"
-            )
-        replace_text(new.images, "".join(f"{name}\n" for name in names))
-        write_pairs(new.pairs, pairs)
-        replace_text(new.inputs, json.dumps(plan.inputs, indent=1))
+    methods.mkdir(exist_ok=True)
+    replace_text(record, json.dumps(plan.inputs, indent=1))
 
 
 def _run(task: MethodTask, progress: Progress, title: str) -> MethodResult:
     """Run a method in a process of its own; what it prints goes to ``run.log`` in its folder."""
-    log_path, failed = Workspace(task.folder).log, ""
+    log_path, argument = Workspace(task.folder).log, b64encode(pickle.dumps((task, title))).decode()
     with (
         log_path.open("a", encoding="utf-8") as log,
-        child(worker.__name__, b64encode(pickle.dumps(task)).decode(), stderr=log) as process,
-        ExitStack() as stage,
+        child(worker.__name__, argument, stdout=progress.file_number, stderr=log) as process,
     ):
-        advance: Advance = stage.enter_context(SILENT.stage("", 0, ""))
-        for line in process.stdout or ():
-            event = json.loads(line)
-            if "stage" in event:
-                stage.close()
-                name, total = f"{title}: {event['stage']}", event["total"]
-                advance = stage.enter_context(progress.stage(name, total, event["unit"]))
-            elif "advance" in event:
-                advance(event["advance"])
-            else:
-                failed = event["failed"]
+        process.wait()
+    failed = ""
     if code := process.returncode:
         ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
         memory = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
-        failed = failed or f"its process ended {ending}{memory}; {log_path} may say why"
-    result = None if failed else task.finished()
-    return result or MethodResult(
-        task.method.label, summary=task.method.summary, folder=task.shown_folder, failed=failed
-    )
+        failed = f"its process ended {ending}{memory}; {log_path} may say why"
+    elif task.failure.exists():
+        failed = task.failure.read_text(encoding="utf-8")
+    return task.finished() or replace(task.begun(), seeds=(), failed=failed)
 
 
 def _measured(results: Sequence[MethodResult], plan: _Plan) -> tuple[MethodResult, ...]:
     """Add what needs the models: scores against ground truth, and where models contradict."""
-    folder, truth, measured = plan.layout.path, plan.truth, []
-    all_poses = {
+    folder, truth = plan.output_path, plan.truth
+    poses = {
         result.name: [
             read_poses(folder / seed.model_path) if seed.model_path else {} for seed in result.seeds
         ]
         for result in results
     }
-    for result in results:
-        poses, seeds = all_poses[result.name], result.seeds
-        first, *later = poses or [{}]
-        if truth is not None:
-            seeds = tuple(
-                replace(seed, scores=pose_scores(found, truth, plan.names))
-                for seed, found in zip(seeds, poses, strict=True)
-            )
-        unstable = {image for other in later for image in disagreeing_images(first, other)}
-        others = {
-            name: disagreeing_images(first, other[0])
-            for name, other in all_poses.items()
-            if other and name != result.name
-        }
-        contradicted = {other: images for other, images in others.items() if images}
-        measured.append(
-            replace(
-                result,
-                seeds=seeds,
-                unstable_names=tuple(sorted(unstable)),
-                disagreements=contradicted,
-            )
+    firsts = {name: of_seeds[0] for name, of_seeds in poses.items() if of_seeds}
+
+    def with_scores(seed: SeedResult, of_seed: Poses) -> SeedResult:
+        return replace(seed, scores=pose_scores(of_seed, truth, plan.names)) if truth else seed
+
+    def measured(result: MethodResult) -> MethodResult:
+        first = firsts.get(result.name, {})
+        others = {n: disagreeing_images(first, p) for n, p in firsts.items() if n != result.name}
+        unstable = {name for p in poses[result.name][1:] for name in disagreeing_images(first, p)}
+        return replace(
+            result,
+            seeds=tuple(map(with_scores, result.seeds, poses[result.name])),
+            unstable_names=tuple(sorted(unstable)),
+            disagreements={name: images for name, images in others.items() if images},
         )
-    return tuple(measured)
+
+    return tuple(map(measured, results))

@@ -33,7 +33,7 @@ class Method:
         return self.recipe.summary if self.recipe else SIFT_SUMMARIES[self.label]
 
     @property
-    def climbs(self) -> bool:
+    def escalates(self) -> bool:
         """Whether pairs that fail verification are matched again."""
         return bool(self.recipe and self.recipe.extraction.escalation)
 

@@ -6,16 +6,22 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, Self
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BeforeValidator, PlainSerializer, computed_field
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Poses, pose_errors, relative_pose
+from colmap_affrect.pairs.base import Pair
 
-PairErrors = Mapping[tuple[str, str], tuple[float, float]]
+PairErrors = Annotated[
+    Mapping[Pair, tuple[float, float]],
+    BeforeValidator(lambda rows: {(row[0], row[1]): tuple(row[2:]) for row in rows}),
+    PlainSerializer(lambda errors: [[*pair, *both] for pair, both in errors.items()]),
+]
 """By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
-and of the direction of the translation."""
+and of the direction of the translation; in JSON rows of both."""
 
 AUC_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
 MAX_CORRECT_ERROR_DEG = 5.0
@@ -32,43 +38,22 @@ class PoseScores:
     correct_names: tuple[str, ...]  # images registered correctly (``MAX_CORRECT_ERROR_DEG``)
     pair_errors_deg: PairErrors  # of every pair of registered images that have ground truth
     num_pairs: int  # of all images with truth; those without errors count as failures
-    auc: Mapping[float, float]  # area under the curve up to a threshold, 0 to 1
+    auc: Mapping[str, float]  # area under the curve, 0 to 1, by the threshold in degrees
     # of camera centres after similarity alignment, in units of the ground truth; None with fewer
     # than three images, or all on one line
     median_position_error: float | None
 
+    @computed_field  # type: ignore[prop-decorator]  # of a property, as pydantic documents it
     @property
     def median_rotation_error_deg(self) -> float | None:
         """Of the pairs of registered images; None without pairs."""
         return median(r for r, _ in self.pair_errors_deg.values()) if self.pair_errors_deg else None
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def median_direction_error_deg(self) -> float | None:
         """Of the translations of the pairs of registered images; None without pairs."""
         return median(d for _, d in self.pair_errors_deg.values()) if self.pair_errors_deg else None
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {
-            "correct_names": list(self.correct_names),
-            "num_pairs": self.num_pairs,
-            "auc": {f"{limit:g}": value for limit, value in self.auc.items()},
-            "median_rotation_error_deg": self.median_rotation_error_deg,
-            "median_direction_error_deg": self.median_direction_error_deg,
-            "median_position_error": self.median_position_error,
-            "pair_errors_deg": [[*pair, *errors] for pair, errors in self.pair_errors_deg.items()],
-        }
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build from :meth:`to_mapping`."""
-        return cls(
-            tuple(values["correct_names"]),
-            {(a, b): (rot, direction) for a, b, rot, direction in values["pair_errors_deg"]},
-            values["num_pairs"],
-            {float(limit): value for limit, value in values["auc"].items()},
-            values["median_position_error"],
-        )
 
 
 def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
@@ -142,7 +127,10 @@ def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> P
         correct_names=correct_images(errors),
         pair_errors_deg=errors,
         num_pairs=num_pairs,
-        auc={limit: area_under_curve(largest, num_pairs, limit) for limit in AUC_THRESHOLDS_DEG},
+        auc={
+            f"{limit:g}": area_under_curve(largest, num_pairs, limit)
+            for limit in AUC_THRESHOLDS_DEG
+        },
         median_position_error=float(np.median(distances)) if distances else None,
     )
 

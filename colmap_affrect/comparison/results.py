@@ -1,4 +1,4 @@
-"""What a comparison found, as frozen data.
+"""What a comparison found, as frozen data; pydantic writes and reads it.
 
 Everything derived (means, who registers what alone) is computed here from the results of single
 seeds, so that terminal, page and JSON cannot disagree.
@@ -6,13 +6,19 @@ seeds, so that terminal, page and JSON cannot disagree.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, Field, PlainSerializer, TypeAdapter
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PlainSerializer,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 
 from colmap_affrect.comparison.pose_scores import PoseScores
 from colmap_affrect.pairs.base import Pair
@@ -23,12 +29,6 @@ PairCounts = Annotated[
     PlainSerializer(lambda counts: [[*pair, count] for pair, count in sorted(counts.items())]),
 ]
 """Numbers by pair; in JSON rows of two names and a number."""
-
-Scores = Annotated[
-    PoseScores | None,
-    BeforeValidator(lambda values: PoseScores.from_mapping(values) if values else None),
-    PlainSerializer(lambda scores: scores.to_mapping() if scores else None),
-]
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,12 @@ class SeedResult:
     # image names of each model, the largest model first
     model_names: Annotated[tuple[tuple[str, ...], ...], Field(alias="models")]
     model_path: str  # the largest model, relative to the folder of the comparison; empty if none
-    num_points3D: Annotated[
-        int, Field(alias="points3D")
-    ]  # of the largest model, as all that follow
+    # of the largest model, as all that follow
+    num_points3D: Annotated[int, Field(alias="points3D")]
     mean_track_length: float  # images per point
-    mean_observations: float  # observed points per registered image
     mean_reprojection_error_px: float
-    num_observations: Mapping[str, int]  # observed points of each image
     pair_inliers: PairCounts  # of the verified pairs, whatever the model
-    scores: Scores  # against ground truth; None where there is none
+    scores: PoseScores | None  # against ground truth; None where there is none
     wall_s: Mapping[str, float]  # seconds of ``verify`` and ``map``
     doubtful: Mapping[str, str] = field(default_factory=dict)  # images that cannot be trusted: why
     doubts: tuple[str, ...] = ()  # reasons to doubt the model as a whole
@@ -75,6 +72,11 @@ class SeedResult:
     def registered_names(self) -> tuple[str, ...]:
         """Images of the largest model."""
         return self.model_names[0] if self.model_names else ()
+
+    @property
+    def mean_observations(self) -> float:
+        """Observed points per registered image."""
+        return self.num_points3D * self.mean_track_length / max(1, len(self.registered_names))
 
     @property
     def correct_names(self) -> tuple[str, ...]:
@@ -87,10 +89,10 @@ class SeedResult:
         doubted = self.registered_names if self.doubts else ()
         return {**dict.fromkeys(doubted, ", ".join(self.doubts)), **self.doubtful}
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON, ``MEASURES`` first."""
+    @model_serializer(mode="wrap")
+    def _with_measures(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         measures = {key: measure(self) for key, measure in MEASURES.items()}
-        return {"seed": self.seed, **measures, **_plain(self)}
+        return {"seed": self.seed, **measures, **plain(self)}
 
 
 MEASURES: dict[str, Callable[[SeedResult], float]] = {
@@ -124,13 +126,11 @@ class MethodResult:
     # by another method, images that both register with the first seed in contradicting poses
     disagreements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     num_keypoints: Mapping[str, int] = field(default_factory=dict)  # of images that could be read
-    raw_matches: PairCounts = field(default_factory=dict)  # before verification
     summary: str = ""
     failures: Mapping[str, str] = field(default_factory=dict)  # images that cannot be used: why
     options: Mapping[str, Any] = field(default_factory=dict)
     folder: str = ""  # of its results, relative to the folder of the comparison
-    # in the order asked for; empty if the method failed
-    seeds: tuple[Annotated[SeedResult, PlainSerializer(SeedResult.to_mapping)], ...] = ()
+    seeds: tuple[SeedResult, ...] = ()  # in the order asked for; empty if the method failed
 
     @property
     def registered(self) -> Span:
@@ -153,12 +153,12 @@ class MethodResult:
         """The first seed that has a model."""
         return next((seed for seed in self.seeds if seed.model_path), None)
 
-    @property
+    @cached_property
     def usually_registered(self) -> frozenset[str]:
         """Images that more than half of the seeds register."""
         return in_most([seed.registered_names for seed in self.seeds])
 
-    @property
+    @cached_property
     def usually_correct(self) -> frozenset[str]:
         """Images that more than half of the seeds register correctly (without truth: register)."""
         return in_most([seed.correct_names for seed in self.seeds])
@@ -187,34 +187,23 @@ class MethodResult:
         seeds = [s for s in self.seeds if s.model_names or measure not in OF_MODEL]
         return Span.of(MEASURES[measure](seed) for seed in seeds) if seeds else None
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON, spans first; without seeds where the method failed."""
-        values = _plain(self)
+    @model_serializer(mode="wrap")
+    def _with_spans(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = plain(self)
         if self.failed:
-            return {key: values[key] for key in ("failed", *KEPT_OF_FAILED)}
+            return {key: values[key] for key in KEPT_OF_FAILED}
+        del values["failed"]
         return {
-            **{key: asdict(span) if (span := self.span(key)) else None for key in MEASURES},
-            "correct": asdict(self.correct) if self.correct else None,
-            "registered_names": {str(s.seed): list(s.registered_names) for s in self.seeds},
-            "wall_s": self.stage_seconds,
+            **{key: self.span(key) for key in MEASURES},
+            "correct": self.correct,
+            "registered_names": {str(s.seed): s.registered_names for s in self.seeds},
             "total_s": self.total_s,
-            **{key: values[key] for key in values if key not in {"name", "failed", "wall_s"}},
+            **values,
+            "wall_s": self.stage_seconds,
         }
 
-    @classmethod
-    def from_mapping(cls, name: str, values: Mapping[str, Any]) -> Self:
-        """Build from :meth:`to_mapping`."""
-        of_seeds = {stage for seed in values["seeds"] for stage in seed["wall_s"]}
-        wall_s = {stage: s for stage, s in values["wall_s"].items() if stage not in of_seeds}
-        return TypeAdapter(cls).validate_python({**values, "name": name, "wall_s": wall_s})
 
-
-KEPT_OF_FAILED = ("summary", "failures", "options", "folder")
-
-
-def _plain(result: SeedResult | MethodResult) -> dict[str, Any]:
-    values: dict[str, Any] = TypeAdapter(type(result)).dump_python(result, by_alias=True)
-    return values
+KEPT_OF_FAILED = ("failed", "name", "summary", "failures", "options", "folder")
 
 
 def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
@@ -254,7 +243,7 @@ class Comparison:
                 by_image[name].append(method.name)
         return {name: methods[0] for name, methods in by_image.items() if len(methods) == 1}
 
-    @property
+    @cached_property
     def registered_by_none(self) -> tuple[str, ...]:
         """Images that no method usually registers."""
         registered = {name for method in self.finished for name in method.usually_registered}
@@ -265,20 +254,19 @@ class Comparison:
         """Whether models were measured against ground truth."""
         return any(method.correct for method in self.finished)
 
-    @property
+    @cached_property
     def names_with_truth(self) -> frozenset[str]:
         """Images whose poses were measured against ground truth, by any method."""
         scores = [seed.scores for method in self.finished for seed in method.seeds if seed.scores]
         return frozenset(name for each in scores for pair in each.pair_errors_deg for name in pair)
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+    @model_serializer(mode="wrap")
+    def _with_totals(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = plain(self)
         return {
             "images_total": len(self.image_names),
             "only_registered_by": self.only_registered_by,
-            "registered_by_none": list(self.registered_by_none),
-            "methods": {method.name: method.to_mapping() for method in self.methods},
-            **{k: getattr(self, k) for k in ("seeds", "image_path", "image_names", "num_pairs")},
-            "settings": dict(self.settings),
-            "versions": dict(self.versions),
+            "registered_by_none": self.registered_by_none,
+            "methods": {method.pop("name"): method for method in values.pop("methods")},
+            **values,
         }

@@ -6,6 +6,7 @@ from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database, require_database_space
+from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.native_options import differences
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.pairs.base import Pair
@@ -70,34 +71,32 @@ def extract_sift(
 
 
 def match_sift(database_path: Path, pairs: Sequence[Pair]) -> None:
-    """Match pairs of images by COLMAP's defaults, without verification; matched ones are kept.
+    """Match pairs of images by COLMAP's defaults, without verification.
 
-    COLMAP's lists of pairs cannot hold names with spaces: while it matches, the images have other
-    ones. If the process is killed then, :func:`rename_images` brings the names back.
+    COLMAP's lists of pairs cannot hold names with spaces: it matches in a copy, in which the images
+    have other ones.
     """
     ids = image_ids(database_path)
-    temporary = {image_id: TEMPORARY_NAME.format(image_id) for image_id in ids.values()}
-    lines = [f"{temporary[ids[first]]} {temporary[ids[second]]}\n" for first, second in pairs]
-    require_database_space(database_path, len(pairs) * ROWS_PER_PAIR)
     names = {image_id: name for name, image_id in ids.items()}
+    lines = [f"{TEMPORARY_NAME.format(ids[a])} {TEMPORARY_NAME.format(ids[b])}\n" for a, b in pairs]
+    require_database_space(database_path, len(pairs) * ROWS_PER_PAIR)
     with temporary_folder(database_path.parent) as folder:
-        list_path = folder / "pairs.txt"
+        list_path, copy = folder / "pairs.txt", folder / database_path.name
         replace_text(list_path, "".join(lines))
-        try:
-            rename_images(database_path, temporary)
-            pycolmap.match_image_pairs(
-                database_path,
-                matching_options=pycolmap.FeatureMatchingOptions(skip_geometric_verification=True),
-                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=list_path),
-            )
-        finally:
-            rename_images(database_path, names)
+        copy_database(database_path, copy)
+        _rename_images(copy, {image_id: TEMPORARY_NAME.format(image_id) for image_id in names})
+        pycolmap.match_image_pairs(
+            copy,
+            matching_options=pycolmap.FeatureMatchingOptions(skip_geometric_verification=True),
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=list_path),
+        )
+        _rename_images(copy, names)
+        copy.replace(database_path)
 
 
-def rename_images(database_path: Path, names: Mapping[int, str]) -> None:
+def _rename_images(database_path: Path, names: Mapping[int, str]) -> None:
     """Give the images of a database these names by id."""
     with open_database(database_path) as database:
         for image in database.read_all_images():
-            if image.name != names[image.image_id]:
-                image.name = names[image.image_id]
-                database.update_image(image)
+            image.name = names[image.image_id]
+            database.update_image(image)

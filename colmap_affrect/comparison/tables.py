@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from statistics import fmean
-from typing import Any
+
+from pydantic import TypeAdapter
 
 from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, PoseScores
-from colmap_affrect.comparison.results import Comparison, MethodResult, Span
+from colmap_affrect.comparison.results import MEASURES, OF_MODEL, Comparison, MethodResult, Span
 from colmap_affrect.comparison.verdict import ranked, verdict
 from colmap_affrect.project.record import STAGES
 
@@ -66,8 +67,9 @@ class Row:
 
 
 Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
-Figure = tuple[str, str, int, Better, Callable[[MethodResult], Span | None]]
-"""Key and title of a line, decimals, what is best, and the value of a method."""
+Values = Callable[[MethodResult], Iterable[float | None]]  # of one method, None for no number
+Figure = tuple[str, str, int, Better, Values]
+"""Key and title of a line, decimals, what is best, and its values, of which it shows the span."""
 
 
 def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]:
@@ -81,68 +83,59 @@ def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]
 
 def _figures(comparison: Comparison, methods: Sequence[MethodResult]) -> list[Figure]:
     given = len(comparison.image_names)
+    stages = {stage for method in methods for stage in method.stage_seconds}
 
-    def measured(key: str, title: str, digits: int = 1, better: Better = None) -> Figure:
-        return key, title, digits, better, lambda method: method.span(key)
+    def measured(key: str) -> Values:
+        return lambda method: [
+            MEASURES[key](s) for s in method.seeds if s.model_names or key not in OF_MODEL
+        ]
 
-    def scored(
-        key: str, title: str, digits: int, better: Better, value: Callable[[PoseScores], Any]
-    ) -> Figure:
-        def span(method: MethodResult) -> Span | None:
-            values = [value(seed.scores) for seed in method.seeds if seed.scores is not None]
-            return _span(number for number in values if number is not None)
-
-        return key, title, digits, better, span
+    def scored(value: Callable[[PoseScores], float | None]) -> Values:
+        return lambda method: [value(seed.scores) for seed in method.seeds if seed.scores]
 
     def area(limit: float) -> Figure:
-        title = f"AUC of relative poses at {limit:g}°"
-        return scored(f"auc_{limit:g}", title, 3, max, lambda scores: scores.auc[limit])
+        title, value = f"AUC of relative poses at {limit:g}°", scored(lambda s: s.auc[f"{limit:g}"])
+        return f"auc_{limit:g}", title, 3, max, value
 
     def median(key: str, title: str, digits: int) -> Figure:
-        return scored(key, f"Median {title}", digits, min, lambda scores: getattr(scores, key))
+        return key, f"Median {title}", digits, min, scored(lambda scores: getattr(scores, key))
 
     def seconds(stage: str) -> Figure:
-        def span(method: MethodResult) -> Span | None:
-            return _span(s for name, s in method.stage_seconds.items() if name == stage)
+        key, title = f"{stage}_s", f"Seconds to {stage}"
+        return key, title, 1, min, lambda method: [method.stage_seconds.get(stage)]
 
-        return f"{stage}_s", f"Seconds to {stage}", 1, min, span
+    def keypoints(method: MethodResult) -> Iterable[float]:
+        return [fmean(method.num_keypoints.values())] if method.num_keypoints else []
 
-    def keypoints(method: MethodResult) -> Span | None:
-        return _span([fmean(method.num_keypoints.values())] if method.num_keypoints else [])
-
-    def memory_mb(method: MethodResult) -> Span:
-        return Span.of([method.peak_memory_bytes / BYTES_PER_MB])
-
-    stages = {stage for method in methods for stage in method.stage_seconds}
     return [
-        measured("registered", f"Registered, of {given}", better=max),
-        ("correct", f"Registered correctly, of {given}", 1, max, lambda method: method.correct),
-        measured("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}"),
-        measured("points3D", "3D points", 0, max),
-        measured("mean_track_length", "Images per 3D point", 2),
+        ("registered", f"Registered, of {given}", 1, max, measured("registered")),
+        ("correct", f"Registered correctly, of {given}", 1, max,
+         scored(lambda scores: len(scores.correct_names))),
+        ("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}", 1, None,
+         measured("verified_pairs")),
+        ("points3D", "3D points", 0, max, measured("points3D")),
+        ("mean_track_length", "Images per 3D point", 2, None, measured("mean_track_length")),
         ("num_keypoints", "Keypoints per image", 0, None, keypoints),
-        measured("inliers", "Inliers in all pairs", 0),
-        measured("mean_observations", "3D points seen by an image", 0),
-        measured("mean_reprojection_error_px", "Reprojection error, px", 2),
+        ("inliers", "Inliers in all pairs", 0, None, measured("inliers")),
+        ("mean_observations", "3D points seen by an image", 0, None, measured("mean_observations")),
+        ("mean_reprojection_error_px", "Reprojection error, px", 2, None,
+         measured("mean_reprojection_error_px")),
         *map(area, AUC_THRESHOLDS_DEG),
         median("median_rotation_error_deg", "rotation error, °", 2),
         median("median_direction_error_deg", "error of translation direction, °", 2),
         median("median_position_error", "position error, units of the ground truth", 4),
         *map(seconds, sorted(stages, key=STAGES.index)),
-        ("total_s", "Seconds in all", 1, min, lambda method: Span.of([method.total_s])),
-        ("peak_memory_bytes", "Peak memory, MB", 0, min, memory_mb),
-    ]
-
-
-def _span(values: Iterable[float]) -> Span | None:
-    known = list(values)
-    return Span.of(known) if known else None
+        ("total_s", "Seconds in all", 1, min, lambda method: [method.total_s]),
+        ("peak_memory_bytes", "Peak memory, MB", 0, min,
+         lambda method: [method.peak_memory_bytes / BYTES_PER_MB]),
+    ]  # fmt: skip
 
 
 def _row(figure: Figure, methods: Sequence[MethodResult]) -> Row:
     """Write means and, in brackets, ranges with as many decimals in all cells as any needs."""
-    key, title, digits, better, value = figure
-    spans = [value(method) for method in methods]
+    key, title, digits, better, values = figure
+    numbers = [[v for v in values(method) if v is not None] for method in methods]
+    spans = [Span.of(of_method) if of_method else None for of_method in numbers]
     known = [span for span in spans if span]
     means = {round(span.mean, digits) for span in known}
     best = better(means) if better and len(means) > 1 else None
@@ -181,7 +174,6 @@ def _splits(method: MethodResult) -> str:
 
 
 WIDTH = 88
-
 
 SHOWN = {
     "registered": "registered", "correct": "correct", "verified_pairs": "verified",
@@ -231,5 +223,6 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 
 def to_json(comparison: Comparison) -> str:
     """Return ``comparison.json``: all results, and the verdict first."""
-    values = {"verdict": verdict(comparison), **comparison.to_mapping()}
+    content = TypeAdapter(Comparison).dump_python(comparison, mode="json", by_alias=True)
+    values = {"verdict": verdict(comparison), **content}
     return json.dumps(values, indent=2, ensure_ascii=False) + "\n"

@@ -1,15 +1,16 @@
 """What one method of a comparison is to do, and where everything lies.
 
-``shared/`` has what all methods begin with: a database of cameras and images, and the lists of
-images and pairs. ``methods/NAME/`` is a workspace with the features and raw matches of a method,
-and ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
+``methods/NAME/`` is a workspace with the features and raw matches of a method, and
+``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
 """
 
-import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP, SIFT_COLMAP, Method
@@ -17,6 +18,8 @@ from colmap_affrect.comparison.results import MethodResult
 from colmap_affrect.comparison.sift import describe_options
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
+from colmap_affrect.pairs.base import Pair, PairList
+from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
 from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.record import first_difference
@@ -24,6 +27,8 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
 DEFAULT_SEEDS = (0, 1, 2)
+METHODS = "methods"  # folder of all methods
+RESULT = TypeAdapter(MethodResult)  # from and to JSON
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,25 +48,10 @@ class CompareOptions(InputOptions):
     seeds: Sequence[int] = DEFAULT_SEEDS
     ground_truth_path: Path | None = None
 
-
-class Layout:
-    """Paths below the folder of a comparison.
-
-    ``inputs`` records what ``shared`` was made from, and the options that all methods have.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.shared, self.methods = path / "shared", path / "methods"
-        self.inputs = self.shared / "inputs.json"
-        self.database = self.shared / "database.db"
-        self.cameras = self.shared / "cameras.json"
-        self.images = self.shared / "images.txt"
-        self.pairs = self.shared / "pairs.txt"
-
-    def image_names(self) -> list[str]:
-        """Read the list of images."""
-        return self.images.read_text(encoding="utf-8").splitlines()
+    def pairs_of(self, names: Sequence[str]) -> PairList | list[Pair]:
+        """Return the pairs of images to match: those of the list if there is one, else all."""
+        listed = self.pairs.match_list_path
+        return read_pairs(Path(listed), names) if listed else exhaustive_pairs(names)
 
 
 @dataclass(frozen=True)
@@ -74,71 +64,76 @@ class MethodTask:
     all_options: CompareOptions
 
     @property
-    def is_colmaps(self) -> bool:
-        """Whether verification and mapping are COLMAP's, too."""
-        return self.method.label == SIFT_COLMAP
-
-    @property
     def verification(self) -> VerificationOptions:
-        """How pairs are verified."""
-        colmaps = VerificationOptions.preset("colmap")
-        return colmaps if self.is_colmaps else self.all_options.verification
+        """How pairs are verified: as COLMAP does it where all of the method is COLMAP's."""
+        if self.method.label == SIFT_COLMAP:
+            return VerificationOptions.preset("colmap")
+        return self.all_options.verification
 
     @property
     def mapping(self) -> MapperOptions:
-        """Mapper and its options."""
-        colmaps = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
-        return colmaps if self.is_colmaps else self.all_options.mapping
-
-    @property
-    def layout(self) -> Layout:
-        """Paths of the comparison."""
-        return Layout(self.output_path)
+        """Mapper and its options, chosen in the same way."""
+        if self.method.label == SIFT_COLMAP:
+            options: MapperOptions = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset(
+                "colmap"
+            )
+            return options
+        return self.all_options.mapping
 
     @property
     def folder(self) -> Path:
         """Folder of the results of the method."""
-        return self.layout.methods / self.method.folder_name
+        return self.output_path / METHODS / self.method.folder_name
 
     @property
-    def shown_folder(self) -> str:
-        """The same, relative to the folder of the comparison."""
-        return self.folder.relative_to(self.output_path).as_posix()
+    def failure(self) -> Path:
+        """Why its process ended before everything was done."""
+        return self.folder / "failed.txt"
 
     @property
     def result(self) -> Path:
-        """The result of the method, there when it has finished."""
+        """What is done of the method; without seeds before the last of them has ended."""
         return self.folder / "result.json"
 
     @property
     def options(self) -> dict[str, Any]:
-        """Options of features and matching, for the record."""
+        """Options of features and matching, and the seed where verification decides on these."""
         recipe = self.method.recipe
         if recipe is None:
             return describe_options(affine=self.method.label == SIFT_AFFINE_DSP)
-        return recipe.to_mapping()
+        seed = {"seed": self.all_options.seeds[0]} if self.method.escalates else {}
+        return {**recipe.to_mapping(), **seed}
+
+    def begun(self) -> MethodResult:
+        """Return what is done of the method."""
+        if self.result.exists():
+            with suppress(ValidationError):  # of a version before: its features are kept
+                return RESULT.validate_json(self.result.read_bytes())
+        folder = self.folder.relative_to(self.output_path).as_posix()
+        method = self.method
+        return MethodResult(
+            method.label, summary=method.summary, folder=folder, options=self.options
+        )
 
     def finished(self) -> MethodResult | None:
         """Return the result of the method if it has been run with the same seeds."""
-        if self.result.exists():
-            content = json.loads(self.result.read_text(encoding="utf-8"))
-            if content["seeds"] == list(self.all_options.seeds):
-                return MethodResult.from_mapping(self.method.label, content["result"])
-        return None
+        result = self.begun()
+        seeds = [seed.seed for seed in result.seeds]
+        return result if seeds == list(self.all_options.seeds) else None
 
     def begin(self, *, overwrite: bool) -> None:
-        """Make the folder; StaleStoreError where the method has finished with other options."""
+        """Make the folder; StaleStoreError where the method was begun with other options."""
         if overwrite:
             remove_own([self.folder])
-        if self.result.exists():
-            content = json.loads(self.result.read_text(encoding="utf-8"))
-            known, now = content["result"]["options"], json.loads(json.dumps(self.options))
-            if self.method.climbs:
-                known["seed"], now["seed"] = content["seeds"][0], self.all_options.seeds[0]
-            if difference := first_difference(known, now):
-                raise StaleStoreError(
-                    f"{self.folder}: {self.method.label} was run there with {difference}; use "
-                    "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
-                    "or another --output-path"
-                )
+        known, now = (
+            RESULT.dump_python(result, mode="json")["options"]
+            for result in (self.begun(), MethodResult("", options=self.options))
+        )
+        if difference := first_difference(known, now):
+            raise StaleStoreError(
+                f"{self.folder}: {self.method.label} was run there with {difference}; use "
+                "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
+                "or another --output-path"
+            )
         Workspace(self.folder).begin()
+        self.failure.unlink(missing_ok=True)

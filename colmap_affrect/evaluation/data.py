@@ -23,8 +23,6 @@ class ScoreOptions(Options):
 
     threshold_px: Annotated[float, within(1e-6, 1e9)] = 0.5
     """Of an inlier of plain RANSAC, for homographies and poses (the paper: 0.5)."""
-    magsac_threshold_px: Annotated[float, within(1e-6, 1e9)] = 5.0
-    """Largest noise that OpenCV's USAC_MAGSAC assumes for homographies."""
     max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
     """Of estimators, as the paper says; its numbers of relative poses are those of 1000."""
 
@@ -36,8 +34,9 @@ class PairScore:
     error: Number  # of the protocol, px or degrees; infinite where no model was found
     num_inliers: int  # of the model that was estimated
     num_correct: int | None = None  # matches that agree with the truth; None where it cannot say
-    details: Mapping[str, Number] = field(default_factory=dict)  # those of other estimators, ...
+    details: Mapping[str, Number] = field(default_factory=dict)  # beside the error
     solved: float = 0.0  # how far it counts as matched: 1 or 0 where there is a threshold
+    kind: str = ""  # of the truth, as tables name it; empty without one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +85,7 @@ class EvaluationPair:
 
     name: str
     images: tuple[EvaluationImage, EvaluationImage]
-    category: str = ""  # of difficulty, as tables and plots group pairs; empty for none
+    category: str = ""  # of difficulty, as tables group pairs; empty for none
     truth: Any = None  # one of :mod:`colmap_affrect.evaluation.truths`
     problem: str = ""
 

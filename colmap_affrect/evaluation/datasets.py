@@ -2,12 +2,11 @@
 
 import json
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from copy import copy
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import h5py
@@ -32,7 +31,10 @@ Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
 CALIBRATION_PREFIX = "calibration_"
-MAX_NOT_UNIT = 1e-3  # largest deviation of the length of a quaternion from 1, and of R Rᵀ from I
+UNREADABLE = (
+    OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, EOFError,
+)  # fmt: skip
+"""What reading a damaged text, JSON, npy or HDF5 file, or a camera of it, may raise."""
 ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
 
 
@@ -138,27 +140,22 @@ load_svp = partial(_scenes, f"*{PAIR_LIST_SUFFIX}", _svp_scene)
 
 def read_views(folder: Path) -> Views:
     """Read ``images.txt`` and ``cameras.txt``; EvaluationError when that cannot be done."""
-    posed = [line for line in _lines(folder / "images.txt") if stem(line) != line]
-    with TemporaryDirectory() as name:
-        for file, lines in (
-            ("cameras.txt", _lines(folder / "cameras.txt")),
-            ("images.txt", [f"{line}\n" for line in posed]),  # each without points
-            ("points3D.txt", []),
-        ):
-            (Path(name) / file).write_text("\n".join([*lines, ""]), encoding="utf-8")
-        try:
-            model = pycolmap.Reconstruction(name)
-        except (RuntimeError, ValueError, IndexError) as error:
-            reason = " ".join(str(error).split())
-            raise EvaluationError(f"{folder}: COLMAP cannot read it ({reason})") from error
-    views = {}
-    for image in model.images.values():
-        pose = image.cam_from_world()
-        length = float(np.linalg.norm(pose.rotation.quat))
-        if not abs(length - 1.0) <= MAX_NOT_UNIT:
-            raise EvaluationError(f"{folder}: {image.name}: quaternion of length {length:.3g}")
-        pose.rotation.normalize()
-        views[stem(image.name)] = copy(image.camera), (pose.rotation.matrix(), pose.translation)
+    cameras, views = {}, {}
+    posed = [line for line in _lines(folder / "images.txt") if stem(line) != line]  # not points
+    with _reading(folder):
+        for line in _lines(folder / "cameras.txt"):
+            key, model, width, height, *words = line.split()
+            params = finite_numbers(words, (-1,), f"{folder / 'cameras.txt'}: camera {key}")
+            size = {"width": int(width), "height": int(height)}
+            cameras[key] = pycolmap.Camera(model=model, params=params.tolist(), **size)
+            if not cameras[key].verify_params():
+                raise ValueError(f"camera {key} has {len(params)} parameters")
+        for line in posed:
+            _, w, x, y, z, *translation, key, name = line.split(maxsplit=9)
+            turn = pycolmap.Rotation3d(np.array([x, y, z, w], dtype=np.float64))
+            turn.normalize()
+            pose = turn.matrix(), np.array(translation, dtype=np.float64)
+            views[stem(name)] = cameras[key], pose
     return views
 
 
@@ -171,11 +168,22 @@ def stem(name: str) -> str:
 
 def _lines(path: Path) -> list[str]:
     """Return the lines of a text file that are not empty or comments."""
-    try:
+    with _reading(path):
         lines = map(str.strip, path.read_text(encoding="utf-8-sig").splitlines())
         return [line for line in lines if line and not line.startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: cannot be read ({error})") from error
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Make one EvaluationError of whatever a damaged file leads to."""
+    try:
+        yield
+    except OptionError as error:
+        raise EvaluationError(str(error)) from error
+    except UNREADABLE as error:
+        raise EvaluationError(
+            f"{path}: cannot be read ({error!r}); see docs/own-evaluation-set.md for the format"
+        ) from error
 
 
 def _imc_scene(lists_path: Path) -> Dataset:
@@ -188,11 +196,9 @@ def _imc_scene(lists_path: Path) -> Dataset:
     for limit in range(10):
         path = lists_path / f"keys-th-0.{limit}.npy"
         if limit or path.exists():
-            try:
+            with _reading(path):
                 keys = np.load(path, allow_pickle=False).ravel().tolist()
-            except (OSError, ValueError, EOFError) as error:
-                raise EvaluationError(f"{path}: cannot be read ({error})") from error
-            bins |= {_split(str(key), views): f"0.{limit}" for key in keys}
+                bins |= {_split(str(key), views): f"0.{limit}" for key in keys}
     return _posed_pairs(scene, root / "images", views, bins, lambda *names: bins[names])
 
 
@@ -208,14 +214,11 @@ def _split(key: str, known: Views) -> Names:
 
 def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
     """Read the camera and cam_from_world of an image; EvaluationError says what is wrong."""
-    try:
-        with h5py.File(path) as file:
-            given = {key: np.squeeze(file[key][()]) for key in ("K", "R", "T")}
-    except (OSError, TypeError, ValueError, RuntimeError, KeyError, AttributeError) as error:
-        raise EvaluationError(f"{path}: cannot be read ({error})") from error
+    with _reading(path), h5py.File(path) as file:
+        given = {key: np.squeeze(file[key][()]) for key in ("K", "R", "T")}
     camera = pinhole(finite_numbers(given["K"], (3, 3), f"{path}: K"), f"{path}: K")
     translation = finite_numbers(given["T"], (3,), f"{path}: T")
-    return camera, (rotation(given["R"], f"{path}: R"), translation)
+    return camera, (finite_numbers(given["R"], (3, 3), f"{path}: R"), translation)
 
 
 def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
@@ -234,15 +237,6 @@ def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
     return values
 
 
-def rotation(given: Any, what: str) -> Array:
-    """Return a (3, 3) rotation; EvaluationError when ``what`` is none."""
-    matrix = finite_numbers(given, (3, 3), what)
-    is_orthonormal = np.abs(matrix @ matrix.T - np.eye(3)).max() < MAX_NOT_UNIT
-    if not is_orthonormal or np.linalg.det(matrix) < 0:
-        raise EvaluationError(f"{what} is not orthonormal, or a reflection")
-    return matrix
-
-
 def pinhole(matrix: Array, what: str) -> pycolmap.Camera:
     """Return the camera of a (3, 3) matrix of COLMAP's px; EvaluationError when it is none."""
     (fx, skew, cx), (zero, fy, cy), last = matrix.tolist()
@@ -258,16 +252,10 @@ def load_pairs(folder: Path) -> Dataset:
     A pair whose images or truth cannot be used is returned with its problem.
     """
     path = folder / "pairs.json"
-    try:
+    with _reading(path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
         entries = [_entry(each, f"{path}: pairs[{k}]") for k, each in enumerate(content["pairs"])]
         offset_px = ORIGIN_PX[content.get("pixel_origin", "center")]
-    except OptionError as error:
-        raise EvaluationError(str(error)) from error
-    except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
-        raise EvaluationError(
-            f"{path}: cannot be read ({error!r}); its format is in docs/own-evaluation-set.md"
-        ) from error
     names = [entry.name for entry in entries]
     if twice := [name for name in names if names.count(name) > 1]:
         raise EvaluationError(f"{path}: two pairs are called '{twice[0]}'; give them names")
@@ -313,10 +301,8 @@ def _truth(
     if isinstance(numbers, str):
         if leads_outside(numbers):
             raise EvaluationError(f"{numbers}: must be a file in the folder of the pairs")
-        try:
+        with _reading(folder / numbers):
             numbers = np.loadtxt(folder / numbers, ndmin=2)
-        except (OSError, ValueError) as error:
-            raise EvaluationError(f"{folder / numbers}: cannot be read ({error})") from error
     if entry.homography is not None:
         center = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]])
         matrix = center @ finite_numbers(numbers, (3, 3), f"{name}: homography")
@@ -334,5 +320,4 @@ def _truth(
     for key in ("intrinsics1", "intrinsics2"):
         values[key][:2, 2] = colmap_from_pixel(values[key][:2, 2] + offset_px)
         cameras.append(pinhole(values[key], f"{name}: {key}"))
-    pose = rotation(values["rotation"], f"{name}: rotation"), values["translation"]
-    return TruePose((cameras[0], cameras[1]), pose)
+    return TruePose((cameras[0], cameras[1]), (values["rotation"], values["translation"]))

@@ -1,8 +1,8 @@
-"""Evaluate recipes on a dataset by a protocol: features, matches, scores, tables, plots.
+"""Evaluate recipes on a dataset by a protocol: features, matches, scores, tables, a plot.
 
 The output folder has ``features/`` and ``pairs/`` (scores of single pairs), both by recipe and a
-digest of all that decides them, ``evaluation.json`` and plots. An evaluation that was stopped goes
-on, and after a change only what depends on it is made again.
+digest of all that decides them, ``evaluation.json`` and ``errors.png``. An evaluation that was
+stopped goes on, and after a change only what depends on it is made again.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import EvaluationError, OptionError, such_as
 from colmap_affrect.evaluation import datasets, truths
 from colmap_affrect.evaluation.data import Dataset, PairResult, ScoreOptions
-from colmap_affrect.evaluation.plots import write_plots
+from colmap_affrect.evaluation.plots import write_plot
 from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, Solved, published
 from colmap_affrect.evaluation.runner import RecipeRun
 from colmap_affrect.geometry.arrays import Array
@@ -39,18 +39,14 @@ class Protocol:
     load: Callable[[Path], Dataset]
     columns: Callable[[Sequence[PairResult]], dict[str, float]]  # of the table, in order
     error_title: str  # what the error of a score is, with its unit
-    category_title: str = ""  # what the categories are; empty without
 
 
 ERROR_PX, ERROR_DEG = "mean reprojection error of the visible part (px)", "rotation error [deg]"
-ANGLE, COVISIBILITY = "relative rotation, from [deg]", "covisibility, from"
 PROTOCOLS = {
     "evd": Protocol(datasets.load_evd, truths.homography_columns, ERROR_PX),
-    "svp": Protocol(datasets.load_svp, truths.pose_columns, ERROR_DEG, ANGLE),
-    "imc": Protocol(datasets.load_imc, truths.pose_columns, ERROR_DEG, COVISIBILITY),
-    "pairs": Protocol(
-        datasets.load_pairs, truths.columns_by_kind, "error (px; poses: degrees)", "category"
-    ),
+    "svp": Protocol(datasets.load_svp, truths.pose_columns, ERROR_DEG),
+    "imc": Protocol(datasets.load_imc, truths.pose_columns, ERROR_DEG),
+    "pairs": Protocol(datasets.load_pairs, truths.columns_by_kind, "error (px; poses: degrees)"),
 }
 
 
@@ -91,9 +87,9 @@ def evaluate(
 
     An image or pair that cannot be used counts as failed, and the others go on; so does an
     evaluation that was stopped, unless ``overwrite`` discards features and scores of these recipes
-    first. What is returned is also written to ``evaluation.json`` and plots in the output folder,
-    which is made if missing. Raises AffrectError for anything that the caller can mend, before any
-    image is worked on.
+    first. What is returned is also written to ``evaluation.json`` and ``errors.png`` in the output
+    folder, which is made if missing. Raises AffrectError for anything that the caller can mend,
+    before any image is worked on.
     """
     require_png()
     if protocol not in PROTOCOLS:
@@ -122,7 +118,6 @@ def evaluate(
         evaluation = Evaluation(
             protocol=protocol,
             error_title=chosen.error_title,
-            category_title=chosen.category_title,
             dataset_path=inputs["dataset_path"],
             settings=settings,
             baseline=options.baseline or "",
@@ -132,7 +127,7 @@ def evaluate(
             versions=installed_versions(),
         )
         replace_text(output_path / "evaluation.json", evaluation.to_json())
-        write_plots(evaluation, output_path)
+        write_plot(evaluation, output_path / "errors.png")
     return evaluation
 
 

@@ -68,7 +68,6 @@ class Evaluation:
 
     protocol: str
     error_title: Annotated[str, Field(alias="error")]  # what errors are, with the unit
-    category_title: Annotated[str, Field(alias="category")]  # what categories are, if anything
     dataset_path: str
     settings: Mapping[str, Any]  # everything that decides scores
     baseline: str  # label of the recipe that the others are tested against; empty for none

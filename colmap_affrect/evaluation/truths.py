@@ -6,7 +6,7 @@ of failed pairs may have no details; their errors are infinite.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -39,16 +39,13 @@ NUM_ESTIMATES = 5  # orders of the matches, of which the one of median error cou
 MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
 """Of poses six: five leave several essential matrices, none of which another match supports."""
 MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices
-GC_THRESHOLD_PX = 3.0  # of an inlier of GC-RANSAC, as in verification by default
 CORRECT_PX = 3.0
 """Matches are correct up to this transfer error in image 2, or Sampson distance from a pose."""
 GRID_STEP_PX = 4
 MAX_ERROR_PX, MAX_ERROR_DEG = 5.0, 5.0  # homographies and rotations of solved pairs are better
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
-POSE_LIMITS_DEG = {"all": MAX_ERROR_DEG, "all < 10°": 10.0, "all < 20°": 20.0}
 MAX_AUC_ERROR_DEG = 10.0
 NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
-SHOWN_LIMITS_PX = (1, 2, 3, 5, 10, 20)
 
 
 def estimate_matrix(
@@ -72,12 +69,12 @@ def estimate_matrix(
 
 
 def estimate_pose(
-    rays: Sides, method: int, threshold: float, options: ScoreOptions, seed: int
+    rays: Sides, threshold: float, options: ScoreOptions, seed: int
 ) -> tuple[Pose | None, int]:
     """Estimate camera2_from_camera1, |t| = 1, from five-point samples, and count its inliers.
 
     ``rays`` are (M, 2) x/z, y/z in front of each camera, the threshold in focal lengths; rays that
-    are not finite are never inliers. For method and seed see :func:`estimate_matrix`.
+    are not finite are never inliers. For the seed see :func:`estimate_matrix`.
     """
     usable = np.flatnonzero(np.isfinite(np.hstack(rays)).all(axis=1))
     if len(usable) < MIN_POSE_MATCHES:
@@ -85,7 +82,7 @@ def estimate_pose(
     order = np.random.default_rng(seed).permutation(usable)
     first, second = (np.ascontiguousarray(side[order]) for side in rays)
     limits = CONFIDENCE, threshold, options.max_num_iterations
-    essential, mask = cv2.findEssentialMat(first, second, np.eye(3), method, *limits)
+    essential, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, *limits)
     if essential is None or essential.shape != (3, 3):
         return None, 0
     inliers = mask.ravel() != 0
@@ -111,10 +108,8 @@ class TrueHomography:
         """Return the truth of two image files, of a (3, 3) matrix of any scale and sign.
 
         Raises ImageError when an image cannot be read, and EvaluationError, naming ``what``, when
-        the matrix is singular, or image 2 shows no part of image 1 by it.
+        image 2 shows no part of image 1 by it.
         """
-        if np.linalg.matrix_rank(matrix) < 3:
-            raise EvaluationError(f"{what} is singular")
         size1, size2 = ((gray.shape[1], gray.shape[0]) for gray in map(read_gray, paths))
         both = [cls(sign * matrix, size1, size2) for sign in (1.0, -1.0)]
         found = max(both, key=lambda truth: len(truth.visible))
@@ -144,18 +139,15 @@ class TrueHomography:
     def score(
         self, points1: Points, points2: Points, options: ScoreOptions, seed: int
     ) -> PairScore:
-        """Score by the paper's RANSAC, in px; the details are those of USAC_MAGSAC."""
-        estimate = partial(estimate_matrix, cv2.findHomography, (points1, points2))
-        matrix, num_inliers = estimate(cv2.RANSAC, options.threshold_px, options, seed)
+        """Score by the paper's RANSAC, in px."""
+        matrix, num_inliers = estimate_matrix(
+            cv2.findHomography, (points1, points2), cv2.RANSAC, options.threshold_px, options, seed
+        )
         error = self.error_px(matrix)
         num_correct = int((transfer_errors(self.matrix, points1, points2) < CORRECT_PX).sum())
-        threshold_px, seeds = options.magsac_threshold_px, range(seed, seed + NUM_ESTIMATES)
-        others = [estimate(cv2.USAC_MAGSAC, threshold_px, options, other) for other in seeds]
-        details = {
-            "magsac_error": median_low(self.error_px(other) for other, _ in others),
-            "magsac_num_inliers": median_low(count for _, count in others),
-        }
-        return PairScore(error, num_inliers, num_correct, details, float(error < MAX_ERROR_PX))
+        return PairScore(
+            error, num_inliers, num_correct, kind="homographies", solved=float(error < MAX_ERROR_PX)
+        )
 
 
 def transfer_errors(matrix: Array, points1: Points, points2: Points) -> Array:
@@ -171,14 +163,9 @@ def third_coordinates(homography: Array, points: Points) -> Array:
 
 
 def homography_columns(results: Results) -> dict[str, float]:
-    """Count the pairs whose error is below each limit, by plain RANSAC and by MAGSAC."""
-    errors = {
-        "": [result.error for result in results],
-        "MAGSAC: ": [result.details.get("magsac_error", math.inf) for result in results],
-    }
+    """Count the pairs whose error is below each limit."""
     return {
-        f"{name}< {limit:g} px": float(sum(error < limit for error in values))
-        for name, values in errors.items()
+        f"< {limit:g} px": float(sum(result.error < limit for result in results))
         for limit in HOMOGRAPHY_LIMITS_PX
     }
 
@@ -195,29 +182,19 @@ class TruePose:
     ) -> PairScore:
         """Score by the paper's RANSAC: the error is that of the rotation, in degrees.
 
-        Its result is one sample of five matches; the details ``gc_...`` are of OpenCV's GC-RANSAC
-        (``USAC_ACCURATE``), which refines on all inliers. ``direction_error_deg`` is the angle
-        between the directions of the translations. Matches within ``CORRECT_PX`` of the true
-        epipolar lines are correct, wrong ones by chance among them. Distances are in px by the mean
-        focal length of the two cameras.
+        ``direction_error_deg`` is the angle between the directions of the translations. Matches
+        within ``CORRECT_PX`` of the true epipolar lines are correct, wrong ones by chance among
+        them. Distances are in px by the mean focal length of the two cameras.
         """
         both = rays(self.cameras[0], points1), rays(self.cameras[1], points2)
         focal_px = float(np.mean([camera.mean_focal_length() for camera in self.cameras]))
-
-        def estimate(method: int, threshold_px: float, seed: int) -> tuple[float, float, int]:
-            pose, count = estimate_pose(both, method, threshold_px / focal_px, options, seed)
-            errors = (math.inf, math.inf) if pose is None else pose_errors(pose, self.pose)
-            return *errors, count
-
-        error, direction_error, num_inliers = estimate(cv2.RANSAC, options.threshold_px, seed)
-        seeds = range(seed, seed + NUM_ESTIMATES)
-        gc = median_low(estimate(cv2.USAC_ACCURATE, GC_THRESHOLD_PX, other) for other in seeds)
+        pose, num_inliers = estimate_pose(both, options.threshold_px / focal_px, options, seed)
+        error, direction = (math.inf, math.inf) if pose is None else pose_errors(pose, self.pose)
         distances_px = focal_px * sampson_errors(essential_matrix(*self.pose), *both)
         has_baseline = self.pose[1].any()  # without, distances are not defined
         num_correct = int((distances_px < CORRECT_PX).sum()) if has_baseline else 0
-        details = {"direction_error_deg": direction_error}
-        details |= zip(("gc_error", "gc_direction_error_deg", "gc_num_inliers"), gc, strict=True)
-        return PairScore(error, num_inliers, num_correct, details, float(error < MAX_ERROR_DEG))
+        details, solved = {"direction_error_deg": direction}, float(error < MAX_ERROR_DEG)
+        return PairScore(error, num_inliers, num_correct, details, solved, "poses")
 
 
 def rays(camera: pycolmap.Camera, points: Points) -> Points:
@@ -229,24 +206,17 @@ def rays(camera: pycolmap.Camera, points: Points) -> Points:
 def pose_columns(results: Results, *, by_category: bool = True) -> dict[str, float]:
     """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
 
-    Also below 10 and 20 degrees, and the area under the curve of the larger of rotation and
-    direction error up to 10 degrees; then the same by GC-RANSAC. Categories are in the order of the
-    results.
+    Also the area under the curve of the larger of rotation and direction error up to 10 degrees.
+    Categories are in the order of the results.
     """
-    columns = {}
-    categories = dict.fromkeys(result.category for result in results if by_category)
-    for group, prefix in {"": "", "GC-RANSAC: ": "gc_"}.items():
-        found = [{"error": result.error, **result.details} for result in results]
-        errors = [each.get(f"{prefix}error", math.inf) for each in found]
-        for title in (*categories, *POSE_LIMITS_DEG):
-            limit, every = POSE_LIMITS_DEG.get(title, MAX_ERROR_DEG), title in POSE_LIMITS_DEG
-            pairs = zip(errors, results, strict=True)
-            below = [error < limit for error, r in pairs if every or r.category == title]
-            columns[group + title] = sum(below) / max(1, len(below))
-        directions = [each.get(f"{prefix}direction_error_deg", math.inf) for each in found]
-        area = area_under_curve(map(max, errors, directions), len(errors), MAX_AUC_ERROR_DEG)
-        columns[f"{group}pose AUC {MAX_AUC_ERROR_DEG:g}°"] = area
-    return columns
+    groups: dict[str, list[bool]] = {}
+    for result in results if by_category else ():
+        groups.setdefault(result.category, []).append(result.error < MAX_ERROR_DEG)
+    groups["all"] = [result.error < MAX_ERROR_DEG for result in results]
+    columns = {title: sum(below) / max(1, len(below)) for title, below in groups.items()}
+    largest = [max(r.error, r.details.get("direction_error_deg", math.inf)) for r in results]
+    area = area_under_curve(largest, len(results), MAX_AUC_ERROR_DEG)
+    return {**columns, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": area}
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +231,7 @@ class Correspondences:
         """Score by the fundamental matrix of OpenCV's USAC_MAGSAC, as WxBS does.
 
         ``error`` is the median of the symmetric epipolar distances of the correspondences, in px.
-        The pair is solved as far as the score of WxBS says. Details: :func:`recalls`.
+        The pair is solved as far as :func:`wxbs_score` says.
         """
         estimate = partial(estimate_matrix, cv2.findFundamentalMat, (points1, points2))
         found = []
@@ -270,8 +240,8 @@ class Correspondences:
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
             found.append((float(np.median(distances)), count, other, distances))
         error, num_inliers, _, distances = median_low(found)
-        details = recalls(distances)
-        return PairScore(error, num_inliers, None, details, details["wxbs_score"])
+        score = wxbs_score(distances)
+        return PairScore(error, num_inliers, solved=score, kind="correspondences")
 
 
 def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2: Points) -> Array:
@@ -289,30 +259,26 @@ def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2:
     return np.asarray(np.nan_to_num(distances, nan=np.inf))
 
 
-def recalls(distances_px: Array) -> dict[str, float]:
-    """Return the score of WxBS, and shares of (N,) distances up to single limits."""
-    shares = [float((distances_px <= limit).mean()) for limit in range(21)]
-    score = float(np.mean(shares[:NUM_WXBS_LIMITS]))
-    return {"wxbs_score": score, **{f"recall_{px}px": shares[px] for px in SHOWN_LIMITS_PX}}
+def wxbs_score(distances_px: Array) -> float:
+    """Return the mean share of (N,) distances within 0, 1, ... 19 px, as WxBS has it."""
+    return float(np.mean([(distances_px <= limit).mean() for limit in range(NUM_WXBS_LIMITS)]))
 
 
 def correspondence_columns(results: Results) -> dict[str, float]:
-    """Return the means of :func:`recalls` over results, at least one, under names for people."""
-    keys = {f"within {px} px": f"recall_{px}px" for px in SHOWN_LIMITS_PX}
-    keys = {"WxBS score": "wxbs_score", **keys}
-    return {name: fmean(result.details[key] for result in results) for name, key in keys.items()}
+    """Return the mean score of results, at least one."""
+    return {"WxBS score": fmean(result.solved for result in results)}
 
 
 def columns_by_kind(results: Results) -> dict[str, float]:
     """Return the columns of each kind of truth; results without a truth are in none."""
-    columns: dict[str, float] = {}
-    for detail, kind, make in (
-        ("magsac_error", "homographies", homography_columns),
-        ("wxbs_score", "correspondences", correspondence_columns),
-        ("gc_error", "poses", partial(pose_columns, by_category=False)),
-    ):
-        if members := [result for result in results if detail in result.details]:
-            for name, value in make(members).items():
-                comma = kind == "poses" and GROUP in name
-                columns[f"{kind}{', ' if comma else GROUP}{name}"] = value
-    return columns
+    makers: dict[str, Callable[[Results], dict[str, float]]] = {
+        "homographies": homography_columns,
+        "correspondences": correspondence_columns,
+        "poses": partial(pose_columns, by_category=False),
+    }
+    return {
+        f"{kind}{GROUP}{name}": value
+        for kind, make in makers.items()
+        if (members := [result for result in results if result.kind == kind])
+        for name, value in make(members).items()
+    }

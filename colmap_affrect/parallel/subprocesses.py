@@ -20,10 +20,15 @@ WATCH_S = 0.5  # elsewhere: how often a process looks whether its parent lives
 
 @contextmanager
 def child(
-    module: str, argument: str, *, stderr: IO[str] | None = None
+    module: str,
+    argument: str,
+    *,
+    stdout: int = subprocess.PIPE,
+    stderr: IO[str] | None = None,
 ) -> Iterator[subprocess.Popen[str]]:
-    """Run a module of this package with one argument and our process id; its stdout is piped.
+    """Run a module of this package with one argument and our process id.
 
+    Its stdout is piped where nothing else is said.
     If the block raises, also for Ctrl-C, the child is killed; otherwise it is waited for. The
     module must call :func:`end_with` first, with the process id.
     """
@@ -32,7 +37,7 @@ def child(
     with subprocess.Popen(  # noqa: S603  (this Python and a module of ours)
         [sys.executable, "-P", "-m", module, argument, str(os.getpid())],
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
+        stdout=stdout,
         stderr=stderr,
         env={**os.environ, "PYTHONPATH": search_path},
         start_new_session=True,  # else Ctrl-C would reach it too

@@ -1,9 +1,11 @@
 """One level of a recipe carried out on one photograph, with all that is decided on the way."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from colmap_affrect.data import (
@@ -16,7 +18,6 @@ from colmap_affrect.data import (
 )
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.progress import Stopwatch
-from colmap_affrect.report.regions import bounding_box, region_area_px
 from colmap_affrect.stages.one_image import ImageExtractor
 
 PIXELS_PER_MEGAPIXEL = 1_000_000
@@ -46,8 +47,7 @@ class InspectedLevel:
     @property
     def warped_share(self) -> float:
         """Area of all warps in areas of the photograph."""
-        width, height = self.plan.image_size
-        return self.plan.rectified_area_px / (width * height)
+        return self.plan.rectified_area_px / math.prod(self.plan.image_size)
 
 
 def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int) -> InspectedLevel:
@@ -129,8 +129,8 @@ def describe_level(level: InspectedLevel) -> dict[str, Any]:
 
 
 def _describe_warp(level: InspectedLevel, warp_id: int, item: Rectification) -> dict[str, Any]:
-    width, height = level.plan.image_size
-    area_px = region_area_px(item, level.plan.image_size)
+    size = level.plan.image_size
+    area_px = math.prod(size) if item.region is None else int(np.count_nonzero(item.region))
     return {
         "id": warp_id,
         "segment": item.segment_id,
@@ -139,13 +139,21 @@ def _describe_warp(level: InspectedLevel, warp_id: int, item: Rectification) -> 
         "rectified_from_image": item.rectified_from_image.tolist(),
         "canvas_size": list(item.canvas_size),
         "region": {
-            "bounding_box": list(bounding_box(item, level.plan.image_size)),
+            "bounding_box": list(bounding_box(item, size)),
             "area_px": area_px,
-            "share": area_px / (width * height),
+            "share": area_px / math.prod(size),
         },
         "features_found": len(level.found[warp_id]),
         "features_kept": len(level.kept_of(warp_id)),
     }
+
+
+def bounding_box(item: Rectification, image_size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of a region in an image of (width, height), in px."""
+    if item.region is None:
+        return (0, 0, *image_size)
+    left, top, width, height = cv2.boundingRect(item.region.astype(np.uint8))
+    return left + item.region_origin[0], top + item.region_origin[1], width, height
 
 
 def summary(level: InspectedLevel) -> str:

@@ -12,7 +12,7 @@ import jinja2
 
 from colmap_affrect.errors import shown
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.report import match_plots, view_graph
+from colmap_affrect.report import view_graph
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -50,7 +50,6 @@ def write_page(
     digest = hashlib.sha256(script.encode("utf-8")).digest()
     environment.globals |= {
         "graph_constants": view_graph,
-        "match_constants": match_plots,
         "script": script,
         "script_digest": base64.b64encode(digest).decode("ascii"),
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),

@@ -50,27 +50,23 @@ def base64_text(data: bytes) -> str:
 def thumbnails(
     folder: Path, names: Sequence[str], progress: Progress = SILENT
 ) -> dict[str, Picture]:
-    """Read photographs for a page, of which some or hundreds are as large as one."""
-    size_px = thumbnail_size_px(len(names))
-    return photograph_pictures(folder, names[:MAX_NUM_THUMBNAILS], size_px, progress)
+    """Read photographs as stored for a page; unreadable ones are left out.
 
-
-def photograph_pictures(
-    folder: Path, names: Sequence[str], max_size_px: int, progress: Progress = SILENT
-) -> dict[str, Picture]:
-    """Read photographs as stored, shrunk to a longer side; unreadable ones are left out."""
+    They are shrunk so that a page of hundreds is as large as one of some.
+    """
+    size_px, shown = thumbnail_size_px(len(names)), names[:MAX_NUM_THUMBNAILS]
 
     def picture(name: str) -> Picture | None:
         try:
-            return Picture.jpeg(read_color(folder / name, max_size_px))
+            return Picture.jpeg(read_color(folder / name, size_px))
         except ImageError:
             return None
 
     found = {}
-    with progress.stage("pictures", len(names), "images") as advance:
-        pictures = map_ordered(picture, names, available_cores())
-        for name, shown in zip(names, pictures, strict=True):
-            if shown is not None:
-                found[name] = shown
+    with progress.stage("pictures", len(shown), "images") as advance:
+        pictures = map_ordered(picture, shown, available_cores())
+        for name, made in zip(shown, pictures, strict=True):
+            if made is not None:
+                found[name] = made
             advance(1)
     return found

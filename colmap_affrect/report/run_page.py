@@ -179,25 +179,17 @@ def _guided(report: ReconstructionReport) -> str:
 
 
 def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
-    shown = report.cameras[:MAX_NUM_CAMERAS]
-    values = [value for camera in shown for value in _focals(camera)]
-    low, high = (min(values), max(values)) if values else (0.0, 0.0)
-    scale = 100 / (high - low) if high > low else 0.0
     rows = []
-    for camera in shown:
-        spread = camera["rival_px"]
-        ends = spread or [camera["focal_px"]] * 2
-        refined = camera["refined_px"]
+    for camera in report.cameras[:MAX_NUM_CAMERAS]:
+        spread, refined = camera["rival_px"], camera["refined_px"]
+        names = (f"{index[name] + 1} {name}" for name in camera["names"] if name in index)
         rows.append(
             {
-                "photographs": _photographs(camera["names"], index),
+                "photographs": such_as(names),
                 "focal": f"{camera['focal_px']:,.0f}",
                 "refined": f"{refined:,.0f}" if refined else "-",
                 "spread": "{:,.0f} to {:,.0f}".format(*spread) if spread else "-",
                 "source": f"{SOURCES[camera['source']]}{camera['why'] and ': '}{camera['why']}",
-                "low": round((ends[0] - low) * scale, 1),
-                "high": round((ends[1] - low) * scale, 1),
-                "at": round(((refined or camera["focal_px"]) - low) * scale, 1),
             }
         )
     counts, total = Counter(camera["source"] for camera in report.cameras), len(report.cameras)
@@ -205,17 +197,7 @@ def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str
     note = f"{total} camera{'s' if total != 1 else ''}, focal lengths: {sources}."
     if total > len(rows):
         note += f" The first {len(rows)} are listed, report.json has all."
-    has_range = any(row["spread"] != "-" for row in rows)
-    return {"cameras": rows, "camera_note": note, "has_range": has_range}
-
-
-def _focals(camera: Mapping[str, Any]) -> list[float]:
-    spread = camera["rival_px"] or []
-    return [value for value in (camera["focal_px"], camera["refined_px"], *spread) if value]
-
-
-def _photographs(names: Sequence[str], index: Mapping[str, int]) -> str:
-    return such_as(f"{index[name] + 1} {name}" for name in names if name in index)
+    return {"cameras": rows, "camera_note": note}
 
 
 def _stages(report: ReconstructionReport) -> list[dict[str, Any]]:

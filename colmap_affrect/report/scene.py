@@ -164,24 +164,16 @@ def similarity_of(source: Model, target: Model) -> tuple[float, Array, Array] | 
 def _upright(model: Model) -> Model:
     """Turn a model so that z is up, as cameras are held on average, and y is where they look.
 
-    Where they look in all directions, x is the long side. The middle of cameras and points goes to
-    the origin, and the scale is that of the view.
+    The middle of cameras and points goes to the origin, and the scale is that of the view.
     """
     up = -model.axes[:, :, 1].mean(axis=0)
     if np.linalg.norm(up) < 1e-6:
         up = -model.axes[0, :, 1]
     up /= np.linalg.norm(up)
-    extent = np.concatenate([model.points, model.centers])
-    extent = extent - np.median(extent, axis=0)
-    level = np.linalg.svd(up[None])[2][1:]  # two horizontal directions
-    flat = extent @ level.T
-    distances = np.linalg.norm(flat, axis=1)
-    near = flat[distances <= np.percentile(distances, POINT_PERCENTILE)]
-    along = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][0] @ level
-    ahead = model.axes[:, :, 2] @ level.T
-    common = (ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]).mean(axis=0)
-    if np.linalg.norm(common) > MIN_COMMON_DIRECTION:
-        along = np.cross(common / np.linalg.norm(common) @ level, up)
+    along = np.cross(model.axes[:, :, 2].mean(axis=0), up)
+    if np.linalg.norm(along) < MIN_COMMON_DIRECTION:  # they look in all directions
+        along = np.linalg.svd(up[None])[2][1]
+    along /= np.linalg.norm(along)
     rotation = np.stack([along, np.cross(up, along), up])
     centers, points = model.centers @ rotation.T, model.points @ rotation.T
     spread = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else []

@@ -15,20 +15,26 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.patheffects import withStroke
 
-from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures
+from colmap_affrect.data import (
+    ColorImage,
+    GrayImage,
+    LocalFeatures,
+    Mask,
+    Photograph,
+    RectificationPlan,
+)
 from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.report.levels import InspectedLevel, summary
-from colmap_affrect.report.regions import (
-    UNIT_CIRCLE,
-    Color,
-    Size,
-    circle_origin,
-    largest_warps,
-    region_middle,
-    tinted,
-    warp_colors,
-)
+
+Color = tuple[float, float, float]
+Size = tuple[int, int]
+
+PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#882255")
+"""Okabe and Ito's colours for all kinds of colour vision, and one of Paul Tol's."""
+
+TINT = 0.45  # share of the colour over a region
 
 DPI = 100
 WIDTH_INCHES, TOP_INCHES, WARP_INCHES, TITLE_INCHES = 16.0, 7.0, 2.6, 0.6
@@ -36,7 +42,8 @@ TITLE_CHARS = 180  # that fit into a line
 WARPS_PER_ROW, MAX_NUM_WARPS = 6, 24
 MAX_NUM_FEATURES, MAX_NUM_WARP_FEATURES = 1500, 120  # drawn, the strongest
 FEATURE_SIGMAS = 2.0  # radius of the ellipses drawn for features
-ELLIPSE_FRAC = 0.022  # radius of the ellipses of warps, of the longer side
+TURN = np.linspace(0.0, 2.0 * np.pi, 25)
+UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
 DARK = "#555555"
 OUTLINED = [withStroke(linewidth=2.5, foreground="white")]
 STYLE: list[str | dict[str, Any]] = [
@@ -59,7 +66,8 @@ def draw_sheet(level: InspectedLevel, stored_size: Size, path: Path) -> None:
     """
     colors = warp_colors(level.plan)
     items = level.plan.items
-    chosen = sorted(largest_warps(level.plan, MAX_NUM_WARPS))
+    largest = sorted(range(len(items)), key=lambda index: -items[index].canvas_area_px)
+    chosen = sorted(largest[:MAX_NUM_WARPS])
     rows = [chosen[first : first + WARPS_PER_ROW] for first in range(0, len(chosen), WARPS_PER_ROW)]
     heights = [TOP_INCHES]
     for row in rows:
@@ -73,7 +81,7 @@ def draw_sheet(level: InspectedLevel, stored_size: Size, path: Path) -> None:
         figure.suptitle("\n".join(map(printable, _title(level, stored_size))))
         grid = figure.add_gridspec(len(heights), WARPS_PER_ROW, height_ratios=heights)
         half = WARPS_PER_ROW // 2
-        _draw_regions(figure.add_subplot(grid[0, :half]), level, colors)
+        _draw_regions(figure.add_subplot(grid[0, :half]), level)
         _draw_all_features(figure.add_subplot(grid[0, half:]), level, colors)
         for place, index in enumerate(chosen, WARPS_PER_ROW):
             axes = figure.add_subplot(grid[divmod(place, WARPS_PER_ROW)])
@@ -104,22 +112,19 @@ def _title(level: InspectedLevel, stored_size: Size) -> Iterator[str]:
     yield from wrap(level.warning, TITLE_CHARS)
 
 
-def _draw_regions(axes: Axes, level: InspectedLevel, colors: Sequence[Color]) -> None:
+def _draw_regions(axes: Axes, level: InspectedLevel) -> None:
     image = tinted(level.photograph, level.plan)
     if level.photograph.mask is not None:
         image[~level.photograph.mask] //= 3
     has_regions = any(item.region is not None for item in level.plan.items)
     all_of_it = "every warp shows the whole photograph" if level.plan.items else "no warps"
     dark = "; dark: masked" if level.photograph.mask is not None else ""
-    how = "number: warp; ellipse: what the warp turns into a circle"
-    _show(axes, image, f"Regions: {how if has_regions else all_of_it}{dark}")
+    _show(axes, image, f"Regions: {'by number of warp' if has_regions else all_of_it}{dark}")
     labels: dict[tuple[float, ...], list[int]] = {}
-    for number, (item, color) in enumerate(zip(level.plan.items, colors, strict=True), 1):
+    for number, item in enumerate(level.plan.items, 1):
         if item.region is not None:
             middle = region_middle(item.region, item.region_origin)
             labels.setdefault(tuple(middle.tolist()), []).append(number)
-            ellipse = circle_origin(item, middle, ELLIPSE_FRAC * max(level.photograph.size))
-            axes.plot(*ellipse, color=color, linewidth=2.0, path_effects=OUTLINED)
     for (x, y), numbers in labels.items():
         text = ", ".join(map(str, numbers[:3])) + " ..." * (len(numbers) > 3)
         axes.text(x, y, text, ha="center", va="center", path_effects=OUTLINED)
@@ -168,3 +173,37 @@ def _show(axes: Axes, image: GrayImage | ColorImage, title: str) -> None:
     axes.autoscale(False)
     axes.set_title(title)
     axes.set_axis_off()
+
+
+def warp_colors(plan: RectificationPlan) -> list[Color]:
+    """Choose a colour for each warp of a plan.
+
+    Warps of one segment, or of one class that shows the whole image, have the same; where these are
+    more than the palette has, it begins anew.
+    """
+    keys = [
+        (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
+        for item in plan.items
+    ]
+    groups = list(dict.fromkeys(keys))
+    return [to_rgb(PALETTE[groups.index(key) % len(PALETTE)]) for key in keys]
+
+
+def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
+    """Return the (H, W, 3) photograph with each region in the colour of its warp."""
+    image = np.repeat(photograph.gray[:, :, None], 3, axis=2)
+    for item, color in zip(plan.items, warp_colors(plan), strict=True):
+        if item.region is not None:
+            rows, columns = np.nonzero(item.region)
+            pixels = rows + item.region_origin[1], columns + item.region_origin[0]
+            mixed = (1.0 - TINT) * photograph.gray[pixels][:, None] + TINT * 255.0 * np.array(color)
+            image[pixels] = np.rint(mixed).astype(np.uint8)
+    return image
+
+
+def region_middle(region: Mask, origin: tuple[int, int]) -> Array:
+    """Return the (2,) pixel of an (h, w) region that is nearest to its centre of mass, image px."""
+    rows, columns = np.nonzero(region)
+    points = np.stack([columns, rows], axis=1).astype(np.float64)
+    nearest = np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1))
+    return np.asarray(points[nearest] + origin)

@@ -116,12 +116,9 @@ def _apart(centers: Array, size: float) -> Array:
 
 
 def edge_paths(
-    names: Sequence[str], layout: Layout, pair_inliers: Mapping[Pair, int], style: str = ""
+    names: Sequence[str], layout: Layout, pair_inliers: Mapping[Pair, int]
 ) -> list[tuple[str, str]]:
-    """Return (class of CSS, SVG path of all its edges), few inliers first.
-
-    Edges are at most ``MAX_NUM_EDGES``; ``style`` is another class that all of them have.
-    """
+    """Return (class of CSS, SVG path of its edges), few inliers first; ``MAX_NUM_EDGES`` in all."""
     index = {name: number for number, name in enumerate(names)}
     parts: dict[int, list[str]] = {}
     strongest = sorted(pair_inliers, key=lambda pair: -pair_inliers[pair])[:MAX_NUM_EDGES]
@@ -129,27 +126,7 @@ def edge_paths(
         (x1, y1), (x2, y2) = layout.centers[[index[name1], index[name2]]]
         line = f"M{x1:.0f} {y1:.0f}L{x2:.0f} {y2:.0f}"
         parts.setdefault(inlier_class(pair_inliers[name1, name2]), []).append(line)
-    return [(f"i{number} {style}".strip(), "".join(parts[number])) for number in sorted(parts)]
-
-
-def differing_edge_paths(
-    names: Sequence[str],
-    layout: Layout,
-    pair_inliers: Mapping[Pair, int],
-    other: Mapping[Pair, int],
-) -> list[tuple[str, str]]:
-    """Return the edges of a graph, with how they differ from those of another one.
-
-    Edges of both are ``shared``, those that only the other has are ``lost``.
-    """
-    lost = {pair: count for pair, count in other.items() if pair not in pair_inliers}
-    shared = {pair: count for pair, count in pair_inliers.items() if pair in other}
-    new = {pair: count for pair, count in pair_inliers.items() if pair not in other}
-    return [
-        *edge_paths(names, layout, lost, "lost"),
-        *edge_paths(names, layout, shared, "shared"),
-        *edge_paths(names, layout, new),
-    ]
+    return [(f"i{number}", "".join(parts[number])) for number in sorted(parts)]
 
 
 def matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> str:

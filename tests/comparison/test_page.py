@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -7,17 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_comparison import IMAGE_SIZE, NAMES, make_comparison
+from small_comparison import NAMES, make_comparison
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison.page import cards_of, choose_pairs, plot_pairs, write_page
-from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
-from colmap_affrect.comparison.tables import columns_of
+from colmap_affrect.comparison.page import cards_of, write_page
+from colmap_affrect.comparison.results import MEASURES, Comparison, MethodResult, SeedResult
+from colmap_affrect.comparison.tables import columns_of, to_json
 from colmap_affrect.comparison.verdict import verdict
-from colmap_affrect.report.match_plots import PLOT_HEIGHT
-from colmap_affrect.report.pictures import Picture
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
@@ -80,29 +78,22 @@ def page(comparison: Comparison, folder: Path) -> Page:
 
 
 def test_numbers_are_those_of_the_comparison(page: Page, comparison: Comparison) -> None:
-    by_method = comparison.to_mapping()["methods"]
+    by_method = json.loads(to_json(comparison))["methods"]
     for name in ("sift", "default"):
         values = by_method[name]
-        for metric in (
-            "registered", "correct", "verified_pairs", "inliers", "points3D",
-            "mean_track_length", "mean_observations", "mean_reprojection_error_px",
-        ):  # fmt: skip
-            mean = values[metric]["mean"]
-            assert page.number(metric, name) == pytest.approx(mean, abs=0.5, rel=0), metric
-        assert page.number("mean_reprojection_error_px", name) == pytest.approx(0.215, abs=0.0051)
-        assert page.number("total_s", name) == pytest.approx(values["total_s"], abs=0.051)
-        for stage, seconds in values["wall_s"].items():
-            assert page.number(f"{stage}_s", name) == pytest.approx(seconds, abs=0.051)
+        seconds = {f"{stage}_s": s for stage, s in values["wall_s"].items()}
+        means = {key: values[key]["mean"] for key in (*MEASURES, "correct") if key[:4] != "num_"}
         scores = [seed["scores"] for seed in values["seeds"]]
         for limit in ("1", "3", "5", "10"):
-            auc = np.mean([score["auc"][limit] for score in scores])
-            assert page.number(f"auc_{limit}", name) == pytest.approx(auc, abs=0.00051)
-        for metric in ("median_rotation_error_deg", "median_direction_error_deg"):
-            mean = np.mean([score[metric] for score in scores])
-            assert page.number(metric, name) == pytest.approx(mean, abs=0.0051)
+            means[f"auc_{limit}"] = np.mean([score["auc"][limit] for score in scores])
+        for key in ("median_rotation_error_deg", "median_direction_error_deg"):
+            means[key] = np.mean([score[key] for score in scores])
+        for key, mean in {**means, **seconds, "total_s": values["total_s"]}.items():
+            decimals = len(page.cells[key, name].split()[0].partition(".")[2])
+            assert page.number(key, name) == pytest.approx(mean, abs=0.51 * 10**-decimals), key
+        assert page.number("mean_reprojection_error_px", name) == pytest.approx(0.215, abs=0.0051)
         assert page.number("peak_memory_bytes", name) == 123
     assert page.cells["registered", "default"] == "4.5 (4-5)"
-    assert page.cells["correct", "default"] == "4.5 (4-5)"
     assert page.cells["models", "default"] == "seed 0: 5; seed 1: 4 + 2"
     assert page.cells["registered", "sift"] == "4.0"
 
@@ -116,7 +107,7 @@ def test_seeds_without_a_model_are_not_averaged_as_0(comparison: Comparison) -> 
     assert (points.min, points.mean) == (with_model.num_points3D,) * 2
     assert registered is not None
     assert (registered.min, registered.mean) == (0.0, 2.5)
-    assert MethodResult("none", seeds=(without,)).to_mapping()["mean_track_length"] is None
+    assert MethodResult("none", seeds=(without,)).span("mean_track_length") is None
 
 
 def test_verdict_failures_and_settings_are_told(page: Page, comparison: Comparison) -> None:
@@ -136,20 +127,6 @@ def test_marks_say_what_each_method_does_with_a_photograph(page: Page) -> None:
     groups = " ".join(page.values("li", "data-groups")).split()
     expected = {"all": 6, "seeds": 1, "wrong": 1, "none": 2}  # "usually" differ: not with half
     assert {group: groups.count(group) for group in set(groups)} == expected
-
-
-def test_of_methods_that_contradict_each_other_the_odd_one_is_marked(
-    comparison: Comparison,
-) -> None:
-    name, (sift, _, default) = NAMES[0], comparison.methods
-    odd = replace(default, name="odd", disagreements={"sift": (name,), "default": (name,)})
-    others = [replace(each, disagreements={"odd": (name,)}) for each in (sift, default)]
-
-    assert uncertain(comparison, odd, *others) == []  # ground truth calls all of them right
-    odd, *others = map(without_truth, (odd, *others))
-    assert uncertain(comparison, odd, *others) == [(name, "odd")]
-    two = replace(odd, disagreements={"sift": (name,)}), others[0]
-    assert sorted(uncertain(comparison, *two)) == [(name, "odd"), (name, "sift")]
 
 
 def test_photographs_that_their_method_doubts_are_marked(comparison: Comparison) -> None:
@@ -190,11 +167,10 @@ def test_page_loads_nothing_and_names_are_never_markup(page: Page, folder: Path)
 def test_every_picture_has_a_text_and_every_table_headers(page: Page) -> None:
     assert sum(tag == "img" for tag, _ in page.tags) == len(page.values("img", "alt"))
     labels = page.values("svg", "aria-label")
-    assert len(labels) == len(page.values("svg", "role")) > 4
+    assert len(labels) == len(page.values("svg", "role")) == 4
     assert set(page.values("th", "scope")) == {"col", "row"}
     graphs = [text for text in labels if text.startswith("View graph")]
     assert graphs[0].endswith("verified pairs")
-    assert graphs[1].endswith("lost")
 
 
 def test_best_method_comes_first_and_best_values_are_marked(page: Page) -> None:
@@ -206,35 +182,11 @@ def test_best_method_comes_first_and_best_values_are_marked(page: Page) -> None:
     assert "mean_reprojection_error_px" not in best  # the same in both
 
 
-def test_matches_lie_where_the_features_are(comparison: Comparison, folder: Path) -> None:
-    pair = (NAMES[0], NAMES[1])
-    methods = choose_pairs(comparison.finished, ["default"])[pair]
-    pictures = {name: Picture("", 80, 60) for name in NAMES}
-    (item,) = plot_pairs({pair: methods}, pictures, folder)
-    assert list(item["plots"]) == ["sift", "default"]
-    before, after = item["plots"].values()
-    assert (before.num_inliers, before.plain, before.warped) == (0, "", "")
-    assert after.num_inliers == comparison.methods[2].seeds[0].pair_inliers[pair]
-    with open_copy(folder / "methods/default/seed-0/database.db") as database:
-        ids = {image.name: image.image_id for image in database.read_all_images()}
-        indices = database.read_two_view_geometry(ids[pair[0]], ids[pair[1]]).inlier_matches
-        points = [database.read_keypoints(ids[name])[:, :2] for name in pair]
-    expected_plain, expected_warped = set(), set()
-    scale = PLOT_HEIGHT / IMAGE_SIZE[1]
-    for index1, index2 in indices:
-        (x1, y1), (x2, y2) = scale * points[0][index1], scale * points[1][index2]
-        line = f"{x1:.1f} {y1:.1f}L{x2 + scale * IMAGE_SIZE[0] + 8:.1f} {y2:.1f}"
-        (expected_warped if index1 % 2 or index2 % 2 else expected_plain).add(line)
-    assert set(after.plain.split("M")[1:]) == expected_plain
-    assert set(after.warped.split("M")[1:]) == expected_warped
-    assert after.num_from_warps == len(expected_warped) > 0 < len(expected_plain)
-
-
 def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
     (tmp_path / "photographs").mkdir()
     write_image(tmp_path / "photographs" / "a.png", texture((64, 48), 0))
     (tmp_path / "photographs" / "b.png").write_bytes(b"no image")
-    seed = SeedResult(0, (), "", 0, 0.0, 0.0, 0.0, {}, {}, None, {})
+    seed = SeedResult(0, (), "", 0, 0.0, 0.0, {}, None, {})
     nothing = Comparison(
         ("a.png", "b.png"), str(tmp_path / "photographs"),
         (MethodResult("sift", seeds=(seed,)),), (0,), 1, {}, {},
@@ -251,10 +203,7 @@ def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
     assert "No method finished" in page.text
 
 
-def test_lost_models_and_databases_are_said_in_their_place(
-    comparison: Comparison, tmp_path: Path
-) -> None:
+def test_lost_models_are_said_in_their_place(comparison: Comparison, tmp_path: Path) -> None:
     page = Page(write_page(comparison, tmp_path).read_text(encoding="utf-8"))
     assert "The model cannot be shown" in page.text
-    assert "The inliers cannot be drawn" in page.text
     assert page.number("registered", "sift") == 4

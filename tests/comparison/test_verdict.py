@@ -16,20 +16,18 @@ DENSE = {"rectifier": {"name": "dense-shapes"}, "escalation": []}
 ON_DEMAND = {"rectifier": {"name": "identity"}, "escalation": [{"name": "asift"}]}
 
 
-def seed_result(names, seed=0, correct=None, points=500, track=3.0):
+def seed_result(names, seed=0, correct=None):
     scores = None if correct is None else PoseScores(tuple(correct), {}, 15, {}, None)
     return SeedResult(
         seed=seed,
         model_names=(tuple(names),) if names else (),
         model_path="",
         num_points3D=900,
-        mean_track_length=track,
-        mean_observations=float(points),
+        mean_track_length=3.0,
         mean_reprojection_error_px=0.5,
         pair_inliers={("a", "b"): 50},
         scores=scores,
         wall_s={"verify": 1.0, "map": 3.0 + 2 * seed},
-        num_observations=dict.fromkeys(names, points),
     )
 
 

@@ -38,36 +38,29 @@ def require_pose(found: Any, first: int, second: int) -> None:
     np.testing.assert_allclose(moved, pose(second)[1], atol=1e-9)
 
 
-def test_layout_of_the_extreme_view_dataset(tmp_path: Path) -> None:
+def test_layouts_of_pairs_with_homographies(tmp_path: Path) -> None:
     write_extreme_views(tmp_path, ["cafe"])
     np.savetxt(tmp_path / "h" / "cafe.txt", -3.0 * TRUTH)
-    (pair,) = load_evd(tmp_path).pairs
-    names = [image.name for image in pair.images]
-    assert (pair.name, names, pair.problem) == ("cafe", ["1/cafe.png", "2/cafe.png"], "")
-    np.testing.assert_allclose(pair.truth.matrix, 3.0 * TRUTH)  # positive where it is visible
-    assert pair.truth.size1 == SIZE == (160, 120)
-
-
-def test_sequences_as_oxfords(tmp_path: Path) -> None:
     write_pair(tmp_path / "my_wall_1.png", tmp_path / "my_wall_3.png", seed=1)
     np.savetxt(tmp_path / "H_my_wall_1_3.txt", TRUTH)
-    (pair,) = load_evd(tmp_path).pairs
-    assert (pair.name, pair.images[1].name) == ("my_wall 1-3", "my_wall_3.png")
-    np.testing.assert_allclose(pair.truth.matrix, TRUTH)
+    cafe, wall = load_evd(tmp_path).pairs
+    names = [image.name for image in cafe.images]
+    assert (cafe.name, names, cafe.problem) == ("cafe", ["1/cafe.png", "2/cafe.png"], "")
+    np.testing.assert_allclose(cafe.truth.matrix, 3.0 * TRUTH)  # positive where it is visible
+    assert cafe.truth.size1 == SIZE == (160, 120)
+    assert (wall.name, wall.images[1].name) == ("my_wall 1-3", "my_wall_3.png")
 
 
 def test_pairs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
-    write_extreme_views(tmp_path, ["good", "imageless", "truthless", "flat", "broken", "aside"])
+    write_extreme_views(tmp_path, ["good", "imageless", "truthless", "broken", "aside"])
     (tmp_path / "2" / "imageless.png").unlink()
     (tmp_path / "h" / "truthless.txt").unlink()
-    np.savetxt(tmp_path / "h" / "flat.txt", TRUTH[[0, 0, 0]])
     (tmp_path / "1" / "broken.png").write_bytes(b"no image")
     np.savetxt(tmp_path / "h" / "aside.txt", np.array([[1, 0, 900], [0, 1, 0], [0, 0, 1]]))
     problems = {pair.name: pair.problem for pair in load_evd(tmp_path).pairs}
     assert problems["good"] == ""
     assert "imageless.png: missing" in problems["imageless"]
     assert "truthless.txt: cannot be read" in problems["truthless"]
-    assert "singular" in problems["flat"]
     assert "not a readable image" in problems["broken"]
     assert "shows no part of image 1" in problems["aside"]
 
@@ -110,32 +103,27 @@ def test_pairs_without_an_image_or_pose_are_left_out_and_named(svp: Path) -> Non
     assert dataset.notes == (
         "scene4: 2 of 3 listed pairs are left out, without an image or its camera: d",
     )
-    (svp / "0" / "images.txt").write_text(scenes.image_line(0) + "\n")
-    with pytest.raises(EvaluationError, match="no pair can be evaluated; scene4: 3 of 3"):
-        load_svp(svp)
 
 
 @pytest.mark.parametrize(("file", "old", "new"), [
     ("cameras.txt", "SIMPLE_RADIAL", "ROUND"),
     ("cameras.txt", "300.0", "nan"),
-    ("images.txt", "1 0.99", "1 2.99"),
+    ("images.txt", "1 0.99", "1 one"),
 ])  # fmt: skip
 def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, new: str) -> None:
     path = svp / "0" / file
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(EvaluationError, match=r"COLMAP cannot read it|quaternion of length 3"):
+    with pytest.raises(EvaluationError, match=r"cannot be read|not finite"):
         load_svp(svp)
 
 
-def test_category_is_that_of_the_poses_and_bad_lines_are_refused(svp: Path) -> None:
-    path = svp / "scene4_image_pairs.txt"
-    path.write_text("a.jpg b.jpg 0\n\na.png d.png 5\n# d.png\na.png c.png\n")
+def test_points_of_images_are_passed_over_and_bad_lines_are_refused(svp: Path) -> None:
     images = svp / "0" / "images.txt"
     images.write_text(images.read_text().replace("png\n", "png\n10.5 20.5 1 30.5 40.5 -1\n"))
-    assert list(categories(load_svp(svp)).values()) == ["0°", "10°", "20°"]
-    path.write_text("a.png b.png 0\nb.png\n")
+    assert len(load_svp(svp).pairs) == 3
+    (svp / "scene4_image_pairs.txt").write_text("a.png b.png 0\nb.png\n")
     with pytest.raises(EvaluationError, match=r"scene4_image_pairs\.txt: 'b\.png' is no pair"):
         load_svp(svp)
 
@@ -156,15 +144,6 @@ def test_imc_scene_or_folder_of_scenes_is_read(imc: Path, path: str) -> None:
     require_pose(dataset.pairs[0].truth, 0, 3)
 
 
-def test_list_from_zero_may_be_there_and_others_must_be(imc: Path) -> None:
-    folder = imc / "set_100" / "new-vis-pairs"
-    np.save(folder / "keys-th-0.0.npy", np.array(["a-b", "a-d", "b-c"]))
-    assert list(categories(load_imc(imc)).values()) == ["0.0", "0.1", "0.2"]
-    np.save(folder / "keys-th-0.9.npy", np.array(["a-d", None], dtype=object))
-    with pytest.raises(EvaluationError, match=r"keys-th-0\.9\.npy: cannot be read \(Object arrays"):
-        load_imc(imc)
-
-
 def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
     root = imc / "set_100"
     for name in scenes.NAMES:
@@ -178,11 +157,9 @@ def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
 
 
 @pytest.mark.parametrize(("changes", "fault"), [
-    ({"K": np.diag([np.nan, 300, 1])}, "K is empty or has values that are not finite"),
     ({"K": np.diag([300.0, 300, 1])}, r"K is not \[\[fx, 0, cx\]"),
     ({"T": None}, "cannot be read"),
-    ({"R": 2 * pose(0)[0]}, "R is not orthonormal"),
-    ({"R": pose(0)[0] * [1, 1, -1]}, "or a reflection"),
+    ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
 ])  # fmt: skip
 def test_unusable_calibration_is_refused(imc: Path, changes: Entry, fault: str) -> None:
     scenes.write_calibration(imc, 0, **changes)
@@ -244,15 +221,14 @@ def planar(tmp_path: Path) -> Entry:
     return {"image1": "a.png", "image2": "b.png"}
 
 
-@pytest.mark.parametrize("in_file", [False, True])
-def test_homography_of_corner_pixels(tmp_path: Path, planar: Entry, in_file: bool) -> None:
+def test_homography_of_corner_pixels(tmp_path: Path, planar: Entry) -> None:
     corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     matrix = corner @ TRUTH @ np.linalg.inv(corner)
     np.savetxt(tmp_path / "h.txt", matrix)
-    entry = {**planar, "homography": "h.txt" if in_file else matrix.tolist()}
-    (pair,) = listed(tmp_path, entry, pixel_origin="corner").pairs
-    np.testing.assert_allclose(pair.truth.matrix, TRUTH, atol=1e-9)
-    assert pair.name == "a b"
+    given = {"of file": "h.txt", "of numbers": matrix.tolist()}
+    entries = [{**planar, "name": name, "homography": h} for name, h in given.items()]
+    for pair in listed(tmp_path, *entries, pixel_origin="corner").pairs:
+        np.testing.assert_allclose(pair.truth.matrix, TRUTH, atol=1e-9)
 
 
 def posed(**changes: Any) -> Entry:
@@ -285,7 +261,6 @@ def test_poses_and_points_in_pixels_of_both_origins(
 
 @pytest.mark.parametrize(("changes", "problem"), [
     ({"homography": [[1, 2], [3, 4]]}, r"has shape \(2, 2\)"),
-    ({"relative_pose": posed(rotation=(2 * np.eye(3)).tolist())}, "not orthonormal"),
     ({"relative_pose": posed(centre=[0, 0, 0])}, "relative_pose needs"),
     ({"correspondences": "../points.txt"}, "must be a file in the folder"),
 ])  # fmt: skip
@@ -304,13 +279,11 @@ SAME = '{"image1": "a.png", "image2": "b.png", "homography": "h.txt"}'
 @pytest.mark.parametrize(("content", "message"), [
     ("[]", "cannot be read"),
     ('{"pairs": [1]}', r"pairs\[0\]: expected options, got 1"),
-    ('{"pairs": [], "pixel_origin": "left"}', r"cannot be read \(KeyError\('left'\)\)"),
     (
         '{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}',
         "must be path",
     ),
     ('{"pairs": [{"image1": "a", "image2": "b"}]}', "needs homography, correspondences or"),
-    ('{"pairs": [{"image1": "a", "image2": "b", "truth": 1}]}', "unknown option 'truth'"),
     (f'{{"pairs": [{SAME}, {SAME}]}}', "two pairs are called 'a b'"),
 ])  # fmt: skip
 def test_bad_list_is_one_line(content: str, message: str, tmp_path: Path) -> None:

@@ -15,11 +15,10 @@ from small_scene import write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import read_names
-from colmap_affrect.doctor.findings import Findings
+from colmap_affrect.doctor.findings import Diagnosis
 from colmap_affrect.doctor.folder import examine_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.interop.pycolmap_api import extract_features
-from colmap_affrect.progress import SILENT
 
 ROWS = [
     ("UPDATE images SET camera_id = 999 WHERE image_id = 1", "images whose camera does not exist"),
@@ -46,9 +45,9 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def num_errors(path: Path) -> int:
     """What the doctor finds in a database; the installation is left out, which takes long."""
-    findings = Findings(SILENT)
-    examine_database(findings, path, None)
-    return findings.diagnosis().num_errors
+    diagnosis = Diagnosis()
+    examine_database(diagnosis, path, None)
+    return diagnosis.num_errors
 
 
 def changed(healthy: Path, path: Path, statement: Statement) -> Path:

@@ -48,7 +48,7 @@
   }
   document.addEventListener("click", (event) => {
     const photograph = event.target.closest("[data-open]");
-    const large = event.target.closest(".enlarge, .matches, .panel > img");
+    const large = event.target.closest(".enlarge, .panel > img");
     if (photograph) open(Number(photograph.dataset.open));
     else if (large) enlarge(large.closest(".panel"));
   });
