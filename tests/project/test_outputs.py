@@ -164,14 +164,13 @@ IN_TEMPORARY_FOLDERS = {
     ("export.py", "_points"), ("export.py", "_nerfstudio"), ("export.py", "_text"),
     ("hdf5_layouts.py", "created"),
     ("inspection.py", "inspect_image"), ("sheet.py", "draw_sheet"), ("conversion.py", "_convert"),
-    ("compare.py", "_make_shared"), ("worker.py", "_run_seed"), ("worker.py", "_seed_result"),
-    ("datasets.py", "read_views"),
+    ("worker.py", "_run_seed"), ("worker.py", "_map_sift"), ("sift.py", "match_sift"),
 }  # fmt: skip
 """Functions that write where the door lets them."""
 
 IN_WORK_FOLDERS = {
-    ("compare.py", "_run"), ("runner.py", "__init__"), ("__init__.py", "_logging"),
-    ("plots.py", "write_plots"),
+    ("compare.py", "_run"), ("compare.py", "_require_same_inputs"), ("task.py", "begin"),
+    ("runner.py", "__init__"), ("__init__.py", "_logging"), ("plots.py", "write_plot"),
 }  # fmt: skip
 """Functions that write where the door has refused folders of others, and links."""
 
