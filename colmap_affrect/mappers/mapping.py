@@ -110,5 +110,6 @@ def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> Mo
         taken_out=dict(mapped.taken_out),
         focals_px=focals,
         rival_focals_px=dict(mapped.rival_focals_px),
+        moves=mapped.moves,
         loose=tuple(name for name, why in doubts.images.items() if why == FOCAL_DOUBT),
     )

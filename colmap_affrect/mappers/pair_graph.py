@@ -113,7 +113,6 @@ class PairGraph:
         weak: verified pairs that are not among the strongest, and in the cache only.
         min_num_matches: pairs with fewer inliers are left out.
         depth_at: depth maps of the images, where there are any.
-        unthinned: the same pairs with all their matches, where this graph has some of them.
     """
 
     cache: pycolmap.DatabaseCache
@@ -124,7 +123,6 @@ class PairGraph:
     weak: tuple[VerifiedPair, ...]
     min_num_matches: int
     depth_at: DepthLookup | None = None
-    unthinned: Self | None = None
 
     @classmethod
     def read(
@@ -157,22 +155,19 @@ class PairGraph:
         strong, weak = _strongest(verified)
         return cls(cache, names, of_images, keypoints, strong, weak, min_num_matches, depth_at)
 
-    @property
-    def whole(self) -> Self:
-        """The graph with all matches."""
-        return self.unthinned or self
-
     def without(self, ids: Collection[Ids]) -> Self:
         """Leave out some pairs."""
-        kept = self._with((p for p in self._verified if p.ids not in ids), self.cache)
-        return replace(kept, unthinned=self.unthinned and self.unthinned.without(ids))
+        return self._with((pair for pair in self._verified if pair.ids not in ids), self.cache)
 
     def with_inliers(self, inliers: Mapping[Ids, NDArray[np.int64]]) -> Self:
-        """Leave some pairs only those (M, 2) inliers."""
-        kept = self._with(
-            (_with_some(pair, inliers.get(pair.ids)) for pair in self._verified), self.cache
+        """Leave some pairs only those of their inliers that are among (M, 2) given ones."""
+        kept = (
+            replace(pair, matches=pair.matches[rows_in(pair.matches, inliers[pair.ids])])
+            if pair.ids in inliers
+            else pair
+            for pair in self._verified
         )
-        return replace(kept, unthinned=self.unthinned and self.unthinned.with_inliers(inliers))
+        return self._with(kept, self.cache)
 
     @property
     def _verified(self) -> tuple[VerifiedPair, ...]:
@@ -197,7 +192,7 @@ class PairGraph:
         if 2 * sum(map(np.sum, kept)) > sum(map(len, kept)):
             return self
         some = (replace(p, matches=p.matches[k]) for p, k in zip(pairs, kept, strict=True))
-        return replace(self._with(some, self.cache), unthinned=self)
+        return self._with(some, self.cache)
 
     def _with(self, verified: Iterable[VerifiedPair], cache: pycolmap.DatabaseCache) -> Self:
         """Return a graph of other pairs, with the cameras and images of a cache."""
@@ -349,13 +344,6 @@ def _strongest(
         (strong if is_strong else weak).append(pair)
         counts.update(pair.ids)
     return tuple(sorted(strong, key=lambda pair: pair.ids)), tuple(weak)
-
-
-def _with_some(pair: VerifiedPair, inliers: NDArray[np.int64] | None) -> VerifiedPair:
-    """Return a pair with those of its matches that are among some; with all if None."""
-    if inliers is None:
-        return pair
-    return replace(pair, matches=pair.matches[rows_in(pair.matches, inliers)])
 
 
 def _empty_copy(

@@ -25,7 +25,7 @@ SHARED_SIGMA = 0.1
 these images do not tell it, and models that are to be joined must agree."""
 SAME_FOCAL = 0.03  # of the logarithm: bridges built with one are right with the other
 FACTORS = 1.25, 0.8  # of a focal length, from which another adjustment starts
-NUM_STARTS = 3  # models that are joined to the others in turn
+NUM_STARTS = 3
 MIN_RIVAL = 1.15  # factor between two focal lengths that are told apart
 
 
@@ -38,6 +38,8 @@ class Search:
     native: pycolmap.IncrementalPipelineOptions
     num_seeds: int
     show: Callable[[int], None]
+    num_starts: int = NUM_STARTS
+    """Models that are joined to the others in turn; with 0 there are no bridges."""
 
     def grower(self, graph: PairGraph, adjuster: Adjuster | None = None) -> Grower:
         """Return what grows models of a graph."""
@@ -64,7 +66,7 @@ class Search:
         while left:
             adjuster = left.pop(0)
             grower = self.grower(graph, adjuster)
-            found = self.joined(graph, adjuster, self._grown(graph, grower), NUM_STARTS)
+            found = self.joined(graph, adjuster, self._grown(graph, grower), self.num_starts)
             if not found:
                 continue
             model, evidence = self._with_free_cameras(graph, found[0].reconstruction)
@@ -90,7 +92,7 @@ class Search:
         grower, again = near.grower(graph), pycolmap.Reconstruction(start)
         grower.finish(again)
         models = sorted([again, *near._grown(graph, grower)], key=self.evidence.of, reverse=True)
-        found = near.joined(graph, near.adjuster, models, NUM_STARTS)
+        found = near.joined(graph, near.adjuster, models, self.num_starts)
         for model in found:
             grower.finish(model.reconstruction)
         return found
@@ -179,19 +181,13 @@ class Search:
     def joined(
         self, graph: PairGraph, adjuster: Adjuster, models: Models, num_starts: int
     ) -> list[MappedModel]:
-        """Return the best model that bridges make of some, best first, and those left out of it.
-
-        Bridges need all points, for theirs are to lie beside them.
-        """
+        """Return the best model that bridges make of some, best first, and those left out of it."""
         if not models:
             return []
-        if graph.is_explained_by(models[0]):
+        if not num_starts or graph.is_explained_by(models[0]):
             return [MappedModel(models[0])]
-        grower = self.grower(graph.whole, adjuster)
-        if graph.unthinned:
-            for model in models:
-                grower.fill(model, MEDIUM)
-        joiner = Joiner(graph.whole, grower, self.evidence)
+        grower = self.grower(graph, adjuster)
+        joiner = Joiner(graph, grower, self.evidence)
         joined = [
             joiner.join(model, models[:index] + models[index + 1 :])
             for index, model in enumerate(models[:num_starts])

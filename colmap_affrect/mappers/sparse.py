@@ -1,7 +1,7 @@
 """The sparse mapper: mapping as one estimate, for small sets with few matches."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,6 +16,7 @@ from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.options import within
 
+SOME_TRACKS = "from some of the tracks"  # the move that makes easy models
 LARGE = 100  # images from which on COLMAP's own pipeline maps
 
 
@@ -110,14 +111,14 @@ class SparseMapper(IncrementalMapper):
         """Let images of one size share unknown cameras, unless the evidence is against that."""
         cameras = with_shared_cameras(task.cameras)
         if not task.may_share or len(cameras) == len(task.cameras):
-            return self._best(task, graph, native, show).with_all_points()
+            return self._best(task, graph, native, show)[0]
         sharing = replace(task, cameras=cameras)
-        shared = self._best(sharing, graph.with_cameras(cameras), native, show)
-        if not shared.models or not graph.is_explained_by(shared.models[0].reconstruction):
-            free = self._best(task, graph, native, show)
-            if shared.evidence < free.evidence - MIN_GAIN:
-                return free.with_all_points()
-        return shared.with_all_points()
+        shared, evidence = self._best(sharing, graph.with_cameras(cameras), native, show)
+        if not shared or not graph.is_explained_by(shared[0].reconstruction):
+            free, most = self._best(task, graph, native, show)
+            if evidence < most - MIN_GAIN:
+                return free
+        return shared
 
     def _best(
         self,
@@ -125,47 +126,47 @@ class SparseMapper(IncrementalMapper):
         graph: PairGraph,
         native: pycolmap.IncrementalPipelineOptions,
         show: Callable[[int], None],
-    ) -> "_Found":
-        """Return what has most evidence after all moves, made of tracks that tell the poses."""
-        thin = graph.thinned()
-        search = self._search(task, thin, native, show)
+    ) -> tuple[list[MappedModel], float]:
+        """Return what has most evidence, and how much, after all moves."""
         ids = {name: image_id for image_id, name in graph.names.items()}
         measured = {(ids[a], ids[b]): inliers for (a, b), inliers in task.measured.items()}
-        best, tried = _Found(search, thin, [], 0.0), set[frozenset[tuple[Ids, int]]]()
+        search = self._search(task, graph, native, show)
+        if easy := self._of_some_tracks(task, graph, graph.with_inliers(measured), search):
+            return easy, search.evidence_of(easy)
+        best: list[MappedModel] = []
+        most, tried = 0.0, set[frozenset[tuple[Ids, int]]]()
         for name, move in MOVES.items():
-            start = best.models[0].reconstruction if best.models else None
-            if start and search.is_certain(start, thin):
+            start = best[0].reconstruction if best else None
+            if start and search.is_certain(start, graph):
                 break
-            reduction = move(State(thin, measured, native.random_seed, start))
+            reduction = move(State(graph, measured, native.random_seed, start))
             if not reduction:
                 continue
-            reduced = reduction(thin)
+            reduced = reduction(graph)
             pairs = frozenset((pair.ids, len(pair.matches)) for pair in reduced.pairs)
             if pairs in tried or (start and reduced.is_explained_by(start)):
                 continue
             tried.add(pairs)
             models = search.best(reduced, start)
             evidence = search.evidence_of(models)
-            if not best.models or evidence > best.evidence:
-                moves = (*(best.models[0].moves if best.models else ()), name)
-                models = [replace(model, moves=moves) for model in models]
-                best = _Found(search, reduced, models, evidence)
-        return best
+            if not best or evidence > most:
+                moves = (*(best[0].moves if best else ()), name)
+                best, most = [replace(model, moves=moves) for model in models], evidence
+        return best, most
 
+    def _of_some_tracks(
+        self, task: MappingTask, graph: PairGraph, reduced: PairGraph, search: Search
+    ) -> list[MappedModel]:
+        """Return a model of all images if some tracks make one that is certain.
 
-@dataclass(frozen=True)
-class _Found:
-    """Models, that with most evidence first, and the pairs that made them."""
-
-    search: Search
-    graph: PairGraph
-    models: list[MappedModel]
-    evidence: float
-
-    def with_all_points(self) -> list[MappedModel]:
-        """Return the models with all points that the pairs make."""
-        if self.graph.unthinned:
-            grower = self.search.grower(self.graph.unthinned)
-            for model in self.models:
-                grower.fill(model.reconstruction, FINAL)
-        return self.models
+        It has the points of all tracks of ``reduced``.
+        """
+        thin = reduced.thinned()
+        if thin is reduced:
+            return []
+        quick = self._search(task, thin, search.native, search.show)
+        models = replace(quick, num_starts=0).best(thin)
+        if not models or not quick.is_certain(models[0].reconstruction, graph):
+            return []
+        search.grower(reduced).fill(models[0].reconstruction, FINAL)
+        return [replace(models[0], moves=(SOME_TRACKS,))]

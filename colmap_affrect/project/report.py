@@ -26,6 +26,7 @@ SOURCES = {
 
 OF_LARGEST = (
     "registered_names", "doubtful", "doubts", "mean_track_length", "mean_reprojection_error_px",
+    "moves",
 )  # fmt: skip
 OF_RUN = (
     "unregistered", "advice", "extended", "added", "num_pairs", "num_verified_pairs", "pair_levels",
@@ -176,6 +177,7 @@ class ModelSummary:
         focals_px: focal length of each image's camera.
         rival_focals_px: lowest and highest of models that agree as well with the pairs, of images
             for which these differ.
+        moves: what made the model, by the sparse mapper.
     """
 
     registered_names: tuple[str, ...]
@@ -189,6 +191,7 @@ class ModelSummary:
     focals_px: dict[str, float] = field(default_factory=dict)
     rival_focals_px: dict[str, tuple[float, float]] = field(default_factory=dict)
     loose: tuple[str, ...] = ()
+    moves: tuple[str, ...] = ()
 
     @property
     def is_trustworthy(self) -> bool:

@@ -66,7 +66,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
     assert read == {
         "status": "partial", "images_total": 5, "images_registered": 2, "num_models": 2,
         "registered_names": ["a.png", "č d.png"], "unregistered": REPORT.unregistered,
-        "doubtful": {}, "doubts": [], "advice": ["--recipe on-demand"], "guided": {},
+        "doubtful": {}, "doubts": [], "moves": [], "advice": ["--recipe on-demand"], "guided": {},
         "cameras": list(REPORT.cameras), "points3D": 120, "mean_track_length": 2.25,
         "mean_reprojection_error_px": 0.512, "models": [["a.png", "č d.png"], ["e.png", "f.png"]],
         "extended": [], "added": [], "num_pairs": 10, "num_verified_pairs": 3,
