@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA, FINAL, NOISE_PX, Adjuster, priors_of
+from colmap_affrect.mappers.adjustment import EXIF_SIGMA, FAST, NOISE_PX, Adjuster, priors_of
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
@@ -168,5 +168,5 @@ class SparseMapper(IncrementalMapper):
         models = replace(quick, num_starts=0).best(thin)
         if not models or not quick.is_certain(models[0].reconstruction, graph):
             return []
-        search.grower(reduced).fill(models[0].reconstruction, FINAL)
+        search.grower(reduced).fill(models[0].reconstruction, FAST)  # poses are right
         return [replace(models[0], moves=(SOME_TRACKS,))]
