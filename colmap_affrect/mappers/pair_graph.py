@@ -4,11 +4,12 @@ import copy
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -172,6 +173,12 @@ class PairGraph:
     @property
     def _verified(self) -> tuple[VerifiedPair, ...]:
         return self.pairs + self.weak
+
+    @cached_property
+    def most_connected(self) -> frozenset[int]:
+        """The images that pairs connect with the most others."""
+        parts = nx.connected_components(nx.Graph(pair.ids for pair in self.pairs))
+        return frozenset(max(parts, key=len, default=()))
 
     def with_cameras(self, records: Mapping[int, CameraRecord]) -> Self:
         """Give images the cameras that records say they have, of those of the graph."""

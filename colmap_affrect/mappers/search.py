@@ -100,14 +100,14 @@ class Search:
     def is_certain(
         self, model: pycolmap.Reconstruction, graph: PairGraph, *, agrees: bool = True
     ) -> bool:
-        """Tell whether a model has all images, and all pairs or features of three confirm it.
+        """Tell whether a model has all images that are connected, and pairs or points confirm it.
 
-        The pairs do if its unknown focal lengths are those that it was made with.
+        That is, no pair contradicts it and its unknown focal lengths are those that it was made
+        with, or features of three images confirm it.
         """
-        if model.num_reg_images() < len(graph.keypoints):
+        if not graph.most_connected.issubset(model.reg_image_ids()):
             return False
-        explained = agrees and graph.is_explained_by(model)
-        return explained or self.evidence.is_confirmed(model)
+        return (agrees and not graph.contradicted(model)) or self.evidence.is_confirmed(model)
 
     @cached_property
     def unknown(self) -> dict[int, FocalPrior]:

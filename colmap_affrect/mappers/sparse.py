@@ -166,7 +166,8 @@ class SparseMapper(IncrementalMapper):
             return []
         quick = self._search(task, thin, search.native, search.show)
         models = replace(quick, num_starts=0).best(thin)
-        if not models or not quick.is_certain(models[0].reconstruction, graph):
+        has_all = models and models[0].reconstruction.num_reg_images() == len(graph.keypoints)
+        if not has_all or not quick.is_certain(models[0].reconstruction, graph):
             return []
         search.grower(reduced).fill(models[0].reconstruction, FAST)  # poses are right
         return [replace(models[0], moves=(SOME_TRACKS,))]

@@ -90,3 +90,12 @@ def test_images_get_the_cameras_of_records(path: Path) -> None:
     for image in model.images.values():
         assert image.name in shared[image.camera_id].names
     assert len({camera.camera_id for camera in graph.cameras.values()}) == NUM_IMAGES
+
+
+def test_most_connected_is_the_largest_part(path: Path) -> None:
+    graph = PairGraph.read(path)
+    assert graph.most_connected == set(graph.keypoints)
+    part = set(sorted(graph.keypoints)[:2])
+    apart = graph.without([p.ids for p in graph.pairs if len(part.intersection(p.ids)) == 1])
+    assert apart.most_connected == set(graph.keypoints) - part
+    assert not graph.without([pair.ids for pair in graph.pairs]).most_connected
