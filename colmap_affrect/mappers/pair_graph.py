@@ -177,7 +177,9 @@ class PairGraph:
     @cached_property
     def most_connected(self) -> frozenset[int]:
         """The images that pairs connect with the most others."""
-        parts = nx.connected_components(nx.Graph(pair.ids for pair in self.pairs))
+        graph = nx.Graph()
+        graph.add_edges_from(pair.ids for pair in self.pairs)
+        parts = nx.connected_components(graph)
         return frozenset(max(parts, key=len, default=()))
 
     def with_cameras(self, records: Mapping[int, CameraRecord]) -> Self:
