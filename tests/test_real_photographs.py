@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 import pytest
 from command import Call
-
-sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from registration import compare, compare_subset
 
 from colmap_affrect.colmap.database import open_database

@@ -16,7 +16,6 @@ moments depend on how fast the machine is.
 
 from __future__ import annotations
 
-import argparse
 import random
 import re
 import shutil
@@ -34,7 +33,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from command import run_in_process_of_its_own
-from machine import describe_machine, table
+from machine import describe_machine, parser_of, table
 from results import (
     Undisturbed,
     assert_readable,
@@ -183,7 +182,7 @@ def campaign(cases: Sequence[Case], kind: str, count: int, seed: int, folder: Pa
 
 def main() -> int:
     """Make the trials and print a table of them."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--output-path", type=Path, required=True)
     parser.add_argument("--image-path", type=Path, nargs="+", default=[SAMPLE])
     parser.add_argument("--seed", type=int, default=0)

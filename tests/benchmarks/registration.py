@@ -15,7 +15,6 @@ again as long as the options are the same: after a change of code remove that fo
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import subprocess
@@ -23,8 +22,9 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
 from typing import Any
+
+from machine import parser_of, span, table
 
 
 @dataclass(frozen=True)
@@ -142,41 +142,29 @@ def rows_of(name: str, comparison: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def span(values: Iterable[float | None], digits: int = 0) -> str:
-    """Format mean [min-max], shortened where all values are the same; - without values.
-
-    >>> [span([2, 3, 3, 3]), span([3, 3]), span([0.25, 0.75], 2), span([None])]
-    ['2.8 [2-3]', '3', '0.500 [0.25-0.75]', '-']
-    """
-    known = [value for value in values if value is not None]
-    if not known:
-        return "-"
-    low, high = f"{min(known):.{digits}f}", f"{max(known):.{digits}f}"
-    return low if low == high else f"{fmean(known):.{digits + 1}f} [{low}-{high}]"
-
-
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table_of(rows: Sequence[dict[str, Any]]) -> str:
     """Format "correct of registered, rotation error" as a Markdown table of subsets by methods."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = [f"| subset | images | {' | '.join(methods)} |", f"|---|--:|{'--:|' * len(methods)}"]
-    for name in (name for name in SUBSETS if any(row["subset"] == name for row in rows)):
+    lines = []
+    for name in SUBSETS:
+        of_subset = [row for row in rows if row["subset"] == name]
         cells = []
-        for method in methods:
-            runs = [row for row in rows if (row["subset"], row["method"]) == (name, method)]
+        for method in methods if of_subset else ():
+            runs = [row for row in of_subset if row["method"] == method]
             correct, registered = (
                 span(run[key] for run in runs) for key in ("correct", "registered")
             )
             errors = span((run["rotation_error_deg"] for run in runs), 2)
             cells.append(f"{correct} of {registered}, {errors} degrees")
-        num_images = next(row["num_images"] for row in rows if row["subset"] == name)
-        lines.append(f"| {name} | {num_images} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        if of_subset:
+            lines.append([name, str(of_subset[0]["num_images"]), *cells])
+    return table(["subset", "images", *methods], lines)
 
 
 def main() -> None:
     """Run all methods on all subsets."""
     root = Path(__file__).resolve().parents[2]
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--methods", nargs="+", default=["sift", "sift-affine-dsp", "default"])
     parser.add_argument("--subsets", nargs="+", choices=SUBSETS, default=SUBSETS, metavar="NAME")
     parser.add_argument("--seeds", type=int, default=5, help="run the seeds 0 to SEEDS - 1")
@@ -189,19 +177,13 @@ def main() -> None:
     rows = json.loads(output_path.read_text()) if output_path.exists() else []
     weights = ["--weights", arguments.weights] if arguments.weights else []
     for name in arguments.subsets:
-        comparison = compare_subset(
-            name,
-            arguments.scenes_path,
-            arguments.work_path,
-            arguments.methods,
-            arguments.seeds,
-            *weights,
-        )
-        new = rows_of(name, comparison)
+        folders = arguments.scenes_path, arguments.work_path
+        given = arguments.methods, arguments.seeds, *weights
+        new = rows_of(name, compare_subset(name, *folders, *given))
         redone = {(row["subset"], row["method"]) for row in new}
         rows = [row for row in rows if (row["subset"], row["method"]) not in redone] + new
         output_path.write_text(json.dumps(rows, indent=1) + "\n")
-    print(table(rows))
+    print(table_of(rows))
 
 
 if __name__ == "__main__":
