@@ -13,7 +13,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from contracts.depth_contract import DepthContract
+from contracts.contracts import DepthContract
 from depth_photographs import (
     CAMERA,
     COURTYARD,
