@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from small_scene import FOCAL_PX, IMAGE_SIZE, photograph
+from small_scene import FOCAL_PX, IMAGE_SIZE, photograph, world_to_camera
 from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
@@ -22,20 +21,20 @@ Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 def pose(index: int) -> Pose:
     """Return camera_from_world of a photograph."""
-    rotation, _ = cv2.Rodrigues(np.array([0.0, np.radians(-YAWS_DEG[index]), 0.0]))
+    rotation = world_to_camera(YAWS_DEG[index])
     return rotation, -rotation @ np.array(POSITIONS[index])
 
 
 def write_images(folder: Path) -> None:
     """Write the photographs as PNG."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name, position, yaw_deg in zip(NAMES, POSITIONS, YAWS_DEG, strict=True):
-        folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / f"{name}.png", photograph(position, yaw_deg))
 
 
-def image_line(index: int, turned: Pose | None = None) -> str:
+def image_line(index: int) -> str:
     """Return the line of a photograph in COLMAP's images.txt."""
-    rotation, translation = turned or pose(index)
+    rotation, translation = pose(index)
     x, y, z, w = pycolmap.Rotation3d(rotation).quat
     values = " ".join(map(repr, map(float, (w, x, y, z, *translation))))
     return f"{index + 1} {values} {index + 1} {NAMES[index]}.png"
@@ -48,10 +47,10 @@ def write_svp(scene: Path, pairs: str = "a.png b.png 0\na.png d.png 2\nb.png d.p
     (scene / "0").mkdir()
     width, height = IMAGE_SIZE
     camera = f"SIMPLE_RADIAL {width} {height} {FOCAL_PX} {width / 2} {height / 2} 0"
-    lines = [f"{index + 1} {camera}" for index in range(len(NAMES))]
-    (scene / "0" / "cameras.txt").write_text("\n".join(["# cameras", *lines]) + "\n")
-    lines = [image_line(index) for index in range(len(NAMES))]
-    (scene / "0" / "images.txt").write_text("\n".join(["# images", *lines]) + "\n")
+    cameras = [f"{index + 1} {camera}" for index in range(len(NAMES))]
+    images = [image_line(index) for index in range(len(NAMES))]
+    for name, lines in (("cameras", cameras), ("images", images)):
+        (scene / "0" / f"{name}.txt").write_text("\n".join([f"# {name}", *lines, ""]))
     return scene
 
 
