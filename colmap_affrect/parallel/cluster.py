@@ -76,8 +76,8 @@ class WorkerEnvironment:
         for (path, here), (_, there) in zip(self.files, worker.files, strict=True):
             if here != there:
                 raise ClusterError(
-                    f"worker on {worker.host}: does not see {path}, as the workers before did; "
-                    "mount it there, or end that worker, and run the same command again"
+                    f"worker on {worker.host}: does not see {path} as this machine does; put it on "
+                    "storage that all machines share, under the same path"
                 )
 
 
@@ -203,15 +203,12 @@ def _require_scheduler(address: str, security: Security) -> None:
 @contextmanager
 def _silent(package: str) -> Iterator[None]:
     """Keep a package from logging to the terminal: errors that matter are raised."""
-    handlers = logging.getLogger(package).handlers
-    levels = [handler.level for handler in handlers]
-    for handler in handlers:
-        handler.setLevel(logging.CRITICAL + 1)
+    its = logging.getLogger(package)
+    handlers, its.handlers = its.handlers, [logging.NullHandler()]
     try:
         yield
     finally:
-        for handler, level in zip(handlers, levels, strict=True):
-            handler.setLevel(level)
+        its.handlers = handlers
 
 
 class Cluster:
@@ -225,29 +222,19 @@ class Cluster:
         """Refuse, by a ClusterError, a cluster without workers or whose results would differ."""
         with suppress(TimeoutError):
             self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
-        workers = self._ask([])
+        here = WorkerEnvironment.of([])
+        try:
+            self._client.run_on_scheduler(WorkerEnvironment.of, [])  # which unpickles tasks
+            workers = list(self._client.run(WorkerEnvironment.of, []).values())
+        except (ModuleNotFoundError, AttributeError) as error:
+            raise self._not_installed(error) from error
         if not workers:
             raise ClusterError(
                 f"{self._address}: the cluster has no workers; start some, with 'dask worker "
                 f"{self._address}' on each machine"
             )
-        here = WorkerEnvironment.of([])
         for worker in workers:
             here.require_same(worker)
-
-    def sees(self, paths: Sequence[Path]) -> bool:
-        """See :class:`~colmap_affrect.parallel.executor.Executor`."""
-        names = [str(path) for path in paths]
-        here = WorkerEnvironment.of(names)
-        return all(worker.files == here.files for worker in self._ask(names))
-
-    def _ask(self, paths: Sequence[str]) -> list[WorkerEnvironment]:
-        try:
-            self._client.run_on_scheduler(WorkerEnvironment.of, [])  # which unpickles tasks
-            found: dict[str, WorkerEnvironment] = self._client.run(WorkerEnvironment.of, paths)
-        except (ModuleNotFoundError, AttributeError) as error:
-            raise self._not_installed(error) from error
-        return list(found.values())
 
     def _not_installed(self, error: Exception) -> ClusterError:
         return ClusterError(
@@ -261,7 +248,7 @@ class Cluster:
         """See :class:`~colmap_affrect.parallel.executor.Executor`.
 
         Raises ClusterError when the scheduler is lost, several workers are lost with one task, or a
-        worker that joins later differs.
+        worker differs or does not see the files.
         """
         job = _Job(pickle.dumps(function), WorkerEnvironment.of([str(path) for path in files]))
         name = f"{type(function).__name__}-{uuid.uuid4().hex}"

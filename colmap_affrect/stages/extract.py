@@ -13,7 +13,6 @@ from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.errors import (
-    ClusterError,
     DatabaseError,
     ImageError,
     OptionError,
@@ -176,26 +175,18 @@ def extract_images(
     """Yield the features of images, or why one cannot be used, in order.
 
     ``images`` are names and levels of escalation. By default there are as many threads as cores and
-    memory allow. ClusterError when workers do not see the depth maps.
+    memory allow. ClusterError when workers do not see the photographs or the depth maps.
     """
     if not images:
         return
     if later := {name for name, level in images if level}:
         refuse_changed(context, inputs, later)
     executor = context.executor or Threads(num_images_at_once(extractor))
-    depth_folder = extractor.options.depth.folder
-    if depth_folder and not executor.sees([depth_folder]):
-        raise ClusterError(
-            f"{depth_folder}: the workers of the cluster do not see this folder of depth maps; put "
-            "it on storage that all of them share"
-        )
     files = inputs.photographs.files(images[0][0])
-    is_shared = executor.sees(files)
-    tasks: Iterable[ImageTask] = image_tasks(context.workspace, inputs, extractor.options, images)
-    if not is_shared:
-        tasks = (task.with_files() for task in tasks)
-    outcomes = executor.map(extractor, tasks, files if is_shared else ())
-    for (name, level), found in zip(images, outcomes, strict=True):
+    if depth_folder := extractor.options.depth.folder:
+        files.append(depth_folder)
+    tasks = _image_tasks(context.workspace, inputs, extractor.options, images)
+    for (name, level), found in zip(images, executor.map(extractor, tasks, files), strict=True):
         if isinstance(found, ExtractedImage):
             logger.debug("%s: %d features (level %d)", name, len(found.features), level)
             if found.warning:
@@ -203,21 +194,18 @@ def extract_images(
         yield found
 
 
-def image_tasks(
+def _image_tasks(
     workspace: Workspace,
     inputs: Inputs,
     options: ExtractionOptions,
-    images: Iterable[tuple[str, int]],
+    images: Sequence[tuple[str, int]],
 ) -> Iterator[ImageTask]:
     """Yield what is to be done for images; cameras are read where rectification depends on them."""
-    known = {}
-    if workspace.database.exists():
-        known = colmap_database.read_cameras(workspace.database)
-    initial = inputs.initial_cameras
+    has_database, initial = workspace.database.exists(), inputs.initial_cameras
+    known = colmap_database.read_cameras(workspace.database) if has_database else {}
     names = inputs.names() if options.uses_depth else []
     for name, level in images:
-        camera = known.get(name)
-        intrinsics = None
+        camera, intrinsics = known.get(name), None
         if options.uses_depth:
             intrinsics = (
                 colmap_database.camera_matrix(camera) if camera else initial.matrix(name, names)
