@@ -169,7 +169,7 @@ def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None
     other = replace(here, host="far", versions=(*here.versions[:-1], ("kornia", "0.1")))
     with pytest.raises(ClusterError, match=r"worker on far: has kornia 0\.1, and the machine"):
         here.require_same(other)
-    (tmp_path / "a.png").write_bytes(b"2")
+    (tmp_path / "a.png").write_bytes(b"22")
     with pytest.raises(ClusterError, match=r"does not see .*a\.png"):
         here.require_same(WorkerEnvironment.of(paths))
 
