@@ -16,13 +16,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import torch
 from local_cluster import local_cluster
 from random_weights import write_comparing_lightglue
 from results import hdf5_content
 from small_scene import INTRINSICS, write_photographs
 
-from colmap_affrect.errors import ClusterError, StaleStoreError, WeightsError
+from colmap_affrect.errors import ClusterError, StaleStoreError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.parallel import cluster as cluster_module
 from colmap_affrect.parallel.cluster import Cluster, WorkerEnvironment, connected
@@ -35,7 +34,7 @@ from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
-from colmap_affrect.stages.one_pair import CachedMatcher, Matching, iterate_matches
+from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 
 CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
@@ -247,21 +246,3 @@ def test_cluster_finds_what_threads_find(
     expected = matched(tmp_path / "local", extracted, lightglue, Threads(2))
     with connected(address) as cluster:
         assert matched(tmp_path / "cluster", extracted, lightglue, cluster) == expected
-
-
-def test_workers_with_other_weights_are_refused(
-    tmp_path: Path, extracted: Path, lightglue: Path
-) -> None:
-    folder = tmp_path / "lightglue"
-    shutil.copytree(lightglue, folder)
-    store = Context(Workspace(extracted)).features
-    resources = Resources(folder, "cpu")
-    matching = Matching(store, WITH_NETWORK.matching, resources=resources)
-    rebuild, given = CachedMatcher(matching).__reduce__()
-    rebuild(*given)
-    state = torch.load(folder / "sift_lightglue.pth", weights_only=True)
-    torch.save(
-        state | {"posenc.Wr.weight": state["posenc.Wr.weight"] + 1}, folder / "sift_lightglue.pth"
-    )
-    with pytest.raises(WeightsError, match=r"sift_lightglue\.pth: is another file than"):
-        rebuild(*given)
