@@ -259,9 +259,6 @@ IMPORT_FORMAT = (
     _choice("--layout", ["auto", "hloc", "dim"],
         "of the files; dim is deep-image-matching's (default: auto, as matches are stored)",
         default="auto"),
-    _choice("--pixel-origin", ["center", "corner"],
-        "where (0, 0) is in the first pixel (default: center, as both programs have it)",
-        default="center"),
     _flag("--skip-verification", "no two-view geometries"),
 )  # fmt: skip
 EXPORT_SOURCE = OneOf(
@@ -273,7 +270,6 @@ EXPORT_SOURCE = OneOf(
 EXPORT_FORMAT = (
     _choice("--layout", ["hloc", "dim"],
         "of the files; dim is deep-image-matching's (default: hloc)", default="hloc"),
-    _flag("--half", "float16, which rounds coordinates to 1 px and more"),
 )  # fmt: skip
 
 OLD_DATABASE = (
@@ -289,9 +285,8 @@ EXPORT = (
     _path("--output-path", "FOLDER", "folder for the files; nothing in it is overwritten",
         required=True, dest="target_path"),
     _value("--format", "A,B,...",
-        "ply (points), text (COLMAP's), nvm, bundler, undistorted (photographs and model, for "
-        "dense reconstruction), nerfstudio (the same with transforms.json, for Gaussian splatting "
-        "too), "
+        "ply (points), text (COLMAP's), undistorted (photographs and model, for dense "
+        "reconstruction), nerfstudio (the same with transforms.json, for Gaussian splatting too), "
         "cameras (CSV), geojson (of a model that align put on earth) (default: ply,text,cameras)",
         type=_words, default=("ply", "text", "cameras")),
     _path("--image-path", "PATH",

@@ -19,7 +19,7 @@ These files are not trusted: links and data in other files are refused, and arra
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -27,7 +27,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import OptionError, StoreError, damage, reason, such_as
+from colmap_affrect.errors import OptionError, StoreError, damage, such_as
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import refuse_colliding_keys
 from colmap_affrect.pairs.base import Pair
@@ -53,6 +53,17 @@ class Layout:
     pair_part: Callable[[str], str]  # what stands for that group in the key of a pair
     matches: str  # dataset in the group of a pair; empty where the key itself is a dataset
     size_step: int  # 1 where image_size is (width, height), -1 where it is (height, width)
+
+    def write_matches(self, write: Callable[[str, Datasets], None], pair: PairMatches) -> int:
+        """Write the matches of a pair, in hloc's files one of each keypoint; return how many."""
+        if not self.matches:
+            first, second = map(self.feature_key, pair.names)
+            write(first, {second: pair.indices})
+            return len(pair.indices)
+        _, kept = np.unique(pair.indices[:, 0], return_index=True)
+        one = replace(pair, indices=pair.indices[kept], scores=pair.scores[kept])
+        write(pair_key(*pair.names), hloc_matches(one))
+        return len(kept)
 
 
 LAYOUTS = {
@@ -100,12 +111,8 @@ def _opened(path: Path) -> Iterator[Source]:
     """Open a file for reading; links and data that lead out of it are refused."""
     if not path.is_file():
         raise OptionError(f"{path}: no such file")
-    try:
+    with damage(path, f"or still being written; {MEND}"):
         file = h5py.File(path, "r")
-    except OSError as error:
-        raise StoreError(
-            f"{path}: not an HDF5 file, damaged, or still being written ({reason(error)})"
-        ) from error
     with file:
         yield Source(path, file, _shapes(path, file))
 
@@ -287,14 +294,6 @@ def check_names(names: Sequence[str], layout: Layout) -> None:
     folders = {str(parent) for key in groups for parent in PurePosixPath(key).parents}
     if both := sorted(folders & groups.keys()):
         raise StoreError(f"{both[0]}: is an image and the folder of another; rename it")
-
-
-def match_datasets(pair: PairMatches, layout: Layout) -> tuple[str, Datasets]:
-    """Return the group of a pair and its datasets."""
-    if layout.matches:
-        return pair_key(*pair.names), hloc_matches(pair)
-    first, second = map(layout.feature_key, pair.names)
-    return first, {second: pair.indices}
 
 
 @contextmanager

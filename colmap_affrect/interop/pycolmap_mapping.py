@@ -28,18 +28,10 @@ def incremental_mapping(
 ) -> dict[int, pycolmap.Reconstruction]:
     """Map any verified database by our mapper and write the models as pycolmap does.
 
-    Args:
-        database_path: COLMAP database with two-view geometries.
-        image_path: folder of the photographs, for the colours of the points; empty for none.
-        output_path: models are written to 0, 1, ... in it, or, with ``input_path``, into it.
-        options: what differs from pycolmap's defaults wins over our preset for sparse sets.
-        input_path: a model to be extended. Its poses and cameras stay with ``fix_existing_frames``.
-        initial_image_pair_callback: called when a first pair is registered.
-        next_image_callback: called for every further image.
-        cancellation_token: stops mapping when it is cancelled, by InterruptedError as in pycolmap.
-
-    Returns:
-        The models by the number of their folder, largest first.
+    ``options`` that differ from pycolmap's defaults win over our preset for sparse sets. Models are
+    written to 0, 1, ... in ``output_path``, or, with ``input_path``, a model to be extended, into
+    it; they are returned by the number of their folder, largest first. A cancelled token stops by
+    InterruptedError.
     """
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
     mapper = MAPPERS.make(translate.mapper_options(native))

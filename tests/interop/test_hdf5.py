@@ -35,20 +35,15 @@ def files(tmp_path: Path) -> Files:
 
 
 def test_centres_move_by_half_a_pixel_once_and_in_float32(files: Files) -> None:
-    # Steps of 1 px: no room for 0.5.
     half = np.array([[3.25, 17.5], [1027.0, 2.0]], np.float16)
     write_h5(
         files.features,
         {"a.png": {"keypoints": half}, "sub/b c.png": {"keypoints": [[7.0, 11.125]]}},
     )
     write_h5(files.matches, {})
-    (note, *_) = files.import_all().notes
-    assert note.startswith("keypoints of 1 images are float16, rounded to steps of 1 px")
+    files.import_all()
     assert files.keypoints("a.png").tolist() == [[3.75, 18.0], [1027.5, 2.5]]
     assert files.keypoints("sub/b c.png").tolist() == [[7.5, 11.625]]
-    files.database.unlink()
-    files.import_all(pixel_origin="corner")
-    assert files.keypoints("a.png").tolist() == [[3.25, 17.5], [1027.0, 2.0]]
 
 
 def test_frames_become_affine_shapes_of_one_sigma(files: Files) -> None:
