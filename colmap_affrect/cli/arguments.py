@@ -93,7 +93,7 @@ CAMERAS = (
     _value("--camera-params", "A,B,...",
         "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5"),
     _path("--cameras-path", "FILE",
-        "known cameras: folder or cameras.txt of a COLMAP model of these images, or a CSV file "
+        "known cameras: folder of a COLMAP model of these images, or a CSV file "
         "with the columns name and any of focal_px, focal_mm with sensor_width_mm or "
         "plate_width_mm (of what the whole image shows), model, params, cx, cy, camera (images "
         "with one label share a camera)"),

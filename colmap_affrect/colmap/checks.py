@@ -1,7 +1,6 @@
-"""What can be wrong in a COLMAP database and what to do about it, found without COLMAP.
+"""What can be wrong in a COLMAP database of any version, and what to do about it.
 
-Rows that COLMAP does not expect end the process inside COLMAP, so the tables are read by SQLite
-itself, of databases of all versions of COLMAP.
+Rows that COLMAP does not expect end the process inside COLMAP, so SQLite reads the tables.
 """
 
 import sqlite3
@@ -105,11 +104,7 @@ KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine
 
 
 def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
-    """Refuse a damaged database, or one with problems that would end the process inside COLMAP.
-
-    It is only read; ``kinds`` of problems are keys of ``CHECKS``, and DatabaseError has one line.
-    Returns all other problems.
-    """
+    """Refuse a damaged database, or one with some ``kinds`` of problems; return all others."""
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         _, what, advice = CHECKS[kind]
@@ -120,28 +115,23 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
     """Check a database, which is only read; DatabaseError if damaged."""
-    with open_read_only(path) as connection:
-        return _check(connection, path)
-
-
-def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems]:
     found: Problems = defaultdict(list)
-    try:
-        connection.text_factory = lambda data: data.decode("utf-8", "replace")
-        (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-        if verdict != "ok":
-            raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
-        tables = read_tables(connection)
-        _check_names(connection, found)
-        _check_cameras(tables, found)
-        _check_links(connection, found)
-        _check_matrices(connection, found)
-        _check_cameras_of_pairs(connection, found)
-        _check_images(tables, found)
-        _check_keypoints(connection, tables, found)
-        _check_pairs(connection, tables, found)
-    except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
-        raise DatabaseError(f"{path}: damaged ({error})") from error
+    with open_read_only(path) as connection:
+        try:
+            connection.text_factory = lambda data: data.decode("utf-8", "replace")
+            (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            if verdict != "ok":
+                raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
+            tables = read_tables(connection)
+            _check_cameras(tables, found)
+            _check_images(connection, tables, found)
+            _check_links(connection, found)
+            _check_matrices(connection, found)
+            _check_cameras_of_pairs(connection, found)
+            _check_keypoints(connection, tables, found)
+            _check_pairs(connection, tables, found)
+        except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
+            raise DatabaseError(f"{path}: damaged ({error})") from error
     return tables, dict(found)
 
 
@@ -185,11 +175,16 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
             found["bad-camera"].append(f"{label}: {camera.width} x {camera.height} px")
 
 
-def _check_names(connection: sqlite3.Connection, found: Problems) -> None:
+def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
         name = raw.decode("utf-8", "replace")
         if not name or "\0" in name or name.encode() != raw:
             found["bad-name"].append(f"image {image_id}: {name!r}")
+    for image_id, name in tables.names.items():
+        if tables.camera_ids[image_id] not in tables.cameras:
+            found["no-parent"].append(name)
+        if tables.num_frames and image_id not in tables.frame_images:
+            found["no-frame"].append(name)
 
 
 def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
@@ -225,21 +220,13 @@ def _check_cameras_of_pairs(connection: sqlite3.Connection, found: Problems) -> 
         for pair_id, blob in rows_of(connection, f"pair_id {name}", "two_view_geometries"):
             if blob is None:
                 continue
-            header = blob[: CAMERA_OF_PAIR.size] if isinstance(blob, bytes) else b""
-            if len(header) == CAMERA_OF_PAIR.size:
-                _, model, *_, count = CAMERA_OF_PAIR.unpack(header)
+            size = CAMERA_OF_PAIR.size
+            if isinstance(blob, bytes) and len(blob) >= size:
+                _, model, *_, count = CAMERA_OF_PAIR.unpack(blob[:size])
                 like = camera_like(model)
-                if like and count == len(like.params) == (len(blob) - len(header)) / 8:
+                if like and count == len(like.params) == (len(blob) - size) / 8:
                     continue
             found["matrix-data"].append(f"{name} of pair_id {pair_id}")
-
-
-def _check_images(tables: Tables, found: Problems) -> None:
-    for image_id, name in tables.names.items():
-        if tables.camera_ids[image_id] not in tables.cameras:
-            found["no-parent"].append(name)
-        if tables.num_frames and image_id not in tables.frame_images:
-            found["no-frame"].append(name)
 
 
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
@@ -272,7 +259,7 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
 def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
         for pair_id, rows, columns, blob in rows_of(connection, "pair_id rows cols data", table):
-            label = f"{tables.pair_label(pair_id)} ({what})"
+            label = f"{' - '.join(tables.pair_names(pair_id))} ({what})"
             images = pair_images(pair_id)
             indices = _array(blob, rows, columns, np.dtype("<u4"))
             is_known = images[0] != images[1] and tables.names.keys() >= set(images)
