@@ -24,8 +24,8 @@ from colmap_affrect.colmap.tables import (
     read_tables,
     rows_of,
 )
-from colmap_affrect.colmap.useless_keypoints import MAX_SIDE_PX, useless
 from colmap_affrect.errors import DatabaseError, such_as
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.project.outputs import leads_outside
@@ -63,10 +63,10 @@ CHECKS: dict[str, Check] = {
         "extract these images again into a new database"),
     "keypoints-not-finite": ("error",
         "images with keypoints that are not finite numbers, or are where no image reaches",
-        "extract these images again; 'map --from-database' leaves these keypoints out"),
-    "keypoints-at-one-place": ("warning",
+        "extract and match these images again"),
+    "keypoints-at-one-place": ("error",
         "images with most keypoints at one place, at which COLMAP may never end",
-        "extract these images again; 'map --from-database' leaves these keypoints out"),
+        "extract and match these images again"),
     "keypoints-outside": ("warning", "images with keypoints outside of them",
         "see that they were found in the images as stored: not rotated, not resized"),
     "match-data": ("error",
@@ -83,7 +83,8 @@ CHECKS: dict[str, Check] = {
 FATAL_FOR_IMAGES = frozenset({"bad-name", "no-parent", "bad-camera", "camera-panorama"})
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 
-FATAL = FATAL_FOR_IMAGES | {"keypoint-data", "match-data", "matrix-data"}
+USELESS_KEYPOINTS = frozenset({"keypoints-not-finite", "keypoints-at-one-place"})
+FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "matrix-data"}
 """The same of keypoints and matches."""
 
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
@@ -101,16 +102,18 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 length is a prior, and the number of parameters that follow, float64."""
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
+MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
+OUTSIDE_TOLERANCE_PX = 1.0  # keypoints of images shrunk for detection may lie outside
+MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
 
 
-def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
-    """Refuse a damaged database, or one with some ``kinds`` of problems; return all others."""
+def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
+    """Refuse a damaged database, or one with some ``kinds`` of problems; DatabaseError."""
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         _, what, advice = CHECKS[kind]
         items = such_as(problems[kind])
         raise DatabaseError(f"{path}: {what} ({items}); {advice.format(path=path)}")
-    return problems
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
@@ -244,8 +247,30 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             found["keypoint-data"].append(name)
         elif count:
             camera = tables.cameras.get(tables.camera_ids[image_id])
-            for kind in useless(keypoints, (camera.width, camera.height) if camera else None):
+            size = (camera.width, camera.height) if camera else None
+            for kind in keypoint_problems(keypoints, size):
                 found[kind].append(name)
+
+
+def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:
+    """Return which kinds of problems some of (N, 2 or more) keypoints have, in COLMAP's px.
+
+    ``size`` is the (width, height) of the image, None if not known.
+    """
+    finite = np.asarray((np.abs(keypoints) <= MAX_SIDE_PX).all(axis=1))
+    points, found = keypoints[finite, :2], list[str]()
+    if not finite.all():
+        found.append("keypoints-not-finite")
+    if size is not None:
+        beyond = np.maximum(-points, points - np.asarray(size, np.float32))
+        if (beyond > OUTSIDE_TOLERANCE_PX).any():
+            found.append("keypoints-outside")
+    if len(points) >= MIN_AT_ONE_PLACE:  # what more than half have is the median
+        median = np.partition(points, len(points) // 2, axis=0)[len(points) // 2]
+        num_there = int((points == median).all(axis=1).sum())
+        if num_there >= max(MIN_AT_ONE_PLACE, len(keypoints) // 2 + 1):
+            found.append("keypoints-at-one-place")
+    return found
 
 
 def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import CHECKS, USELESS_KEYPOINTS, keypoint_problems
 from colmap_affrect.colmap.database import (
     DESCRIPTOR_NORM,
     colmap_keypoints,
@@ -16,7 +17,6 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
-from colmap_affrect.colmap.useless_keypoints import leave_out_useless
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StoreError
 from colmap_affrect.geometry.arrays import Indices, Singles
@@ -107,12 +107,10 @@ def import_h5(
             )
         _fill_database(new, files, progress)
         with open_database(new) as database:
-            useless = leave_out_useless(database)
             counts = database.num_keypoints(), len(files.pairs), database.num_matches()
         without = sorted(set(names) - set(rejected) - files.keys.keys())
         notes = [
             *files.notes,
-            *filter(None, [useless]),
             *noted("images without features are there without keypoints", without),
             *noted("images that COLMAP does not take are left out", rejected),
         ]
@@ -138,6 +136,8 @@ def _fill_database(path: Path, files: ForeignFiles, progress: Progress) -> None:
                 camera = database.read_camera(images[name].camera_id)
                 files.check_size(name, (camera.width, camera.height))
                 keypoints = _read_keypoints(files, name)
+                for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints, None)):
+                    raise StoreError(f"{files.features.path}: {CHECKS[kind][1]}: {name}")
                 database.write_keypoints(images[name].image_id, keypoints)
                 counts[name] = len(keypoints)
                 advance(1)
@@ -164,7 +164,7 @@ def _read_keypoints(files: ForeignFiles, name: str) -> Singles:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
     source, key = files.features, files.keys[name]
     lafs, scales, oris = (f"{key}/{dataset}" for dataset in ("lafs", "scales", "oris"))
-    with np.errstate(over="ignore"):  # what float32 cannot hold is left out later
+    with np.errstate(over="ignore"):  # what float32 cannot hold is refused later
         points = source.read(files.keypoints_key(name), (None, 2)).astype(np.float32)
         centers = np.asarray(colmap_from_pixel(points))
         count = len(points)

@@ -12,7 +12,7 @@ from typing import Any, TypedDict, Unpack
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
-from colmap_affrect.colmap.checks import FATAL, refuse_unusable
+from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
@@ -224,7 +224,7 @@ def verify(
     """
     path, pairs = Path(database_path), None
     verification = translate.verification_options(options, random_seed)
-    refuse_unusable(path, FATAL | {"keypoints-not-finite"})
+    refuse_unusable(path)
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
         if pairs_path is not None:
             ids = image_ids(path)

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import FATAL, refuse_unusable
-from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.useless_keypoints import KINDS
+from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.interop.pycolmap_api import CANCELLED, Native, PathLike, Token
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -36,11 +34,8 @@ def incremental_mapping(
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
     mapper = MAPPERS.make(translate.mapper_options(native))
     database, output = Path(database_path), Path(output_path)
-    has_useless = not refuse_unusable(database).keys().isdisjoint(KINDS)
+    refuse_unusable(database)
     with temporary_folder(output) as folder:
-        if has_useless:  # it stays as it is
-            copy_database(database, folder / "database.db", FATAL)
-            database = folder / "database.db"
         existing = None
         if translate.given_path(input_path):
             extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap.cameras import read_camera_records, write_camera_records
-from colmap_affrect.colmap.checks import FATAL, refuse_unusable
+from colmap_affrect.colmap.checks import FATAL, USELESS_KEYPOINTS, refuse_unusable
 from colmap_affrect.colmap.database import all_cameras
 from colmap_affrect.colmap.seal import (
     Change,
@@ -28,7 +28,6 @@ from colmap_affrect.colmap.seal import (
     remove_seal,
 )
 from colmap_affrect.colmap.tables import Tables, delete_rows, open_read_only, read_tables
-from colmap_affrect.colmap.useless_keypoints import KINDS
 from colmap_affrect.errors import AffrectError, DatabaseError, such_as
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
@@ -44,7 +43,7 @@ from colmap_affrect.stages.verify import verify_matches, verify_new
 
 logger = logging.getLogger(__name__)
 
-UNUSABLE = (FATAL | KINDS | {"no-frame"}) - {"keypoints-outside"}
+UNUSABLE = FATAL | {"no-frame"}
 NOTHING = np.zeros(0, np.int64)
 RIGS = ("rigs", "rig_sensors", "frames", "frame_data")
 
@@ -102,7 +101,8 @@ def edits_of(path: Path) -> Edits | None:
         with open_read_only(path) as connection:
             edits = _edits(found, read_tables(connection))
         if not edits.lost:
-            refuse_unusable(path, UNUSABLE - KINDS if len(edits.keypoints) else UNUSABLE)
+            mended = USELESS_KEYPOINTS if len(edits.keypoints) else frozenset()
+            refuse_unusable(path, UNUSABLE - mended)
         return edits
     except AffrectError as error:
         text = str(error).removeprefix(f"{path}: ").partition(";")[0]

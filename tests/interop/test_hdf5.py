@@ -156,17 +156,6 @@ def test_deep_image_matching_knows_file_names_and_may_have_no_groups(
     assert_array_equal(files.keypoints("sub/b c.png"), points(4, 4) + np.float32(0.5))
 
 
-def test_keypoints_that_no_model_can_use_are_left_out_of_matches(files: Files) -> None:
-    places = [[1.0, 2.0], [np.nan, 3.0], [1e300, 2.0], [30.0, -3.0], [5.0, 6.0]]
-    groups = {"a.png": {**hloc_group(5), "keypoints": places}, "sub/b c.png": hloc_group(4)}
-    write_h5(files.features, groups)
-    write_h5(files.matches, {"a.png/sub-b c.png": match_group([0, 1, 2, 3, -1])})
-    report = files.import_all()
-    assert files.keypoints("a.png").tolist()[:3] == [[1.5, 2.5], [0.0, 0.0], [0.0, 0.0]]
-    assert files.pairs() == {("a.png", "sub/b c.png"): [[0, 0]]}
-    assert any(note.startswith("3 keypoints of a.png are left out") for note in report.notes)
-
-
 def change_features(**datasets: Any) -> Callable[[Files], object]:
     groups = {"a.png": {**hloc_group(3), **datasets}, "sub/b c.png": hloc_group(4)}
     return lambda files: write_h5(files.features, groups)
@@ -229,6 +218,10 @@ ERRORS: dict[str, tuple[Callable[[Files], object], str]] = {
     "frames of others": (
         change_features(lafs=np.zeros((4, 2, 3))),
         r"a\.png/lafs has shape \(4, 2, 3\), expected \(3, 2, 3\)",
+    ),
+    "not finite": (
+        change_features(keypoints=[[1.0, 2.0], [np.nan, 3.0], [1e300, 2.0]]),
+        r"features\.h5: images with keypoints that are not finite.*: a\.png$",
     ),
     "other size": (
         change_features(image_size=[48, 64]),
