@@ -67,7 +67,7 @@ RESULTS = (
 """Of commands that leave results in an output folder."""
 
 CONVERTED_PATH = _path(
-    "--output-path", "PATH", "folder for the photographs", required=True, dest="converted_path"
+    "--output-path", "PATH", "new folder for the photographs", required=True, dest="converted_path"
 )
 IMAGE_PATH = _path("--image-path", "PATH",
     "folder of the photographs, searched with its sub-folders", required=True)  # fmt: skip

@@ -12,7 +12,6 @@ import colmap_affrect
 from colmap_affrect.errors import OptionError
 from colmap_affrect.project.outputs import (
     new_results,
-    publish,
     refuse_photographs,
     temporary_folder,
 )
@@ -99,16 +98,6 @@ def test_what_is_in_the_way_is_refused_before_anything_is_made(
     with pytest.raises(OptionError, match=why), new_results(tmp_path / "a.txt"):
         pytest.fail("nothing may be made")
     assert content(tmp_path) == before
-
-
-def test_links_may_not_lead_out_of_a_folder(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "box").symlink_to(tmp_path)
-    (tmp_path / "new").touch()
-    target = tmp_path / "out" / "box" / "a.txt"
-    with pytest.raises(OptionError, match="leads out of"):
-        publish([(tmp_path / "new", target)], tmp_path / "out")
-    assert not target.exists()
 
 
 def test_nothing_is_made_beside_the_models_of_a_run(tmp_path: Path) -> None:
