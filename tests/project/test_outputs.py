@@ -153,7 +153,8 @@ IN_TEMPORARY_FOLDERS = {
     ("export.py", "_points"), ("export.py", "_nerfstudio"), ("export.py", "_text"),
     ("hdf5_layouts.py", "created"),
     ("inspection.py", "inspect_image"), ("sheet.py", "draw_sheet"), ("conversion.py", "_convert"),
-    ("worker.py", "_run_seed"), ("worker.py", "_map_sift"), ("sift.py", "match_sift"),
+    ("conversion.py", "convert_images"), ("worker.py", "_run_seed"), ("worker.py", "_map_sift"),
+    ("sift.py", "match_sift"),
 }  # fmt: skip
 """Functions that write where the door lets them."""
 
