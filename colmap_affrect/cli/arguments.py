@@ -153,7 +153,7 @@ SCHEDULER = _value("--scheduler", "ADDRESS",
 DEPTH = (
     OneOf(
         _path("--depth-path", "FOLDER",
-            "depth maps named as the images: a/b.jpg has a/b.npy, .npz, .png or .tif"),
+            "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
         _value("--depth-model", "NAME",
             "monocular depth network: name or local folder for Hugging Face transformers"),
     ),
