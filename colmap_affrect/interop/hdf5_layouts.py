@@ -1,13 +1,13 @@
 """HDF5 files of other programs: safe access, and which image or pair each of their keys means.
 
-Three layouts are read, two are written; in all of them (0, 0) is the centre of the first pixel.
+In all layouts (0, 0) is the centre of the first pixel.
 
 ``hloc``
     Features: a group per image name, nested at '/', with ``keypoints`` (N, 2), ``descriptors``
     (D, N), ``scores`` (N,), ``image_size`` (width, height), and perhaps ``scales`` (N,) in sigmas,
     ``oris`` (N,) in degrees from x towards y, ``lafs`` (N, 2, 3). Matches: a group per pair with
     ``matches0`` (N0,), -1 where unmatched, and ``matching_scores0`` (N0,); in its key each '/'
-    of a name is '-', and '/' stands between the names ('_' in old files).
+    of a name is '-', and '/' stands between the names.
 ``dim`` (deep-image-matching)
     The same features by file name without folders, ``image_size`` as (height, width); matches
     [name 1][name 2] (M, 2). Also read without groups, as in the notebooks of the Image Matching
@@ -236,35 +236,24 @@ def _name_pairs(
         raise StoreError(f"{source.path}: holds no 'matches0'; is it of another layout?")
     pairs: dict[Pair, str] = {}
     unknown, selves, again = [], [], []
-    for key in sorted(keys, key=lambda key: ("/" not in key, key)):
-        ways = _split_key(key, names)
-        if len(ways) > 1:
-            raise StoreError(f"{source.path}: {key} may be any of {listed(map(' + '.join, ways))}")
-        if not ways:
+    for key in sorted(keys):
+        parts = key.split("/")
+        if len(parts) != 2 or not names.keys() >= set(parts):
             unknown.append(key)
-        elif ways[0][0] == ways[0][1]:
+            continue
+        pair = names[parts[0]], names[parts[1]]
+        if pair[0] == pair[1]:
             selves.append(key)
-        elif ways[0] in pairs or ways[0][::-1] in pairs:
+        elif pair in pairs or pair[::-1] in pairs:
             again.append(key)
         else:
-            pairs[ways[0]] = key
+            pairs[pair] = key
     if unknown:
         raise StoreError(
             f"{source.path}: has matches of images that have no features: {listed(unknown)}"
         )
     notes = noted("pairs that are there twice, the second is left out", again)
     return pairs, notes + noted("images matched with themselves are left out", selves)
-
-
-def _split_key(key: str, names: Mapping[str, str]) -> list[Pair]:
-    """Return every way to read a key as two names."""
-    separator = "/" if "/" in key else "_"
-    parts = key.split(separator)
-    halves = (
-        (separator.join(parts[:count]), separator.join(parts[count:]))
-        for count in range(1, len(parts))
-    )
-    return [(names[a], names[b]) for a, b in halves if a in names and b in names]
 
 
 def _by_key(names: Iterable[str], layout: Layout) -> dict[str, list[str]]:
