@@ -1,8 +1,4 @@
-"""Copies of COLMAP databases, made without opening the original through COLMAP.
-
-COLMAP migrates a database in place as soon as it opens it, even for reading. So a user's database
-is read and copied by SQLite itself, and COLMAP opens only the copy.
-"""
+"""Copies of COLMAP databases, made by SQLite: COLMAP migrates a database as soon as it opens it."""
 
 import sqlite3
 import tempfile
@@ -51,8 +47,7 @@ def refuse_newer(path: Path) -> int:
 def copy_as_it_is(source: Path, target: Path) -> None:
     """Copy a database as it is now, including its write-ahead log, with the schema that it has.
 
-    Raises OptionError when there is none, DatabaseError unless it is an intact one of a COLMAP that
-    is not newer than pycolmap.
+    DatabaseError unless it is an intact one of a COLMAP that is not newer than pycolmap.
     """
     refuse_newer(source)
     try:
@@ -94,10 +89,7 @@ def copy_database(
 
 
 def _old_positions(path: Path) -> dict[int, tuple[float, float, float]]:
-    """Return the positions that COLMAP before 3.10 kept with images, by image id.
-
-    Beside a rotation there is the translation of a pose instead; scripts wrote zeros for none.
-    """
+    """Return the positions that COLMAP before 3.10 kept with images, by image id."""
     with open_read_only(path) as connection:
         if "prior_tx" not in columns_of(connection, "images"):
             return {}
