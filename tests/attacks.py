@@ -175,13 +175,12 @@ def exports(folder: Path, photograph: str = "a.png") -> dict[str, tuple[list[obj
     images = ["--image-path", folder / "photos"]
     new_files = ["--features-path", "{out}/features.h5", "--matches-path", "{out}/matches.h5"]
     names = {
-        "ply": "points3D.ply", "text": "text", "nvm": "model.nvm", "bundler": "bundle.list.txt",
-        "undistorted": "dense", "nerfstudio": "dense", "cameras": "cameras.csv",
-        "geojson": "cameras.geojson",
+        "ply": "points3D.ply", "text": "text", "undistorted": "dense", "nerfstudio": "dense",
+        "cameras": "cameras.csv", "geojson": "cameras.geojson",
     }  # fmt: skip
     assert names.keys() == FORMATS.keys()
     found: dict[str, tuple[list[object], str]] = {}
-    for form, name in [*names.items(), ("ply,text,cameras,bundler,nerfstudio,geojson", "text")]:
+    for form, name in [*names.items(), ("ply,text,cameras,nerfstudio,geojson", "text")]:
         for model in ("plain", "lens"):
             given = ["--model-path", folder / model, *images, "--format", form]
             found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)

@@ -111,7 +111,7 @@ def depth_reader(folder: Path, suffix: str) -> Callable[[bytes], object]:
     return read
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".npz", ".png"])
+@pytest.mark.parametrize("suffix", [".npy", ".png"])
 def test_depth_maps(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture) -> None:
     (tmp_path / "maps").mkdir()
     read = depth_reader(tmp_path / "maps", suffix)
