@@ -7,6 +7,7 @@ matched, and the matches united.
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 from collections.abc import Sequence
@@ -32,14 +33,15 @@ from colmap_affrect.matchers.base import (
     MatcherContext,
     MatcherOptions,
     Matches,
-    unless_gpu_is_full_or_say,
 )
 from colmap_affrect.options import within
-from colmap_affrect.parallel.executor import one_openmp_thread
+from colmap_affrect.parallel.executor import one_openmp_thread, unless_gpu_is_full
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+logger = logging.getLogger(__name__)
 
 MIN_VIEW_FEATURES = 8  # of a view: no geometry could be verified by what fewer add
 TRAINING_SIZE_PX = 1024  # longer side in training, whose pixels scales of features are in
@@ -66,21 +68,14 @@ TRAININGS: dict[str, Training] = {
     "dog-affnet-hardnet": Training(
         "lightglue-dog-affnet-hardnet", "dog-affnet-hardnet", "dog-affnet-hardnet-lightglue", False
     ),
-    "keynet-affnet-hardnet": Training(
-        "lightglue-keynet-affnet-hardnet", "keynet-affnet-hardnet",
-        "dog-affnet-hardnet-lightglue --set features.detector=keynet "
-        "--set matching.trained_for=keynet-affnet-hardnet", False,
-    ),
-}  # fmt: skip
+}
 
 
 class LightGlueOptions(MatcherOptions):
     """LightGlue, and LighterGlue for XFeat; defaults are those of LightGlue's authors."""
 
     name: Literal["lightglue"] = "lightglue"
-    trained_for: Literal[
-        "aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet", "keynet-affnet-hardnet"
-    ] = "aliked"
+    trained_for: Literal["aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet"] = "aliked"
     """Features that the weights were trained for."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of each view that are matched, those of the largest responses."""
@@ -93,8 +88,6 @@ class LightGlueOptions(MatcherOptions):
     max_num_view_pairs: Annotated[int, within(0, 1_000_000)] = 8
     """Of images with warps: pairs of views that are matched, those with most mutual nearest
     neighbours; 0: all."""
-    half_precision: bool = False
-    """Mixed precision on a GPU; a CPU keeps to 32 bits."""
 
     @property
     def weights(self) -> tuple[str, ...]:
@@ -119,7 +112,7 @@ class PreparedView:
     """One view of an image as the network takes it."""
 
     rows: Indices  # (N,) of the image's features
-    inputs: dict[str, Tensor]  # the network's, a batch of one, on its device
+    inputs: dict[str, Tensor]  # the network's, a batch of one
 
 
 @dataclass(frozen=True)
@@ -131,7 +124,7 @@ class PreparedViews:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all arrays, on whatever device."""
+        """Memory of all arrays."""
         tensors = (tensor for view in self.views for tensor in view.inputs.values())
         return self.keypoints.nbytes + sum(tensor.nbytes for tensor in tensors)
 
@@ -152,13 +145,11 @@ class LightGlue:
         self.options, self.training = options, TRAININGS[options.trained_for]
         self._path = context.weights[self.training.weights]
         self._device = resolve_device(context.device)
-        on_gpu = self._device.type != "cpu"
-        network = load_network(self._path, options, mixed=options.half_precision and on_gpu)
-        self._network = network.to(self._device)
+        self._network = load_network(self._path, options).to(self._device)
         self._gpu_lock = threading.Lock()
 
     def prepare(self, image: ImageFeatures) -> PreparedViews:
-        """Bring the features of each view into its own coordinates, and onto the device."""
+        """Bring the features of each view into its own coordinates."""
         self.options.require_extractor(image.extractor)
         features = image.features
         views = []
@@ -184,11 +175,7 @@ class LightGlue:
             name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
             for name, array in (values | {"descriptors": features.descriptors}).items()
         }
-        moved = unless_gpu_is_full_or_say(
-            lambda: {name: tensor.to(self._device) for name, tensor in inputs.items()},
-            lambda: inputs,
-        )
-        return PreparedView(rows, moved)
+        return PreparedView(rows, inputs)
 
     def match(self, first: PreparedViews, second: PreparedViews) -> Matches:
         """Match two images; scores are the network's."""
@@ -205,7 +192,7 @@ class LightGlue:
         if not len(first.rows) or not len(second.rows):
             return Matches.none()
         pair = {"image0": first.inputs, "image1": second.inputs}
-        rows, columns, scores = unless_gpu_is_full_or_say(
+        rows, columns, scores = unless_gpu_is_full(
             lambda: self._run(self._network, pair, self._device),
             lambda: self._run(self._network_on_cpu, pair, torch.device("cpu")),
         )
@@ -232,14 +219,12 @@ class LightGlue:
 
     @cached_property
     def _network_on_cpu(self) -> torch.nn.Module:
+        logger.warning("the memory of the GPU is full; the CPU matches what does not fit")
         return load_network(self._path, self.options)
 
 
-def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) -> torch.nn.Module:
-    """Build kornia's LightGlue with the parameters in a file, all of them, else WeightsError.
-
-    With ``mixed`` precision kornia computes in 16 bits where that is safe.
-    """
+def load_network(path: Path, options: LightGlueOptions) -> torch.nn.Module:
+    """Build kornia's LightGlue with the parameters in a file, all of them, else WeightsError."""
     from kornia.feature import LightGlue as Network
 
     configuration = {
@@ -248,7 +233,6 @@ def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) 
         "depth_confidence": options.depth_confidence,
         "width_confidence": options.width_confidence,
         "filter_threshold": options.min_score,
-        "mp": mixed,
     }
     network = Network(features=None, **configuration)  # type: ignore[arg-type]
     state = {renamed(name): value for name, value in load_state_dict(path).items()}
@@ -303,8 +287,6 @@ def network_inputs(
     the sense of training: COLMAP's of SIFT, else kornia's.
     """
     values = {"keypoints": np.clip(lafs[:, :, 2], 0.0, size), "image_size": size}
-    if trained_for == "keynet-affnet-hardnet":
-        values["lafs"] = lafs
     if trained_for not in ("sift", "dog-affnet-hardnet"):
         return values
     sigmas = np.sqrt(determinants(lafs[:, :, :2])) / MEASUREMENT_SIGMAS
@@ -320,7 +302,7 @@ def promising(
 ) -> list[tuple[PreparedView, PreparedView]]:
     """Return the pairs of views with most mutual nearest neighbours among all features."""
     descriptors1, descriptors2 = (
-        np.concatenate([view.inputs["descriptors"][0].cpu().numpy() for view in views])
+        np.concatenate([view.inputs["descriptors"][0].numpy() for view in views])
         for views in (first, second)
     )
     views1, views2 = (
