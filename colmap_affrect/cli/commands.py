@@ -194,7 +194,6 @@ def evaluate(options: argparse.Namespace) -> int:
         options.output_path,
         EvaluateOptions(
             recipes=parse_methods(options.recipes, given.depth_settings(options)),
-            baseline=options.baseline,
             max_num_keypoints=options.max_num_keypoints,
             random_seed=options.random_seed,
             scores=ScoreOptions.from_mapping(changed, "--protocol-options"),
