@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -38,8 +38,7 @@ from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import one_openmp_thread, unless_gpu_is_full
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
+    from torch import Tensor, nn
 
 logger = logging.getLogger(__name__)
 
@@ -50,17 +49,16 @@ CHUNK_ROWS = 1 << 10  # features whose similarities are held at once, which boun
 DUPLICATE_RADIUS_PX = 2.0  # of nearer matches of several views, at both ends, the best stays
 
 
-@dataclass(frozen=True)
-class Training:
+class Training(NamedTuple):
     """What weights were trained for."""
 
     weights: str  # key of the file
     kind: str  # of the features that they take
-    recipe: str  # with such features, and what is to be changed in it
+    recipe: str  # with such features
     has_circles: bool = True  # whether frames are circles of one radius in the view, upright
 
 
-TRAININGS: dict[str, Training] = {
+TRAININGS = {
     "aliked": Training("lightglue-aliked", "aliked", "aliked-lightglue"),
     "disk": Training("lightglue-disk", "disk", "disk-lightglue"),
     "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat-lighterglue"),
@@ -159,23 +157,21 @@ class LightGlue:
                 continue
             order = np.argsort(-features.responses[rows], kind="stable")
             rows = np.sort(rows[order[: self.options.max_num_features]])
-            views.append(self._view(features.select(rows), rows, image.image_size))
+            views.append(PreparedView(rows, self._inputs(features.select(rows), image.image_size)))
         return PreparedViews(tuple(views), features.keypoints)
 
-    def _view(
-        self, features: LocalFeatures, rows: Indices, image_size: tuple[int, int]
-    ) -> PreparedView:
+    def _inputs(self, features: LocalFeatures, image_size: tuple[int, int]) -> dict[str, Tensor]:
         import torch
 
         lafs, size = features.lafs, np.asarray(image_size, np.float64)
         if features.rectification_ids[0]:
             lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
         values = network_inputs(lafs, size, max(image_size), self.options.trained_for)
-        inputs = {
+        values["descriptors"] = features.descriptors
+        return {
             name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
-            for name, array in (values | {"descriptors": features.descriptors}).items()
+            for name, array in values.items()
         }
-        return PreparedView(rows, inputs)
 
     def match(self, first: PreparedViews, second: PreparedViews) -> Matches:
         """Match two images; scores are the network's."""
@@ -187,43 +183,38 @@ class LightGlue:
         return parts[0] if len(parts) == 1 else united(parts, first.keypoints, second.keypoints)
 
     def _match_views(self, first: PreparedView, second: PreparedView) -> Matches:
-        import torch
-
         if not len(first.rows) or not len(second.rows):
             return Matches.none()
-        pair = {"image0": first.inputs, "image1": second.inputs}
         rows, columns, scores = unless_gpu_is_full(
-            lambda: self._run(self._network, pair, self._device),
-            lambda: self._run(self._network_on_cpu, pair, torch.device("cpu")),
+            lambda: self._run(self._network, first, second),
+            lambda: self._run(self._network_on_cpu, first, second),
         )
         return Matches(np.stack([first.rows[rows], second.rows[columns]], axis=1), scores)
 
-    def _run(
-        self, network: torch.nn.Module, pair: dict[str, dict[str, Tensor]], device: torch.device
-    ) -> tuple[Indices, Indices, Singles]:
+    def _run(self, network: nn.Module, *views: PreparedView) -> tuple[Indices, Indices, Singles]:
         import torch
 
+        device = next(network.parameters()).device
         on_gpu = device.type != "cpu"
         torch.get_num_threads()  # lets torch set up this thread, which would undo the next line
         limit = nullcontext() if on_gpu else one_openmp_thread()
         with torch.inference_mode(), limit, self._gpu_lock if on_gpu else nullcontext():
-            there = {
-                image: {name: tensor.to(device) for name, tensor in inputs.items()}
-                for image, inputs in pair.items()
-            }
-            found = network(there)
+            found = network({
+                f"image{k}": {name: tensor.to(device) for name, tensor in view.inputs.items()}
+                for k, view in enumerate(views)
+            })  # fmt: skip
             rows, columns = found["matches"][0].cpu().numpy().T
             scores = found["scores"][0].float().cpu().numpy()
         order = np.argsort(rows, kind="stable")
         return rows[order], columns[order], scores[order]
 
     @cached_property
-    def _network_on_cpu(self) -> torch.nn.Module:
+    def _network_on_cpu(self) -> nn.Module:
         logger.warning("the memory of the GPU is full; the CPU matches what does not fit")
         return load_network(self._path, self.options)
 
 
-def load_network(path: Path, options: LightGlueOptions) -> torch.nn.Module:
+def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
     """Build kornia's LightGlue with the parameters in a file, all of them, else WeightsError."""
     from kornia.feature import LightGlue as Network
 
@@ -301,18 +292,15 @@ def promising(
     first: Sequence[PreparedView], second: Sequence[PreparedView], count: int
 ) -> list[tuple[PreparedView, PreparedView]]:
     """Return the pairs of views with most mutual nearest neighbours among all features."""
-    descriptors1, descriptors2 = (
-        np.concatenate([view.inputs["descriptors"][0].numpy() for view in views])
-        for views in (first, second)
-    )
-    views1, views2 = (
-        np.repeat(np.arange(len(views)), [len(view.rows) for view in views])
-        for views in (first, second)
-    )
+    descriptors, numbers = [], []
+    for views in (first, second):
+        descriptors.append(np.concatenate([v.inputs["descriptors"][0].numpy() for v in views]))
+        numbers.append(np.repeat(np.arange(len(views)), [len(view.rows) for view in views]))
+    views1, views2 = numbers
     nearest1 = np.empty(len(views1), np.int64)
     nearest2, closest = np.zeros(len(views2), np.int64), np.full(len(views2), -np.inf)
     for start in range(0, len(views1), CHUNK_ROWS):
-        similarities = descriptors1[start : start + CHUNK_ROWS] @ descriptors2.T
+        similarities = descriptors[0][start : start + CHUNK_ROWS] @ descriptors[1].T
         nearest1[start : start + CHUNK_ROWS] = similarities.argmax(axis=1)
         best = similarities.max(axis=0)
         nearest2 = np.where(best > closest, start + similarities.argmax(axis=0), nearest2)
@@ -333,11 +321,9 @@ def united(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matche
     order = np.argsort(-scores, kind="stable")
     indices, scores = indices[order], scores[order]
     for column in (0, 1):  # the best match of each feature, in both images
-        _, best = np.unique(indices[:, column], return_index=True)
-        best.sort()
+        best = np.sort(np.unique(indices[:, column], return_index=True)[1])
         indices, scores = indices[best], scores[best]
     places = keypoints1[indices[:, 0]], keypoints2[indices[:, 1]]
     kept = without_duplicates(*places, DUPLICATE_RADIUS_PX)
-    indices, scores = indices[kept], scores[kept]
-    rising = np.argsort(indices[:, 0])
+    rising = kept[np.argsort(indices[kept, 0])]
     return Matches(indices[rising], scores[rising])
