@@ -123,10 +123,6 @@ def test_files_of_text_may_begin_with_a_byte_order_mark(trio: Path, tmp_path: Pa
     assert [*read_pairs(listed, names)] == [(names[0], names[1])]
     table = CameraOptions(cameras_path=str(written("table.csv", "name,focal_px\na.png,300\n")))
     assert read_given_cameras(table)["a.png"].focal_px == 300.0
-    written("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n")
-    model = written("cameras.txt", "1 PINHOLE 320 240 300 300 160 120\n")
-    given = read_given_cameras(CameraOptions(cameras_path=str(model)))
-    assert given["a.png"].model == "PINHOLE"
 
 
 def test_damaged_features_are_made_again_with_overwrite(

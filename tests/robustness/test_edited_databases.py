@@ -25,13 +25,13 @@ MENDED = {
     "image added": ("INSERT INTO images (name, camera_id) VALUES ('x', 1)", "1 added (x)"),
     "keypoints zero": (
         "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = 2",
-        "is written again: keypoints of 1 image",
+        "keypoints: 1 changed (b c.png)",
     ),
     "camera of another size": ("UPDATE cameras SET width = 100", "cameras: 3 changed"),
     "camera of no size": ("UPDATE cameras SET width = 'wide'", "(damaged (invalid"),
     "other geometry": (
         f"UPDATE two_view_geometries SET F = zeroblob(72) WHERE {FIRST_PAIR}",
-        "is written again: 1 pair",
+        "geometries: 1 changed",
     ),
     "table dropped": ("DROP TABLE frames", "no such table: frames"),
     "trigger": (
