@@ -127,7 +127,8 @@ def test_wrong_setting_is_one_clear_line(setting: str, message: str) -> None:
 
 def test_recipe_file_is_read_and_what_it_leaves_out_is_default(tmp_path: Path) -> None:
     path = tmp_path / "mine č.toml"
-    path.write_text('summary = "mine"\n[rectifier]\nmax_num_rectifications = 2\n')
+    text = 'summary = "mine"\n[rectifier]\nmax_num_rectifications = 2\n'
+    path.write_text(text, encoding="utf-8-sig")  # as editors of Windows do
     recipe = load_recipe(str(path))
     assert (recipe.name, recipe.summary) == (str(path), "mine")
     rectifier = DenseShapesOptions(max_num_rectifications=2)

@@ -26,7 +26,7 @@ import matplotlib.pyplot  # noqa: F401 - before HOME is another, where it would 
 import pytest
 from command import CAMERA, FAST, Call, Ended, run_in_process_of_its_own
 from damaged import damage, execute
-from planar_pairs import write_extreme_views
+from posed_photographs import write_extreme_views
 from results import database_content, differences, results, tree
 
 from colmap_affrect.colmap import pycolmap
