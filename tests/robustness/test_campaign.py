@@ -4,8 +4,7 @@
     CAMPAIGN=10 pytest -m long --dist load tests/robustness/test_campaign.py
 
 The second line makes ten times as many trials by chance. Each trial has a number, which seeds it,
-stands alone, and says what it did when it fails. Kills
-at system calls and full disks: tests/benchmarks/campaign.py.
+stands alone, and says what it did when it fails. Kills and full disks: test_interruption.py.
 """
 
 from __future__ import annotations
