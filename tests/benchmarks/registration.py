@@ -20,23 +20,14 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from machine import parser_of, span, table
 
 
-@dataclass(frozen=True)
-class Subset:
-    """Some images of one scene.
-
-    Attributes:
-        scene: folder of the scene.
-        step: every step-th image in sorted order is taken.
-        calibrated: whether the runs are given the true intrinsics.
-        first: number of the first image.
-    """
+class Subset(NamedTuple):
+    """Every step-th image of a scene in sorted order, perhaps with the true intrinsics."""
 
     scene: str
     step: int
@@ -44,20 +35,21 @@ class Subset:
     first: int = 0
 
 
+FOUNTAIN, HERZ, TEMPLE = "strecha_fountain_p11", "strecha_herz_jesus_p25", "temple_sparse_ring"
 SUBSETS = {
-    "fountain 0,5,10": Subset("strecha_fountain_p11", 5, True),
-    "herz 0,8,16,24": Subset("strecha_herz_jesus_p25", 8, True),
+    "fountain 0,5,10": Subset(FOUNTAIN, 5, True),
+    "herz 0,8,16,24": Subset(HERZ, 8, True),
     "kermit /2": Subset("kermit", 2, False),
     "sacre_coeur /2": Subset("sacre_coeur", 2, False),
     "saharov /4": Subset("saharov32", 4, True),
-    "temple /2": Subset("temple_sparse_ring", 2, True),
-    "temple all": Subset("temple_sparse_ring", 1, True),
-    "temple 1/2": Subset("temple_sparse_ring", 2, True, 1),
+    "temple /2": Subset(TEMPLE, 2, True),
+    "temple all": Subset(TEMPLE, 1, True),
+    "temple 1/2": Subset(TEMPLE, 2, True, 1),
     "saharov 1/5": Subset("saharov32", 5, True, 1),
     "kermit /3": Subset("kermit", 3, False),
     "sacre_coeur /3": Subset("sacre_coeur", 3, False),
-    "fountain 1,5,9": Subset("strecha_fountain_p11", 4, True, 1),
-    "herz /6": Subset("strecha_herz_jesus_p25", 6, True),
+    "fountain 1,5,9": Subset(FOUNTAIN, 4, True, 1),
+    "herz /6": Subset(HERZ, 6, True),
     "kitchen /2": Subset("kitchen", 2, False),
     "kitchen all": Subset("kitchen", 1, False),
     "et /2": Subset("et", 2, False),
@@ -66,13 +58,10 @@ SUBSETS = {
     "dunes 1/3": Subset("copr_kap", 3, False, 1),
     "nadar all": Subset("nadar", 1, False),
     "sceaux all": Subset("sceaux", 1, False),
-    "herz all": Subset("strecha_herz_jesus_p25", 1, True),
+    "herz all": Subset(HERZ, 1, True),
 }
-SUBSETS |= {
-    f"{name} (unknown)": replace(subset, calibrated=False)
-    for name, subset in SUBSETS.items()
-    if subset.calibrated
-}
+calibrated = {name: subset for name, subset in SUBSETS.items() if subset.calibrated}
+SUBSETS |= {f"{name} (unknown)": s._replace(calibrated=False) for name, s in calibrated.items()}
 
 
 def compare(
@@ -126,20 +115,23 @@ def compare_subset(
 
 def rows_of(name: str, comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each method and seed of a comparison."""
-    return [
-        {
-            "subset": name,
-            "num_images": comparison["images_total"],
-            "method": method,
-            "seed": seed["seed"],
-            "registered": seed["registered"],
-            "correct": seed["scores"] and len(seed["scores"]["correct_names"]),
-            "rotation_error_deg": seed["scores"] and seed["scores"]["median_rotation_error_deg"],
-            "points": seed["points3D"],
-        }
-        for method, result in comparison["methods"].items()
-        for seed in result.get("seeds", ())
-    ]
+    rows = []
+    for method, result in comparison["methods"].items():
+        for seed in result.get("seeds", ()):
+            scores = seed["scores"] or {}
+            rows.append(
+                {
+                    "subset": name,
+                    "num_images": comparison["images_total"],
+                    "method": method,
+                    "seed": seed["seed"],
+                    "registered": seed["registered"],
+                    "correct": len(scores["correct_names"]) if scores else None,
+                    "rotation_error_deg": scores.get("median_rotation_error_deg"),
+                    "points": seed["points3D"],
+                }
+            )
+    return rows
 
 
 def table_of(rows: Sequence[dict[str, Any]]) -> str:

@@ -113,6 +113,8 @@ def test_cameras_that_cannot_be_used_are_refused_before_anything_is_recorded(
     extract = ["extract", "--image-path", trio, "--output-path", tmp_path / "out", *FAST[:2]]
     refused = call(*extract, "--camera-model", "EQUIRECTANGULAR")
     assert "--camera-model EQUIRECTANGULAR: not one of SIMPLE_PINHOLE, " in refused.errors[0]
+    refused = call(*extract, "--principal-point", "5")
+    assert "--principal-point 5: give cx,cy, two numbers" in refused.errors[0]
     inputs = Inputs.of(trio, cameras=CameraOptions(existing_camera_id=7))
     context = Context(Workspace(tmp_path / "out"))
     with pytest.raises(OptionError, match=r"existing_camera_id=7: .*database\.db has no such"):
