@@ -46,20 +46,12 @@ MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
 
 @dataclass(frozen=True)
 class ExtractedImage:
-    """Features of one image file.
+    """Features of one image file."""
 
-    Attributes:
-        features: frames in px of the stored image.
-        image_size: (width, height) of the stored image in px.
-        warning: why it was not rectified though it was to be, or not on the GPU; empty if all
-            went well.
-        stretched: whether its contrast was low and was stretched.
-    """
-
-    features: LocalFeatures
-    image_size: tuple[int, int]
-    warning: str = ""
-    stretched: bool = False
+    features: LocalFeatures  # frames in px of the stored image
+    image_size: tuple[int, int]  # (width, height) of the stored image in px
+    warning: str = ""  # why it was not rectified or not on the GPU; empty if all went well
+    stretched: bool = False  # whether its contrast was low and was stretched
 
 
 @dataclass(frozen=True)
