@@ -29,11 +29,11 @@ from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.images.reading import decode, in_eight_bits, read_color, shrink_to, tones
 from colmap_affrect.parallel.executor import (
+    SHARED_OPENCV_THREADS,
     available_cores,
     available_memory_bytes,
     unless_gpu_is_full,
 )
-from colmap_affrect.parallel.opencv_threads import SHARED_OPENCV_THREADS
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions, Level
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
