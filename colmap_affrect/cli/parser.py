@@ -42,7 +42,7 @@ EXAMPLES = (
     "export-h5 --database-path any.db --features-path features.h5 \\\n"
     "      --matches-path matches.h5",
     "export-database out old.db --colmap 3.8",
-    "export --model-path out/sparse/0 --output-path for-others --format ply,bundler",
+    "export --model-path out/sparse/0 --output-path for-others --format ply,text",
     "export --model-path out/sparse/0 --output-path for-others --format nerfstudio \\\n"
     "      --image-path photos",
     "align --model-path out/sparse/0 --output-path metric --gps out/database.db",

@@ -26,7 +26,6 @@ from colmap_affrect.colmap.seal import (
     remove_seal,
 )
 from colmap_affrect.colmap.tables import Tables, open_read_only, pair_images, read_tables
-from colmap_affrect.colmap.useless_keypoints import KINDS
 from colmap_affrect.errors import AffrectError, DatabaseError, such_as
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.outputs import database_files
@@ -40,7 +39,7 @@ from colmap_affrect.stages.verify import verify_matches
 
 logger = logging.getLogger(__name__)
 
-UNUSABLE = (FATAL | KINDS | {"no-frame"}) - {"keypoints-outside"}
+UNUSABLE = FATAL | {"no-frame"}
 RIGS = ("rigs", "rig_sensors", "frames", "frame_data")
 
 
