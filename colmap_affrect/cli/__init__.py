@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from colmap_affrect import __version__
 from colmap_affrect.cli.parser import build_parser
@@ -127,7 +127,7 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     log_path.parent.mkdir(parents=True, exist_ok=True)
     python_stderr, terminal_fd = sys.stderr, os.dup(2)
     terminal = os.fdopen(terminal_fd, "w", buffering=1, encoding="utf-8", errors="replace")
-    log = _Log(log_path, encoding="utf-8", errors="backslashreplace")
+    log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
     with terminal, closing(log):
         shown = logging.StreamHandler(terminal)
         level = logging.DEBUG if options.verbose else logging.WARNING
@@ -159,12 +159,13 @@ class _OneLine(logging.Formatter):
         return one_line(super().formatMessage(record))
 
 
-class _Log(logging.FileHandler):
+class _Log(logging.StreamHandler[TextIO]):
     """Writes to ``run.log``; where the disk has no room for that the command goes on without."""
 
     def handleError(self, record: logging.LogRecord) -> None:
         pass
 
     def close(self) -> None:
+        super().close()
         with suppress(OSError):
-            super().close()
+            self.stream.close()
