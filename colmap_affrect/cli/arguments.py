@@ -239,8 +239,6 @@ EVALUATION = (
         "by name or path; NAME=RECIPE:section.option=value changes options "
         "(default: unrectified-rootsift,default)",
         nargs="+", default=["unrectified-rootsift", "default"]),
-    _value("--baseline", "NAME",
-        "the recipe that the others are tested against, pair by pair"),
     _value("--max-num-keypoints", "N",
         "equal budget: match only the strongest N features of each image, warps included",
         type=int),

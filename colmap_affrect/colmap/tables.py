@@ -1,7 +1,7 @@
 """What a COLMAP database of any version holds, read by SQLite: COLMAP migrates what it opens."""
 
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -126,18 +126,6 @@ def rows_of(connection: sqlite3.Connection, columns: str, table: str) -> Iterabl
     present = ", ".join(name if name in known | {"rowid"} else "0" for name in columns.split())
     # All names are those of COLMAP's tables, written down in this package.
     return connection.execute(f"SELECT {present} FROM {table}")  # noqa: S608
-
-
-def delete_rows(path: Path, rows: Mapping[str, Iterable[int]]) -> None:
-    """Delete rows of the tables that are named, all at once; COLMAP must not have them open."""
-    try:
-        with closing(sqlite3.connect(path)) as connection, connection:
-            for table, keys in rows.items():
-                # Names of tables are those of COLMAP, written down in this package.
-                statement = f"DELETE FROM {table} WHERE rowid = ?"  # noqa: S608
-                connection.executemany(statement, ((int(key),) for key in keys))
-    except DAMAGED as error:
-        raise DatabaseError(f"{path}: cannot be changed ({error})") from error
 
 
 def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:

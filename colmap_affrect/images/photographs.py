@@ -3,10 +3,10 @@
 import os
 import posixpath
 import unicodedata
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -116,11 +116,6 @@ class Photographs:
         except ImageError as error:
             return str(error)
         return ""
-
-    def moved(self, move: Callable[[Path], Path]) -> Self:
-        """Return the same photographs with all files in other places."""
-        masks = MaskOptions(**{name: str(move(Path(path))) for name, path in self.masks if path})
-        return replace(self, folder=move(self.folder), masks=masks)
 
 
 def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:

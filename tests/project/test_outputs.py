@@ -152,15 +152,15 @@ IN_TEMPORARY_FOLDERS = {
     ("align.py", "align"), ("pycolmap_mapping.py", "_written"),
     ("export.py", "_points"), ("export.py", "_nerfstudio"), ("export.py", "_text"),
     ("hdf5_layouts.py", "created"),
-    ("inspection.py", "inspect_image"), ("sheet.py", "draw_sheet"), ("conversion.py", "_convert"),
-    ("conversion.py", "convert_images"), ("worker.py", "_run_seed"), ("worker.py", "_map_sift"),
-    ("sift.py", "match_sift"),
+    ("inspection.py", "inspect_image"), ("conversion.py", "_convert"),
+    ("conversion.py", "convert_images"),
+    ("method_run.py", "_run_seed"), ("method_run.py", "_map_sift"), ("sift.py", "match_sift"),
 }  # fmt: skip
 """Functions that write where the door lets them."""
 
 IN_WORK_FOLDERS = {
-    ("compare.py", "_run"), ("compare.py", "_require_same_inputs"), ("task.py", "begin"),
-    ("runner.py", "__init__"), ("__init__.py", "_logging"), ("plots.py", "write_plot"),
+    ("compare.py", "_run"), ("compare.py", "_require_same"), ("method_run.py", "begin"),
+    ("runner.py", "__init__"), ("__init__.py", "_logging"), ("results.py", "write_plot"),
 }  # fmt: skip
 """Functions that write where the door has refused folders of others, and links."""
 
