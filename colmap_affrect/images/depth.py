@@ -317,10 +317,10 @@ class MonocularDepth:
             output = self._network(self._pillow_from_array(image))["predicted_depth"]
         values = output.detach().cpu().float().numpy()
         values = values.reshape(values.shape[-2:])
-        return _Prediction(values, predicts_inverse_depth(self._network.model.config))
+        return _Prediction(values, _predicts_inverse_depth(self._network.model.config))
 
 
-def predicts_inverse_depth(config: Any) -> bool:
+def _predicts_inverse_depth(config: Any) -> bool:
     """Return whether a model predicts relative inverse depth, by its configuration.
 
     Depth Anything says so. DPT does but for metric heads, those with ``add_projection``.

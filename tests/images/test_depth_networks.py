@@ -30,7 +30,6 @@ from colmap_affrect.images.depth import (
     DepthContext,
     MonocularDepth,
     MonocularOptions,
-    predicts_inverse_depth,
 )
 
 
@@ -108,23 +107,6 @@ def test_network_of_relative_inverse_depth(transformers, model):
 
 
 @pytest.mark.long
-def test_what_a_model_predicts_is_read_from_its_configuration(transformers):
-    inverse = [
-        transformers.DPTConfig(),
-        transformers.DepthAnythingConfig(),
-        transformers.DepthAnythingConfig(depth_estimation_type="relative"),
-    ]
-    metric = [
-        transformers.DPTConfig(add_projection=True),
-        transformers.DepthAnythingConfig(depth_estimation_type="metric"),
-        transformers.GLPNConfig(),
-        transformers.ZoeDepthConfig(),
-    ]
-    assert all(predicts_inverse_depth(config) for config in inverse)
-    assert not any(predicts_inverse_depth(config) for config in metric)
-
-
-@pytest.mark.long
 def test_model_that_is_no_depth_network_or_not_there_is_one_clear_error(transformers, tmp_path):
     config = transformers.Dinov2Config(hidden_size=16, num_hidden_layers=1, num_attention_heads=1)
     transformers.Dinov2Model(config).save_pretrained(tmp_path / "backbone")
@@ -192,6 +174,7 @@ def fake(monkeypatch):
 
 RELATIVE = dict(model_type="depth_anything", depth_estimation_type="relative")
 METRIC = dict(model_type="zoedepth")
+DPT = dict(model_type="dpt", add_projection=False)  # as MiDaS; with a projection it is metric
 
 NAN = np.nan
 PLANE, PLANE_RAYS = slanted_plane((12, 8), CAMERA)
@@ -207,6 +190,8 @@ PLANE, PLANE_RAYS = slanted_plane((12, 8), CAMERA)
             [[50.0, 25.0, 5.0], [0.51, 0.49, -0.1]],
             [[1, 2, 10], [50 / 0.51, NAN, NAN]],
         ),
+        (DPT, "z", [[50.0, 25.0]], [[1, 2]]),
+        ({**DPT, "add_projection": True}, "z", [[50.0, 25.0]], [[50, 25]]),
         (METRIC, "z", [[[5.0, 2.5, 0.5], [0.0, -0.1, NAN]]], [[5, 2.5, 0.5], [NAN] * 3]),
         (METRIC, "inverse", [[4.0, 2.0]], [[1.0, 2.0]]),
         (METRIC, "ray", PLANE_RAYS, PLANE),
