@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from math import log, prod
 from pathlib import Path
 from posixpath import splitext
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 from zipfile import BadZipFile
 
 import cv2
@@ -27,12 +27,13 @@ from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Singles
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.reading import read_color, shrink_to
-from colmap_affrect.options import PartOptions, Registry, within
+from colmap_affrect.options import PartOptions, Registry
 from colmap_affrect.project.atomic_files import replace_bytes
 
 SUFFIXES = (".npy", ".png", ".tif", ".tiff")  # in the order in which they are looked for
 MAX_NUM_VALUES_PER_PX = 4  # of a map, for each pixel of its photograph; more is taken for damage
 MIN_LARGEST_MAP = 1 << 22  # a map of so many values is read whatever the size of the photograph
+PNG_STEP = 0.001  # depth of one step of 16 bits; only the ratio of depths matters
 MAX_ASPECT_RATIO = 1.05  # of aspects of map and photograph: networks round sizes to 32 px
 MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
 MIN_DISPARITY_FRAC = 0.01  # inverse depth below this share of the largest is sky, i.e. unknown
@@ -98,8 +99,6 @@ class DepthFilesOptions(DepthOptions):
     path: str = ""
     """Folder of depth maps, named as the images: ``a/b.jpg`` has ``a/b.npy``, or .png, .tif (also
     after the image's full name, ``a/b.jpg.npy``)."""
-    png_scale: Annotated[float, within(1e-12, 1e12)] = 0.001
-    """Depth of one step of a 16-bit PNG; only the ratio of depths matters."""
 
     @property
     def folder(self) -> Path | None:
@@ -169,7 +168,7 @@ class DepthFiles:
             stored = photograph.path and header_size(photograph.path)
             values = _read_map(path, prod(stored or photograph.size))
             if path.suffix == ".png":
-                values = values * self._options.png_scale
+                values = values * PNG_STEP
             _require_same_aspect(values, photograph)
             return _z_depth(values, self._options.kind, photograph)
         except _UnusableMap as error:
