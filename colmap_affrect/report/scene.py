@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import read_model
+from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.report.pictures import base64_text
@@ -62,7 +62,7 @@ def read_scene(paths: Mapping[str, Path | None]) -> list[View3D]:
     for name, path in paths.items():
         try:
             if path is not None:
-                models[name] = read_model(path)
+                models[name] = read_given_model(path)
         except AffrectError as error:
             notes[name] = f"The model cannot be shown: {error}"
     if models:
