@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,7 +15,6 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError, damage, such_as
-from colmap_affrect.evaluation.data import Dataset, EvaluationImage, EvaluationPair
 from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import colmap_from_pixel, pixel_from_colmap
@@ -32,6 +31,43 @@ PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
 CALIBRATION_PREFIX = "calibration_"
 ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
+
+
+@dataclass(frozen=True)
+class EvaluationImage:
+    """An image of a dataset; its name is the key of its features and depth map."""
+
+    name: str
+    path: Path
+    camera: pycolmap.Camera | None = None  # None where it is not known
+
+    @property
+    def intrinsics(self) -> Array | None:
+        """(3, 3) camera matrix in pixel-centre px, without distortion; None without a camera."""
+        if self.camera is None:
+            return None
+        matrix = np.asarray(self.camera.calibration_matrix(), dtype=np.float64)
+        matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])
+        return matrix
+
+
+@dataclass(frozen=True)
+class EvaluationPair:
+    """Two images whose matches are scored; one with a problem has no truth, and fails."""
+
+    name: str
+    images: tuple[EvaluationImage, EvaluationImage]
+    category: str = ""  # of difficulty, as tables group pairs; empty for none
+    truth: TrueHomography | TruePose | Correspondences | None = None
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """The pairs of a dataset, and what is missing in it, in words."""
+
+    pairs: tuple[EvaluationPair, ...]
+    notes: tuple[str, ...] = ()
 
 
 class _Entry(Options):

@@ -13,7 +13,7 @@ from statistics import fmean
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import EvaluationError, OptionError, such_as
 from colmap_affrect.evaluation import datasets, truths
-from colmap_affrect.evaluation.data import Dataset, PairResult, ScoreOptions
+from colmap_affrect.evaluation.datasets import Dataset
 from colmap_affrect.evaluation.results import (
     SECONDS,
     Evaluation,
@@ -22,6 +22,7 @@ from colmap_affrect.evaluation.results import (
     write_plot,
 )
 from colmap_affrect.evaluation.runner import RecipeRun
+from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text

@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from pydantic import Field, TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
-from colmap_affrect.evaluation.data import Number, PairResult
-from colmap_affrect.evaluation.truths import GROUP
+from colmap_affrect.evaluation.truths import GROUP, Number, PairResult
 from colmap_affrect.project.atomic_files import replace_bytes
 
 DATA = Path(__file__).with_name("published.toml")

@@ -25,8 +25,8 @@ from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
 from colmap_affrect.comparison.methods import Method
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.evaluation import data
-from colmap_affrect.evaluation.data import EvaluationPair, PairResult, PairScore
+from colmap_affrect.evaluation.datasets import EvaluationImage, EvaluationPair
+from colmap_affrect.evaluation.truths import PairResult, PairScore, ScoreOptions
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
@@ -74,7 +74,7 @@ class RecipeRun:
         if method.recipe is None:
             raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
         self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
-        self._options = data.ScoreOptions(**settings["scores"]), settings["random_seed"]
+        self._options = ScoreOptions(**settings["scores"]), settings["random_seed"]
         extraction, matching = self.recipe.extraction, self.recipe.matching
         images = {image.name for pair in pairs if not pair.problem for image in pair.images}
         self._extractor = prepare(extraction, resources, sorted(images))
@@ -166,7 +166,7 @@ class RecipeRun:
                 break
         return replace(best, seconds=seconds, num_levels=num_levels), points
 
-    def _extract(self, image: data.EvaluationImage, level: int) -> bool:
+    def _extract(self, image: EvaluationImage, level: int) -> bool:
         """Extract what an image lacks up to a level; tell whether it can be used."""
         name, store = image.name, self._store
         num_levels = len(store.level_ends(name)) if store.complete([name]) else 0

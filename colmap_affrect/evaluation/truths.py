@@ -6,31 +6,31 @@ of failed pairs may have no details; their errors are infinite.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from statistics import fmean, median_low
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from pydantic import BeforeValidator
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, pose_errors
 from colmap_affrect.comparison.pose_scores import area_under_curve
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
 from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 from colmap_affrect.images.reading import read_gray
+from colmap_affrect.options import Options, within
 
 Points = Floats
 Sides = tuple[Floats, Floats]  # points or rays of both images
-Results = Sequence[PairResult]
 Size = tuple[int, int]  # (width, height) in px
 
 GROUP = ": "  # separates the name of a table from that of its column in the names of columns
@@ -45,6 +45,56 @@ MAX_ERROR_PX, MAX_ERROR_DEG = 5.0, 5.0  # homographies and rotations of solved p
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
 MAX_AUC_ERROR_DEG = 10.0
 NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
+
+
+Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
+"""Infinite where JSON has null."""
+
+
+class ScoreOptions(Options):
+    """How models are estimated from matches: ``--protocol-options`` of the command line."""
+
+    threshold_px: Annotated[float, within(1e-6, 1e9)] = 0.5
+    """Of an inlier of plain RANSAC, for homographies and poses (the paper: 0.5)."""
+    max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
+    """Of estimators, as the paper says; its numbers of relative poses are those of 1000."""
+
+
+@dataclass(frozen=True)
+class PairScore:
+    """How good the matches of one pair are."""
+
+    error: Number  # of the protocol, px or degrees; infinite where no model was found
+    num_inliers: int  # of the model that was estimated
+    num_correct: int | None = None  # matches that agree with the truth; None where it cannot say
+    details: Mapping[str, Number] = field(default_factory=dict)  # beside the error
+    solved: float = 0.0  # how far it counts as matched: 1 or 0 where there is a threshold
+    kind: str = ""  # of the truth, as tables name it; empty without one
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairResult(PairScore):
+    """The score of one pair by one recipe: what ``evaluation.json`` lists.
+
+    Attributes:
+        level: rectifier of the level of escalation that decided, ``none`` if no level was verified;
+            empty without escalation.
+        num_levels: levels that were matched, 1 without escalation.
+        failure: why the pair counts as failed, with an infinite error.
+    """
+
+    name: str
+    category: str = ""
+    num_matches: int = 0
+    num_keypoints: tuple[int, int] = (0, 0)
+    seconds: float = 0.0
+    seconds_by_step: Mapping[str, float] = field(default_factory=dict)  # ``match``, ``estimate``
+    level: str = ""
+    num_levels: int = 0
+    failure: str = ""
+
+
+Results = Sequence[PairResult]
 
 
 def estimate_matrix(
