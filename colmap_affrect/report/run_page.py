@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from colmap_affrect.errors import such_as
-from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport, by_story
@@ -92,8 +91,6 @@ def write_run_page(
         "matrix": matrix,
         "guided": _guided(report),
         **_cameras(report, index),
-        "stages": _stages(report),
-        "settings": _settings(report),
         "script_data": {
             "matrices": [matrix],
             "views": [view.script_data(index, {card.name: card.kind for card in cards})],
@@ -198,22 +195,3 @@ def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str
     if total > len(rows):
         note += f" The first {len(rows)} are listed, report.json has all."
     return {"cameras": rows, "camera_note": note}
-
-
-def _stages(report: ReconstructionReport) -> list[dict[str, Any]]:
-    longest = max((stage.wall_s for stage in report.stages), default=0.0) or 1.0
-    return [
-        {"label": stage.name, "shares": [stage.wall_s / longest], "text": f"{stage.wall_s:.1f}"}
-        for stage in report.stages
-    ]
-
-
-def _settings(report: ReconstructionReport) -> dict[str, Mapping[str, Any]]:
-    settings = {
-        "Two-view geometry": flat(report.verification),
-        "Mapping": flat(report.mapping),
-        "What differs from COLMAP's defaults": flat(report.differs_from_colmap),
-        "Verified pairs by level of the recipe": report.pair_levels,
-        "Versions": report.versions,
-    }
-    return {title: values for title, values in settings.items() if values}
