@@ -142,11 +142,7 @@ def _escaped(character: str) -> str:
 
 
 def one_line(text: str) -> str:
-    r"""Return the same in one line.
-
-    >>> one_line("a\nb")
-    'a\\u000ab'
-    """
+    """Return the same in one line, line ends as JSON has them."""
     return shown(text).replace("\n", _escaped("\n"))
 
 
@@ -159,11 +155,7 @@ def say(line: str) -> None:
 
 
 def such_as(names: Iterable[str], most: int = MAX_NAMES) -> str:
-    """Return the first few names, and how many there are more.
-
-    >>> such_as(["a", "b", "c", "d", "e"])
-    'a, b, c and 2 more'
-    """
+    """Return the first few names, and how many there are more."""
     listed = list(names)
     more = f" and {len(listed) - most} more" if len(listed) > most else ""
     return ", ".join(listed[:most]) + more

@@ -41,11 +41,7 @@ class Span:
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Self:
-        """Return the span of one or more values.
-
-        >>> Span.of([1, 3, 2])
-        Span(mean=2.0, min=1.0, max=3.0)
-        """
+        """Return the span of one or more values."""
         numbers = [float(value) for value in values]
         return cls(sum(numbers) / len(numbers), min(numbers), max(numbers))
 

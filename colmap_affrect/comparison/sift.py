@@ -40,12 +40,10 @@ def extract_sift(
     *,
     affine: bool,
 ) -> dict[str, str]:
-    """Extract SIFT features of images that the database has; those with features are kept.
+    """Extract SIFT features of images of a database; those that have some are kept.
 
-    COLMAP takes memory for whatever a header claims, so images that claim more pixels than
-    photographs have, and those with such masks, are passed over as our extraction does.
-
-    Returns the images that have no features now, with the reason.
+    Images and masks that claim more pixels than photographs have are passed over: COLMAP takes
+    memory for whatever a header claims. Returns the images without features, with the reason.
     """
     photographs = Photographs(image_path, masks)
     impossible = {name: why for name in image_names if (why := photographs.why_impossible(name))}
@@ -73,8 +71,7 @@ def extract_sift(
 def match_sift(database_path: Path, pairs: Sequence[Pair]) -> None:
     """Match pairs of images by COLMAP's defaults, without verification.
 
-    COLMAP's lists of pairs cannot hold names with spaces: it matches in a copy, in which the images
-    have other ones.
+    In a copy in which images have other names: COLMAP's lists of pairs cannot hold spaces.
     """
     ids = image_ids(database_path)
     names = {image_id: name for name, image_id in ids.items()}
@@ -95,7 +92,6 @@ def match_sift(database_path: Path, pairs: Sequence[Pair]) -> None:
 
 
 def _rename_images(database_path: Path, names: Mapping[int, str]) -> None:
-    """Give the images of a database these names by id."""
     with open_database(database_path) as database:
         for image in database.read_all_images():
             image.name = names[image.image_id]

@@ -107,10 +107,7 @@ def load_evd(folder: Path) -> Dataset:
 
 
 def _scenes(pattern: str, load: Callable[[Path], Dataset], path: Path) -> Dataset:
-    """Read one or all scenes, by the file or folder that makes a folder one.
-
-    Raises EvaluationError when there is none, or its files are unusable.
-    """
+    """Read one or all scenes, by the file that makes a folder one; EvaluationError if none."""
     folders = [path, *sorted(path.glob("*/"))]
     scenes = [load(each) for folder in folders for each in sorted(folder.glob(pattern))]
     notes = tuple(note for scene in scenes for note in scene.notes)
@@ -246,10 +243,7 @@ def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
 
 
 def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
-    """Return an array, of any number of rows where ``shape`` begins with -1.
-
-    EvaluationError says what is wrong with ``what``.
-    """
+    """Return an array; a shape that begins with -1 has any number of rows. EvaluationError."""
     try:
         values = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -271,10 +265,7 @@ def pinhole(matrix: Array, what: str) -> pycolmap.Camera:
 
 
 def load_pairs(folder: Path) -> Dataset:
-    """Read ``pairs.json``; EvaluationError when that cannot be used.
-
-    A pair whose images or truth cannot be used is returned with its problem.
-    """
+    """Read ``pairs.json``; pairs that cannot be used have a problem, else EvaluationError."""
     path = folder / "pairs.json"
     with _damaged(path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))

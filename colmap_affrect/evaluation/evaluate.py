@@ -80,11 +80,9 @@ def evaluate(
 ) -> Evaluation:
     """Score recipes on a dataset by one of ``PROTOCOLS``.
 
-    An image or pair that cannot be used counts as failed, and the others go on; so does an
-    evaluation that was stopped, unless ``overwrite`` discards features and scores of these recipes
-    first. What is returned is also written to ``evaluation.json`` and ``errors.png`` in the output
-    folder, which is made if missing. Raises AffrectError for anything that the caller can mend,
-    before any image is worked on.
+    An image or pair that cannot be used counts as failed. One that was stopped goes on, unless
+    ``overwrite`` discards features and scores of these recipes. Writes ``evaluation.json`` and
+    ``errors.png``, too. AffrectError for what the caller can mend, before any image is worked on.
     """
     require_png()
     if protocol not in PROTOCOLS:

@@ -127,10 +127,7 @@ def _table(
 
 
 def write_plot(evaluation: Evaluation, path: Path) -> None:
-    """Draw the number of pairs of each recipe over the threshold of the error, as PNG.
-
-    The axes are those of the paper's figure.
-    """
+    """Draw how many pairs each recipe has below each error, as in the paper, as PNG."""
     figure = Figure(figsize=(8.0, 5.0), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     axes, (low, high) = figure.add_subplot(), ERROR_LIMITS

@@ -68,8 +68,7 @@ class RecipeRun:
     ) -> None:
         """Find everything that the recipe needs before any image is worked on.
 
-        Features depend on the recipe and ``inputs``, and scores on ``settings`` too. Others are
-        kept beside; ``overwrite`` removes all that this method has.
+        Features depend on recipe and ``inputs``, scores on ``settings`` too.
         """
         if method.recipe is None:
             raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
@@ -138,10 +137,7 @@ class RecipeRun:
     def _matched(
         self, matchers: Sequence[CachedMatcher], pair: EvaluationPair
     ) -> tuple[PairResult, tuple[Array, Array]]:
-        """Return the (M, 2) and (M, 2) points of the best level, and a result without score.
-
-        It has no levels where an image cannot be used.
-        """
+        """Return a result without score, and (M, 2) and (M, 2) points of the best level, if any."""
         best = PairResult(**vars(NO_SCORE), name=pair.name, category=pair.category)
         points, most, seconds, num_levels = NOTHING, 0, 0.0, 0
         for level, matcher in enumerate(matchers):

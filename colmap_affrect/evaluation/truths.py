@@ -143,10 +143,7 @@ def estimate_pose(
 
 @dataclass(frozen=True, eq=False)
 class TrueHomography:
-    """The (3, 3) image2_from_image1 of pixel-centre px, and the sizes of the images.
-
-    Its third coordinate is positive in the part of image 1 that image 2 shows.
-    """
+    """The (3, 3) image2_from_image1 of pixel-centre px, > 0 where visible; sizes of images."""
 
     matrix: Array
     size1: Size
@@ -156,8 +153,7 @@ class TrueHomography:
     def of(cls, matrix: Array, paths: Sequence[Path], what: str) -> "TrueHomography":
         """Return the truth of two image files, of a (3, 3) matrix of any scale and sign.
 
-        Raises ImageError when an image cannot be read, and EvaluationError, naming ``what``, when
-        image 2 shows no part of image 1 by it.
+        ImageError when one cannot be read, EvaluationError when image 2 shows no part of image 1.
         """
         size1, size2 = ((gray.shape[1], gray.shape[0]) for gray in map(read_gray, paths))
         both = [cls(sign * matrix, size1, size2) for sign in (1.0, -1.0)]
@@ -177,7 +173,7 @@ class TrueHomography:
     def error_px(self, estimate: Array | None) -> float:
         """Return the mean distance in image 2 between truth and estimate, over the visible part.
 
-        It is infinite without an estimate, or when its horizon runs through that part.
+        Infinite without an estimate, or when its horizon runs through that part.
         """
         if estimate is None:
             return math.inf
@@ -255,8 +251,7 @@ def rays(camera: pycolmap.Camera, points: Points) -> Points:
 def pose_columns(results: Results, *, by_category: bool = True) -> dict[str, float]:
     """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
 
-    Also the area under the curve of the larger of rotation and direction error up to 10 degrees.
-    Categories are in the order of the results.
+    And the area under the curve of the larger of rotation and direction error up to 10 degrees.
     """
     groups: dict[str, list[bool]] = {}
     for result in results if by_category else ():
@@ -294,10 +289,7 @@ class Correspondences:
 
 
 def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2: Points) -> Array:
-    """Return (N,) sqrt(d1^2 + d2^2) of points from their epipolar lines, px, as WxBS has it.
-
-    Infinite without a matrix, and where a line is not defined.
-    """
+    """Return (N,) sqrt(d1^2 + d2^2) from epipolar lines, px; infinite if undefined."""
     if matrix is None:
         return np.full(len(points1), np.inf)
     lines1, lines2 = epipolar_lines(matrix, points1, points2)

@@ -81,9 +81,8 @@ class AffNetHardNet:
     ) -> list[LocalFeatures]:
         """Estimate shape, orientation and descriptor of features, a list element for each image.
 
-        Patches of all (H, W) uint8 images share batches. Of the frames given, in px of the image,
-        centre and scale count. Features whose shape is degenerate or whose descriptor is not finite
-        are left out; the others keep their order.
+        Of the frames given, in px, centre and scale count. Features whose shape is degenerate or
+        whose descriptor is not finite are left out; the others keep their order.
         """
         counts = [len(features) for features in detected]
         if not sum(counts):
@@ -151,10 +150,7 @@ def _sampler(
 
 
 def _shapes_from_outputs(outputs: Floats) -> Array:
-    """Return (N, 2, 2) shapes of determinant 1 of (N, 3) outputs of AffNet, lower triangular.
-
-    NaN where the frame has no area.
-    """
+    """Return (N, 2, 2) shapes of determinant 1 of AffNet's outputs; NaN without an area."""
     shapes = frames_from_affnet(outputs)
     areas = shapes[:, 0, 0] * shapes[:, 1, 1]
     return shapes / np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]

@@ -79,10 +79,7 @@ class AffNetOptions(ShapeOptions):
 
 
 class AffNet:
-    """Shapes of all 4 x 4 blocks of an image, or of its keypoints.
-
-    Keypoints are by DoG, with the thresholds of the recipe's features where those are.
-    """
+    """Shapes of all 4 x 4 blocks of an image, or of its DoG keypoints."""
 
     Options = AffNetOptions
 
@@ -118,10 +115,7 @@ class AffNet:
         return ShapeGrid(metrics_from_log(logs), textured, grid_origin(STEP_PX), STEP_PX)
 
     def samples(self, image: GrayImage) -> ShapeSamples:
-        """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image.
-
-        Keypoints whose shape is not finite or turns the patch over are left out.
-        """
+        """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
         keypoints = self.detect(image)
         order = np.argsort(-keypoints.responses, kind="stable")
         keypoints = keypoints.select(order[: self.options.max_num_keypoints])

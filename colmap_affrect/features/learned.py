@@ -94,10 +94,7 @@ class LearnedFeatures(FeatureExtractor):
         self.network: Any = load_extractor(key, threshold, path, context.device)
 
     def detect(self, view: View) -> LocalFeatures:
-        """Detect and describe, by falling response; none for views under 8 px.
-
-        The mask chooses among what was found, so that its edge is no feature.
-        """
+        """Detect and describe, by falling response; the mask chooses, its edge is no feature."""
         image, mask = view
         if not is_searchable(image, mask):
             return LocalFeatures.empty(self.descriptor_size)

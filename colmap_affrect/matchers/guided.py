@@ -68,10 +68,7 @@ class GuidableImage:
 
     @property
     def has_directions(self) -> bool:
-        """Whether frames can tell a direction.
-
-        Similarities (COLMAP's SIFT) do, circles do not, nor what warps made of them.
-        """
+        """Whether frames tell a direction: circles do not, nor what warps made of them."""
         return self.shapes is not None and len(self.shapes) > 0 and vary_singly(self.shapes)
 
 
@@ -250,7 +247,7 @@ def frame_angles_deg(
 ) -> Array:
     """Return (M,) angles between the frames of (M, 2) matches and the geometry.
 
-    The sign of all directions that the geometry leaves open is that of most of the matches ``of``.
+    The sign that the geometry leaves open is that of most of the matches ``of``.
     """
     cosines, known = (
         guide.model.cosines(pairs[:, 0], pairs[:, 1], shapes) for pairs in (indices, of)

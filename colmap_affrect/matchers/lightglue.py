@@ -130,8 +130,8 @@ class PreparedViews:
 class LightGlue:
     """Matches with one network, a pair of views at a time.
 
-    On a CPU each calling thread uses one core, so that results do not depend on their number. A GPU
-    takes one pair at a time; where its memory is full the CPU matches.
+    On a CPU each thread uses one core, so that results do not depend on their number; a GPU takes
+    one pair at a time, and where its memory is full the CPU matches.
     """
 
     Options = LightGlueOptions

@@ -87,10 +87,7 @@ def retrieved_pairs(
     num_neighbors: int,
     progress: Progress,
 ) -> list[Pair]:
-    """Return pairs of images that are alike as a whole, of so many neighbours on average.
-
-    None if all features are those of warps, which are not looked at.
-    """
+    """Return pairs of images that are alike as a whole; none if all features are of warps."""
     random = np.random.default_rng(0)
     sampled = random.permutation(len(names))[:NUM_SAMPLED_IMAGES]
     num_each = -(-NUM_SAMPLES // max(1, len(sampled)))

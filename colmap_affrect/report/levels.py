@@ -98,10 +98,10 @@ class _Recorder:
 
 
 def describe_level(level: InspectedLevel) -> dict[str, Any]:
-    """Return one level as plain values for JSON: warps, totals, seconds.
+    """Return one level as plain values for JSON.
 
-    Coordinates and areas are in px of the photograph at the size of processing; a ``share`` is
-    that of its area; a ``bounding_box`` is left, top, width, height.
+    Coordinates and areas are in px of the photograph at the size of processing, boxes are left,
+    top, width, height.
     """
     plan = level.plan
     regions = plan.num_regions

@@ -57,10 +57,10 @@ def write_run_page(
     image_path: Path | None,
     progress: Progress = SILENT,
 ) -> Path:
-    """Write ``report.html`` into the folder of a run, one file that loads nothing.
+    """Write ``report.html`` of a run, one file that loads nothing; WorkspaceError if it cannot.
 
-    ``names`` are those of all photographs, ``image_path`` their folder, None where it is not known;
-    ``pair_inliers`` are of the verified pairs. Raises WorkspaceError when it cannot be written.
+    ``names`` are those of all photographs, ``image_path`` their folder, if known; ``pair_inliers``
+    are of the verified pairs.
     """
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
     cards = [_fate(number, name, report, model) for number, name in enumerate(names, 1)]

@@ -141,11 +141,7 @@ def _write(image: ColorImage, text: str, place: tuple[int, int]) -> None:
 
 
 def warp_colors(plan: RectificationPlan) -> list[Color]:
-    """Choose a colour for each warp of a plan.
-
-    Warps of one segment, or of one class that shows the whole image, have the same; where these are
-    more than the palette has, it begins anew.
-    """
+    """Choose colours, the same for warps of one segment or of one class of the whole image."""
     keys = [
         (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
         for item in plan.items

@@ -32,20 +32,12 @@ MAX_NUM_EDGES = 4000
 
 
 def inlier_class(num_inliers: int) -> int:
-    """Return the class of a number of inliers.
-
-    >>> [inlier_class(count) for count in (1, 29, 30, 10_000)]
-    [0, 0, 1, 5]
-    """
+    """Return the class of a number of inliers."""
     return sum(num_inliers >= start for start in CLASS_STARTS) - 1
 
 
 def class_labels() -> list[str]:
-    """Return the range of each class.
-
-    >>> class_labels()[0], class_labels()[-1]
-    ('1-29', '480 or more')
-    """
+    """Return the range of each class, as "1-29"."""
     ends = [f"-{start - 1}" for start in CLASS_STARTS[1:]]
     return [f"{start}{end}" for start, end in zip(CLASS_STARTS, [*ends, " or more"], strict=True)]
 
