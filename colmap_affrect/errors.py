@@ -12,7 +12,6 @@ DAMAGE = (
 )  # fmt: skip
 """What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or of another
 shape than ours."""
-
 MAX_REASON = 200  # characters of what a reader says
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "

@@ -22,7 +22,6 @@ PairErrors = Annotated[
 ]
 """By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
 and of the direction of the translation; in JSON rows of both."""
-
 AUC_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
 MAX_CORRECT_ERROR_DEG = 5.0
 """An image is registered correctly if its relative poses to at least half of the other registered

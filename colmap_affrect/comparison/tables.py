@@ -18,13 +18,11 @@ METHOD_COLORS = (
     "#0b62a8", "#a34700", "#00714f", "#9b2d79", "#5d4bb0", "#7a5c00", "#a3213b", "#46606e",
 )  # fmt: skip
 """Of the marks of methods; white text on them is readable."""
-
 MAIN_ROWS = {
     "registered", "correct", "num_models", "verified_pairs", "points3D", "mean_track_length",
     "total_s",
 }  # fmt: skip
 """Rows that decide; the others are folded away."""
-
 BYTES_PER_MB = 1_000_000
 NOTHING = "-"  # where there is no number
 WIDTH = 88  # of the verdict in the terminal

@@ -11,11 +11,9 @@ from colmap_affrect.comparison.results import Comparison, MethodResult, Span, in
 
 REFERENCES = ("sift", "sift-affine-dsp", "sift-colmap")
 """What gains are measured against: the first of these that was run."""
-
 MIN_MEAN_GAIN = 0.5
 """More photographs on average over the seeds than this is a gain, though no single photograph is
 registered in most seeds that was not before."""
-
 MIN_IMAGES = 3  # fewer are a pair, not a reconstruction
 MAX_NAMES = 6
 

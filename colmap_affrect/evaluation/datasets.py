@@ -26,7 +26,6 @@ from colmap_affrect.project.outputs import leads_outside
 Names = tuple[str, str]  # of the images of a pair, without suffix
 Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 """Cameras and cam_from_world poses by the name of the image without suffix."""
-
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
 CALIBRATION_PREFIX = "calibration_"

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
 front, that patch has the block of rows and columns 0...3 in its middle."""
-
 PAPER_CROP_PX = (-LEAD_PX) % STEP_PX  # puts the patches of all cells round whole blocks
 PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX  # blocks before the first with a patch
 CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9  # cell i depends on rows 4 i - 11...4 i + 39

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 RADIUS_PX = 12.0
 """Radius of all frames: a sigma of 2 px, within which all three networks find a point again, so
 that a point that warps show again is known as the same."""
-
 MIN_NETWORK_PX = 32  # views are filled up to it: DISK normalises over a sixteenth of it
 
 Found = tuple["Tensor", "Tensor", Callable[["Tensor"], "Tensor"]]

@@ -24,7 +24,6 @@ KINDS = {
     "doubtful": "doubtful",
 }
 """How cameras came in; each has a colour of this name."""
-
 FILTERS = {
     "all": "All", "missing": "Missing", "doubtful": "Doubtful", "added": "New",
     "guided": "Guided", "bridged": "Bridged",
