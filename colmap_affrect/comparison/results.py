@@ -96,6 +96,10 @@ class Measure:
     column: str = ""  # title of its column in the terminal; empty: not shown there
 
 
+def _of_scores(value: Callable[[PoseScores], float | None]) -> Callable[[SeedResult], float | None]:
+    return lambda seed: value(seed.scores) if seed.scores else None
+
+
 def _of_model(name: str) -> Callable[[SeedResult], float | None]:
     return lambda seed: getattr(seed, name) if seed.model_names else None
 
@@ -105,7 +109,7 @@ MEASURES = {
         lambda seed: len(seed.registered_names), "Registered, of {images}", 1, max, "registered"
     ),
     "correct": Measure(
-        lambda seed: len(seed.correct_names) if seed.scores else None,
+        _of_scores(lambda scores: len(scores.correct_names)),
         "Registered correctly, of {images}", 1, max, "correct",
     ),
     "num_doubtful": Measure(lambda seed: len(seed.reasons_to_doubt), "Doubtful", 1, min),
@@ -121,11 +125,11 @@ MEASURES = {
         _of_model("mean_reprojection_error_px"), "Reprojection error, px", 2, None, "px"
     ),
     "median_rotation_error_deg": Measure(
-        lambda seed: seed.scores and seed.scores.median_rotation_error_deg,
+        _of_scores(lambda scores: scores.median_rotation_error_deg),
         "Median rotation error, °", 2, min,
     ),
     "auc_5": Measure(
-        lambda seed: seed.scores and seed.scores.auc["5"], "AUC of relative poses at 5°", 3, max
+        _of_scores(lambda scores: scores.auc["5"]), "AUC of relative poses at 5°", 3, max
     ),
 }  # fmt: skip
 """Numbers of every seed, by their names in JSON."""

@@ -57,7 +57,7 @@ class EvaluationPair:
     name: str
     images: tuple[EvaluationImage, EvaluationImage]
     category: str = ""  # of difficulty, as tables group pairs; empty for none
-    truth: TrueHomography | TruePose | Correspondences | None = None
+    truth: Any = None  # one of :mod:`colmap_affrect.evaluation.truths`
     problem: str = ""
 
 

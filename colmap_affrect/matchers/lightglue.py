@@ -167,10 +167,9 @@ class LightGlue:
         if features.rectification_ids[0]:
             lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
         values = network_inputs(lafs, size, max(image_size), self.options.trained_for)
-        values["descriptors"] = features.descriptors
         return {
             name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
-            for name, array in values.items()
+            for name, array in (*values.items(), ("descriptors", features.descriptors))
         }
 
     def match(self, first: PreparedViews, second: PreparedViews) -> Matches:

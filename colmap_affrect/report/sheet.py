@@ -104,8 +104,9 @@ def _panel(
     side, height, width = WIDTH_PX // per_row - MARGIN_PX, *image.shape[:2]
     scale = side / max(width, height)
     size = max(1, round(scale * width)), max(1, round(scale * height))
-    panel = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    panel = np.array(np.broadcast_to(panel.reshape(*size[::-1], -1), (*size[::-1], 3)))
+    shrunk = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    panel: ColorImage = np.empty((*size[::-1], 3), np.uint8)
+    panel[:] = shrunk.reshape(*size[::-1], -1)
     panel_from_image = resized_from_original((width, height), size)
     if features is not None:
         order = np.argsort(-features.responses, kind="stable")[:max_num]
