@@ -36,19 +36,16 @@ class AffNetHardNetOptions(DogOptions):
 
     name: Literal["affnet-hardnet"] = "affnet-hardnet"
     descriptor: Literal["hardnet", "hardtfeat"] = "hardnet"
-    affine_shape: bool = True
-    """Estimate affine shapes by AffNet; otherwise measurement regions are circles."""
 
     @property
     def kind(self) -> str:
-        """The same where shapes are circles: descriptors are."""
+        """Name of the chain with this descriptor."""
         return f"dog-affnet-{self.descriptor}"
 
     @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights that the networks read."""
-        shape = ("affnet",) if self.affine_shape else ()
-        return (*shape, "orinet", self.descriptor)
+        return ("affnet", "orinet", self.descriptor)
 
 
 class AffNetHardNet:
@@ -63,10 +60,7 @@ class AffNetHardNet:
 
         weights, device = network.weights, network.device
         self.options, self.device = options, networks.resolve_device(device)
-        self.affine_shapes = None
-        if options.affine_shape:
-            affnet = networks.load_affnet(weights["affnet"], device)
-            self.affine_shapes = networks.OnPatches(affnet)
+        self.affnet = networks.OnPatches(networks.load_affnet(weights["affnet"], device))
         self.orinet = networks.load_orinet(weights["orinet"], device)
         name = options.descriptor
         self.descriptor = networks.load_descriptor(name, weights[name], device)
@@ -109,9 +103,8 @@ class AffNetHardNet:
         """Return (N, 2, 2) shapes of determinant 1, and (N, 128) descriptors of any length."""
         half_widths_px = PATCH_SIGMAS / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
-        if self.affine_shapes is not None:
-            upright = sample(_frames(shapes, half_widths_px, found.keypoints))
-            shapes = _shapes_from_outputs(self._run(self.affine_shapes, upright))
+        upright = sample(_frames(shapes, half_widths_px, found.keypoints))
+        shapes = _shapes_from_outputs(self._run(self.affnet, upright))
         unturned = sample(_frames(shapes, half_widths_px, found.keypoints))
         # kornia's angles are of the opposite sense to those of our rotation().
         shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))

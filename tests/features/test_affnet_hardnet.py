@@ -111,7 +111,8 @@ def test_orientation_points_along_the_gradient_of_a_turned_pattern(
     direction = np.array([np.cos(np.deg2rad(direction_deg)), np.sin(np.deg2rad(direction_deg))])
     distance = (columns - 62.0) * direction[0] + (rows - 48.0) * direction[1]
     edge = (128 + 100 * np.tanh(distance / 8.0)).astype(np.uint8)
-    profile = make(weights, affine_shape=False)
+    profile = make(weights)
+    profile.affnet = lambda patches: torch.zeros(len(patches), 3)
     profile.orinet = feature.PatchDominantGradientOrientation(32)
     described = describe_one(profile, edge, circles([[62.0, 48.0]], [2.5]))
     first = described.lafs[0, :, 0] / described.scales[0]
@@ -140,7 +141,7 @@ def test_describe_leaves_out_degenerate_shapes(
     def every_second_is_bad(patches: torch.Tensor) -> torch.Tensor:
         return torch.stack([bad if number % 2 else good for number in range(len(patches))])
 
-    profile.affine_shapes = every_second_is_bad
+    profile.affnet = every_second_is_bad
     detected = circles([[60.0, 50.0], [70.0, 60.0], [80.0, 70.0]], [2.0, 2.0, 2.0])
     described = describe_one(profile, image, detected)
     assert described.rectification_ids.tolist() == ([0, 1, 2] if kept else [0, 2])
