@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,7 +18,9 @@ from colmap_affrect.data import (
 from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.project.atomic_files import replace_bytes
-from colmap_affrect.report.levels import InspectedLevel, summary
+
+if TYPE_CHECKING:
+    from colmap_affrect.report.inspection import InspectedLevel
 
 Color = tuple[int, int, int]
 Marks = dict[tuple[float, float], str]  # text by place, px
@@ -34,8 +37,8 @@ UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
 DARK: Color = (85, 85, 85)
 
 
-def draw_sheet(level: InspectedLevel, path: Path) -> None:
-    """Draw one level and write it as PNG.
+def draw_sheet(level: "InspectedLevel", summary: str, path: Path) -> None:
+    """Draw one level under its summary, and write it as PNG.
 
     Above the photograph with the regions and their warps in one colour each, beside it its
     features; below the largest warps with theirs.
@@ -47,14 +50,12 @@ def draw_sheet(level: InspectedLevel, path: Path) -> None:
     for first in range(0, len(warps), WARPS_PER_ROW):
         rows.append(_row(warps[first : first + WARPS_PER_ROW], WARPS_PER_ROW))
     title = np.full((TITLE_PX, WIDTH_PX, 3), 255, np.uint8)
-    width, height = level.photograph.size
-    which = f"level {level.number}: {level.rectifier}, {level.extractor}, {width} x {height} px"
-    _write(title, f"{which}; {summary(level)}", (MARGIN_PX, TITLE_PX - 8))
+    _write(title, summary, (MARGIN_PX, TITLE_PX - 8))
     _, data = cv2.imencode(".png", np.concatenate([title, *rows])[:, :, ::-1])
     replace_bytes(path, data.tobytes())
 
 
-def _regions(level: InspectedLevel) -> tuple[ColorImage, str]:
+def _regions(level: "InspectedLevel") -> tuple[ColorImage, str]:
     image = tinted(level.photograph, level.plan)
     if level.photograph.mask is not None:
         image[~level.photograph.mask] //= 3
@@ -70,7 +71,7 @@ def _regions(level: InspectedLevel) -> tuple[ColorImage, str]:
     return _panel(image, PANELS_PER_ROW, marks=marks), title
 
 
-def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImage, str]:
+def _features(level: "InspectedLevel", colors: Sequence[Color]) -> tuple[ColorImage, str]:
     features = level.features
     palette = [DARK, *colors]
     drawn = [palette[number] for number in features.rectification_ids.tolist()]
@@ -80,7 +81,7 @@ def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImag
     return image, f"the strongest {shown} of {len(features)} features; gray: without a warp"
 
 
-def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, str]:
+def _warp(level: "InspectedLevel", index: int, color: Color) -> tuple[ColorImage, str]:
     item = level.plan.items[index]
     found, kept = level.found[index + 1], level.kept_of(index + 1)
     image, mask = level.views[index + 1]

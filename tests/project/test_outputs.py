@@ -163,7 +163,7 @@ IN_TEMPORARY_FOLDERS = {
     ("align.py", "align"), ("pycolmap_mapping.py", "_written"),
     ("export.py", "_points"), ("export.py", "_nerfstudio"), ("export.py", "_text"),
     ("hdf5_layouts.py", "created"),
-    ("inspection.py", "inspect_image"), ("conversion.py", "_convert"),
+    ("conversion.py", "_convert"),
     ("method_run.py", "_run_seed"), ("method_run.py", "_map_sift"), ("sift.py", "match_sift"),
 }  # fmt: skip
 """Functions that write where the door lets them."""
