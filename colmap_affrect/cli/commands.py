@@ -232,7 +232,6 @@ def import_h5(options: argparse.Namespace) -> None:
         options.database_path,
         cameras=given.built(options, "cameras", CameraOptions),
         layout=options.layout,
-        pixel_origin=options.pixel_origin,
         skip_verification=options.skip_verification,
         random_seed=options.random_seed,
         progress=given.progress(options),
@@ -249,7 +248,6 @@ def export_h5(options: argparse.Namespace) -> None:
         output_path=options.workspace_path,
         database_path=options.database_path,
         layout=options.layout,
-        half=options.half,
         progress=given.progress(options),
     )
     show(report.summary())

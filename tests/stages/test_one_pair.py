@@ -48,13 +48,13 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
     expected = matches(store)
     assert min(map(len, expected.values())) > NUM_FEATURES // 2
     reads: list[str] = []
-    read = CachedMatcher.read
+    read = CachedMatcher._prepare
 
-    def counted(cache: CachedMatcher, name: str) -> one_pair.StoredFeatures:
+    def counted(cache: CachedMatcher, name: str) -> one_pair.PreparedImage:
         reads.append(name)
         return read(cache, name)
 
-    monkeypatch.setattr(CachedMatcher, "read", counted)
+    monkeypatch.setattr(CachedMatcher, "_prepare", counted)
     monkeypatch.setattr(one_pair, "CACHE_BYTES", 3 * 800 * NUM_FEATURES)
     assert matches(store) == expected
     assert len(NAMES) < len(reads) <= 3 * len(NAMES)
