@@ -1,7 +1,6 @@
 """Recipes: named TOML files that set the options of a run.
 
-A section is the options of a part, which ``name`` chooses; what a recipe leaves out keeps its
-default.
+A section is the options of a part, which ``name`` chooses; what is left out keeps its default.
 """
 
 import difflib

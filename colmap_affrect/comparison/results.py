@@ -1,8 +1,4 @@
-"""What a comparison found, as frozen data; pydantic writes and reads it.
-
-Everything derived (means, who registers what alone) is computed here from the results of single
-seeds, so that terminal, page and JSON cannot disagree.
-"""
+"""What a comparison found, as frozen data; pydantic writes and reads it."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,8 +1,7 @@
 """Evaluate recipes on a dataset by a protocol: features, matches, scores, tables, a plot.
 
-The output folder has ``features/`` and ``pairs/`` (scores of single pairs), both by recipe and a
-digest of all that decides them, ``evaluation.json`` and ``errors.png``. An evaluation that was
-stopped goes on, and after a change only what depends on it is made again.
+``features/`` and ``pairs/`` (scores of pairs) are by recipe and a digest of what decides them: only
+what changed is made again.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,7 @@
 """One recipe on the pairs of a dataset: features, matches and scores, kept for the next run.
 
-A pair is matched as a run of its two images alone would match it: a recipe with escalation tries
-its levels until COLMAP's geometric verification finds enough inliers. The level with most of them
-counts. Cameras are taken as unknown for that.
+A pair is matched as a run of its two images alone would match it, with cameras unknown. Of levels
+of escalation the one with most inliers of COLMAP's verification counts.
 """
 
 import json

@@ -1,8 +1,7 @@
 """The three kinds of truth: scores of matches by them, and the columns of their tables.
 
 A truth scores (M, 2) and (M, 2) matched points, pixel-centre px of the stored images; its repr has
-all that it knows. Columns are named as the paper's rows where they have the same numbers. Results
-of failed pairs may have no details; their errors are infinite.
+all that it knows. Results of failed pairs have infinite errors.
 """
 
 import math
@@ -74,14 +73,7 @@ class PairScore:
 
 @dataclass(frozen=True, kw_only=True)
 class PairResult(PairScore):
-    """The score of one pair by one recipe: what ``evaluation.json`` lists.
-
-    Attributes:
-        level: rectifier of the level of escalation that decided, ``none`` if no level was verified;
-            empty without escalation.
-        num_levels: levels that were matched, 1 without escalation.
-        failure: why the pair counts as failed, with an infinite error.
-    """
+    """The score of one pair by one recipe: what ``evaluation.json`` lists."""
 
     name: str
     category: str = ""
@@ -89,9 +81,9 @@ class PairResult(PairScore):
     num_keypoints: tuple[int, int] = (0, 0)
     seconds: float = 0.0
     seconds_by_step: Mapping[str, float] = field(default_factory=dict)  # ``match``, ``estimate``
-    level: str = ""
-    num_levels: int = 0
-    failure: str = ""
+    level: str = ""  # of escalation, that decided: its rectifier, ``none`` if none was verified
+    num_levels: int = 0  # that were matched
+    failure: str = ""  # why the pair counts as failed, with an infinite error
 
 
 Results = Sequence[PairResult]

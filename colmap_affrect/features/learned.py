@@ -1,7 +1,6 @@
 """Features ``aliked``, ``disk`` and ``xfeat``: networks that detect and describe in one pass.
 
-They have points without scale or shape: all frames are upright circles of RADIUS_PX, which a warp
-makes ellipses in the image.
+Frames are upright circles of RADIUS_PX in the view, which a warp makes ellipses in the image.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Networks with their weights, ready for inference, and the patches that they take.
 
-kornia builds the architectures, empty, and nothing is downloaded: a file must have the parameters
-of its network, all of them and no others, in their shapes.
+kornia builds them empty; a file must have all parameters of its network and no others.
 """
 
 import re

@@ -1,10 +1,9 @@
 """Weights of networks: where they are looked for, where they come from, reading them safely.
 
-weights.toml lists the published files. They are looked for, before any image is read, in the folder
-that the user gives, in the one that the environment variable ``COLMAP_AFFRECT_WEIGHTS`` names, in
-torch's cache (also kornia's), and in installed distributions that carry them, of which nothing is
-imported. What is nowhere is downloaded into torch's cache. A file that is not the published one is
-used with a warning, since it may be trained further.
+weights.toml lists the published files. They are looked for in the folder that the user gives, that
+of the environment variable ``COLMAP_AFFRECT_WEIGHTS``, torch's cache, and installed distributions,
+of which nothing is imported; else downloaded into torch's cache. Others than the published ones are
+used with a warning, since they may be trained further.
 """
 
 import logging

@@ -1,7 +1,7 @@
 """What a matcher is: it finds which features of two images may show the same.
 
-A matcher of another package becomes known by an entry point of the group
-``colmap_affrect.matchers``. Several threads may call the same object at once.
+Entry points are in the group ``colmap_affrect.matchers``. Several threads may call an object at
+once.
 """
 
 from dataclasses import dataclass

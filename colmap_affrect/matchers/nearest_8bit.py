@@ -1,11 +1,9 @@
 """Short lists for the ratio test, by similarities of descriptors in 8 bits.
 
-Few features pass the test. Coarse similarities say which may, and which features may be their two
-nearest neighbours; only these are compared exactly. Six standard deviations of the rounding error
-are allowed for, so that matches are those of exact similarities. A run of ten photographs without
-8-bit products takes 1.7 times the processor time and 1.4 times as long (Sceaux, default recipe).
-
-torch is loaded here, when there is enough to match to pay for that.
+Coarse similarities say which features may pass the test and what their neighbours may be; only
+these are compared exactly. Six standard deviations of the rounding error are allowed for, so that
+matches are those of exact similarities. torch is loaded where there is enough to match to pay for
+that.
 """
 
 import math

@@ -1,7 +1,6 @@
 """What a rectifier is: it decides which warps of a photograph to look at.
 
-A rectifier of another package becomes known by an entry point of the group
-``colmap_affrect.rectifiers``. Several threads may call the same object at once.
+Entry points are in the group ``colmap_affrect.rectifiers``. Several threads may call an object.
 """
 
 from dataclasses import dataclass
