@@ -48,8 +48,8 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
     cards = cards_of(columns, comparison)
     index = {name: number for number, name in enumerate(names)}
     layout = view_graph.lay_out(names, graphs)
-    paths = {c.name: comparison.model_path(c.method, output_path) for c in columns}
-    views = read_scene(paths)
+    shown = {column.name: column.method.shown_seed for column in columns}
+    views = read_scene({n: output_path / s.model_path if s else None for n, s in shown.items()})
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
     content = {
         "comparison": comparison,

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
-from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Self
 
@@ -201,20 +200,13 @@ class MethodResult:
 
     @model_serializer(mode="wrap")
     def _with_spans(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = plain(self)
-        if self.failed:
-            return {key: values[key] for key in KEPT_OF_FAILED}
-        del values["failed"]
         return {
             **{key: self.span(key) for key in MEASURES},
             "registered_names": {str(s.seed): s.registered_names for s in self.seeds},
             "total_s": self.total_s,
-            **values,
+            **plain(self),
             "wall_s": self.stage_seconds,
         }
-
-
-KEPT_OF_FAILED = ("failed", "name", "summary", "failures", "options", "folder")
 
 
 def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
@@ -239,11 +231,6 @@ class Comparison:
     def finished(self) -> tuple[MethodResult, ...]:
         """The methods that did not fail."""
         return tuple(method for method in self.methods if not method.failed)
-
-    def model_path(self, method: MethodResult, output_path: Path) -> Path | None:
-        """Return the folder of the first model of a method; None for none."""
-        seed = method.shown_seed
-        return output_path / seed.model_path if seed else None
 
     @property
     def only_registered_by(self) -> dict[str, str]:
