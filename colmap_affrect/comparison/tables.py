@@ -124,7 +124,6 @@ def span_text(span: Span | None, digits: int = 1, digits_of_ends: int = 0) -> st
 
 
 def _splits(method: MethodResult) -> str:
-    """Write the sizes of the models, once where all seeds agree."""
     splits = [" + ".join(str(len(m)) for m in s.model_names) or "none" for s in method.seeds]
     if len(set(splits)) == 1:
         return splits[0]

@@ -139,7 +139,6 @@ class _Examination:
         return path.exists()
 
     def _record(self) -> Mapping[str, Any]:
-        """Return the record, with options that later stages would take."""
         context, record = Context(self.workspace), self.workspace.recorded()
         if "extract" in self.workspace.begun:
             _ = context.inputs, context.extraction
@@ -169,5 +168,4 @@ class _Examination:
 
 
 def _without_path(path: Path, error: Exception) -> str:
-    """Return the message of an error without the path that it begins with."""
     return str(error).removeprefix(f"{path}: ").removeprefix(f"{path}/") or type(error).__name__

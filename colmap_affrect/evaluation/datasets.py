@@ -195,12 +195,10 @@ def stem(name: str) -> str:
 
 
 def _damaged(path: Path) -> AbstractContextManager[None]:
-    """Make one EvaluationError of whatever a damaged file leads to."""
     return damage(path, "see docs/own-evaluation-set.md for the format", EvaluationError)
 
 
 def _lines(path: Path) -> list[str]:
-    """Return the lines of a text file that are not empty or comments."""
     with _damaged(path):
         lines = map(str.strip, path.read_text(encoding="utf-8-sig").splitlines())
         return [line for line in lines if line and not line.startswith("#")]

@@ -129,7 +129,6 @@ class RecipeRun:
         return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
 
     def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
-        """Return the result of a pair that has no matches."""
         score = pair.truth.score(*NOTHING, *self._options) if pair.truth else NO_SCORE
         return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
 

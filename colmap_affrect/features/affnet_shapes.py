@@ -100,10 +100,9 @@ class AffNet:
     def grid(self, image: GrayImage) -> ShapeGrid:
         """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
 
-        By default the border is reflected, and blocks whose surroundings deviate by less than
-        ``min_deviation`` are not textured and get the identity. With ``paper`` the network sees
-        the image without padding (the shorter side must have 32 px), and blocks near the border
-        get the shape of the nearest one that has a patch inside. All blocks are textured.
+        By default the border is reflected; blocks without texture (``min_deviation``) get the
+        identity. With ``paper`` the network sees the image without padding (at least 32 px), blocks
+        near the border get the nearest shape, and all are textured.
         """
         if self.options.paper:
             logs = self._paper_logs(image)

@@ -228,7 +228,6 @@ def _find(key: str, weights_path: Path | None) -> Path | None:
 
 
 def _find_installed(key: str) -> Path | None:
-    """Look for a file among those that its distribution installed, of any version."""
     published = WEIGHT_FILES[key]
     try:
         name = published.distribution.partition("==")[0]

@@ -265,11 +265,10 @@ def guided_matches(
 ) -> Indices:
     """Return the (M, 2) inliers of a pair and its guided matches, one to one, as (K, 2).
 
-    They rise by features of image 1. All inliers, which the geometry was estimated from, stay.
-    There are no others where the frames of the inliers (without any, of the guided matches) do not
-    agree with the geometry (:data:`MIN_AGREEING`), or where too many are found beside it
-    (:data:`MAX_ACCIDENTAL`). Frames without a direction (:attr:`GuidableImage.has_directions`) are
-    not compared; of these images there are no guided matches without inliers.
+    They rise by features of image 1; all inliers stay. There are no others where the frames do not
+    agree with the geometry (:data:`MIN_AGREEING`), or too many are found beside it
+    (:data:`MAX_ACCIDENTAL`). Frames without a direction are not compared; without inliers these
+    images have no guided matches.
     """
     has_directions = first.has_directions and second.has_directions
     if not (has_directions or len(inliers)):

@@ -123,10 +123,10 @@ def _is_hidden(
     is_close: Bools,
     rivals: NeighborLists,
 ) -> Bools:
-    """Tell where the second neighbour is not known, for each of R rows.
+    """Return where the second neighbour is not known, for each of R rows.
 
-    A rival of the best may be nearer than it and have the runner-up for a rival, of which the best
-    is none. The second neighbour then may be far less similar than the runner-up.
+    A rival of the best may be nearer than it and have the runner-up, no rival of the best, for a
+    rival; the second neighbour then may be far less similar.
     """
     rows, columns = (indices[is_close] for indices in of_best)
     is_other = columns != best[rows]

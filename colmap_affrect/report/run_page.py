@@ -149,7 +149,6 @@ def _why_no_model(report: ReconstructionReport) -> list[str]:
 
 
 def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
-    """Return the numbers that are read first."""
     tiles = {
         "photographs in the model": f"{len(model.registered_names)} of {report.images_total}",
         "verified pairs": f"{report.num_verified_pairs:,} of {report.num_pairs:,}",

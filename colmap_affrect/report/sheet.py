@@ -123,7 +123,6 @@ def _panel(
 
 
 def _row(panels: Sequence[tuple[ColorImage, str]], per_row: int) -> ColorImage:
-    """Put panels beside each other, each below its title."""
     height = max(len(panel) for panel, _ in panels) + TITLE_PX
     row = np.full((height, WIDTH_PX, 3), 255, np.uint8)
     for place, (panel, title) in enumerate(panels):
