@@ -139,15 +139,11 @@ def _same_for_all(
 
 
 def _settings(same: Mapping[str, Any], options: CompareOptions) -> dict[str, Any]:
-    paths = {
-        "image_list_path": options.image_list_path,
-        "from_database": options.from_database,
-        "ground_truth_path": options.ground_truth_path,
-    }
+    places = ("image_list_path", "from_database", "ground_truth_path")
     return {
         **{key: same[key] for key in ("camera", "verification", "mapping")},
+        **{key: str(getattr(options, key) or "") for key in places},
         "masks": options.masks.to_mapping(),
-        **{key: str(path.resolve()) if path else "" for key, path in paths.items()},
         "match_list_path": options.pairs.match_list_path,
         "preset": options.mapping.preset_name,
     }

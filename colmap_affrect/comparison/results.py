@@ -80,6 +80,9 @@ class SeedResult:
         return {"seed": self.seed, **{k: m.of(self) for k, m in MEASURES.items()}, **plain(self)}
 
 
+Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
+
+
 @dataclass(frozen=True)
 class Measure:
     """A number of every seed, and how tables write it."""
@@ -87,7 +90,7 @@ class Measure:
     of: Callable[[SeedResult], float | None]  # None where a seed has no such number
     title: str  # of its line
     digits: int  # decimals, where not all values are whole
-    better: Callable[[Iterable[float]], float] | None = None  # which mean is best, if any
+    better: Better = None
     column: str = ""  # title of its column in the terminal; empty: not shown there
 
 
