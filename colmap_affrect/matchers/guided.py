@@ -285,24 +285,17 @@ def guided_matches(
     if len(trusted) and agrees(guide, trusted).mean() < MIN_AGREEING:
         return inliers
     found = found[agrees(guide, found)]
-    limit = MAX_ACCIDENTAL * len(found)
+    limit, ours = MAX_ACCIDENTAL * len(found), {*map(tuple, found.tolist())}
     for beside in guide.beside():
         accidental = nearest_allowed(first, second, beside, options)
         accidental = accidental[agrees(beside, accidental)]
-        if len(_without(accidental, found)) <= limit:
+        if len({*map(tuple, accidental.tolist())} - ours) <= limit:
             break
     else:
         return inliers
     free = ~(np.isin(found[:, 0], inliers[:, 0]) | np.isin(found[:, 1], inliers[:, 1]))
     both = np.concatenate([inliers, found[free]])
     return np.asarray(both[np.argsort(both[:, 0], kind="stable")])
-
-
-def _without(matches: Indices, others: Indices) -> Indices:
-    """Return the (M, 2) matches that are not among others, in both of which features are unique."""
-    partner = dict(others.tolist())
-    is_other = [partner.get(row) != column for row, column in matches.tolist()]
-    return np.asarray(matches[np.array(is_other, bool)])
 
 
 def nearest_allowed(

@@ -88,7 +88,6 @@ def write_run_page(
         "layout": layout,
         "edges": view_graph.edge_paths(names, layout, pair_inliers),
         "matrix": matrix,
-        "guided": _guided(report),
         **_cameras(report, index),
         "script_data": {
             "matrices": [matrix],
@@ -163,14 +162,6 @@ def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
         tiles["models"] = str(len(report.models))
     seconds = sum(stage.wall_s for stage in report.stages)
     return tiles | {"seconds": f"{seconds:,.1f}".removesuffix(".0")}
-
-
-def _guided(report: ReconstructionReport) -> str:
-    if not report.guided:
-        return ""
-    pairs, before, after = (report.guided[k] for k in ("pairs", "matches_before", "matches_after"))
-    taken = f"{pairs} pair{'s' if pairs != 1 else ''}"
-    return f"Guided matching took {taken} from {before:,} to {after:,} inliers."
 
 
 def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
