@@ -170,8 +170,8 @@ def compare(options: argparse.Namespace) -> int:
 
 def evaluate(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.methods import parse_methods
-    from colmap_affrect.evaluation.data import ScoreOptions
     from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
+    from colmap_affrect.evaluation.truths import ScoreOptions
     from colmap_affrect.recipes import with_settings
 
     given.key_values("--protocol-options", options.protocol_options)

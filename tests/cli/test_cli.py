@@ -224,12 +224,10 @@ def test_file_or_folder_that_is_not_there_is_wrong_usage_before_anything_is_made
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images" / "view_5_tilt70.jpg"
 
 
-def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path, call: Call) -> None:
+def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
     out = tmp_path / "out č"
     done = call("inspect", FACADE, "--output-path", out, "--set", "max_image_size_px=240")
     assert (done.code, done.stderr) == (0, [])
-    plan = json.loads((out / "view_5_tilt70-plan.json").read_text(encoding="utf-8"))
-    assert plan["levels"][0]["warps"][0]["tilt"] > 1.7
     sheet = out / "view_5_tilt70-inspection.png"
     assert sheet.stat().st_size > 50_000
     assert str(sheet) in done.stdout
