@@ -12,7 +12,6 @@ DAMAGE = (
 )  # fmt: skip
 """What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or of another
 shape than ours."""
-
 MAX_REASON = 200  # characters of what a reader says
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
@@ -142,11 +141,7 @@ def _escaped(character: str) -> str:
 
 
 def one_line(text: str) -> str:
-    r"""Return the same in one line.
-
-    >>> one_line("a\nb")
-    'a\\u000ab'
-    """
+    """Return the same in one line, line ends as JSON has them."""
     return shown(text).replace("\n", _escaped("\n"))
 
 
@@ -159,11 +154,7 @@ def say(line: str) -> None:
 
 
 def such_as(names: Iterable[str], most: int = MAX_NAMES) -> str:
-    """Return the first few names, and how many there are more.
-
-    >>> such_as(["a", "b", "c", "d", "e"])
-    'a, b, c and 2 more'
-    """
+    """Return the first few names, and how many there are more."""
     listed = list(names)
     more = f" and {len(listed) - most} more" if len(listed) > most else ""
     return ", ".join(listed[:most]) + more

@@ -35,10 +35,7 @@ Built = TypeVar("Built")
 
 
 def from_record(where: str, build: Callable[[], Built]) -> Built:
-    """Build options from a record, perhaps of another version: unknown ones are left out.
-
-    A warning names them once.
-    """
+    """Build options from a record, perhaps of another version; unknown ones are left out."""
     names: list[str] = []
     token = _left_out.set(names)
     try:
@@ -232,11 +229,7 @@ def digest_of(values: Any) -> str:
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Join the keys of nested mappings by dots; tuples become lists.
-
-    >>> flat({"a": {"b": (1, 2)}, "c": 3})
-    {'a.b': [1, 2], 'c': 3}
-    """
+    """Join the keys of nested mappings by dots; tuples become lists."""
     found: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):

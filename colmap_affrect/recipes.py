@@ -1,7 +1,6 @@
 """Recipes: named TOML files that set the options of a run.
 
-A section is the options of a part, which ``name`` chooses; what a recipe leaves out keeps its
-default.
+A section is the options of a part, which ``name`` chooses; what is left out keeps its default.
 """
 
 import difflib
@@ -216,10 +215,9 @@ class Recipe:
         }
 
     def mapper_options(self, preset: str, name: str = "", **values: Any) -> MapperOptions:
-        """Return the options of the mapper: of a preset, changed by the recipe, then by ``values``.
+        """Return the options of a mapper: of a preset, changed by the recipe, then by ``values``.
 
-        ``name`` is by default that of the recipe, or of the preset. OptionError for an unknown
-        mapper or option.
+        ``name`` is by default that of the recipe, or of the preset.
         """
         own = dict(self.mapping)
         recipes_name = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))

@@ -86,7 +86,7 @@ def test_matching_of_a_level_must_take_its_features() -> None:
 def test_choosing_a_profile_drops_the_options_of_the_other_one() -> None:
     recipe = load_recipe("asift-recommended", ["features.name=rootsift"])
     assert recipe.extraction.features == SiftOptions(max_num_rectified_features=32768)
-    recipe = load_recipe("unrectified", ["features.affine_shape=false", "features.name=rootsift"])
+    recipe = load_recipe("unrectified", ["features.descriptor=hardtfeat", "features.name=rootsift"])
     assert recipe.extraction.features.contrast_threshold == 0.04
 
 

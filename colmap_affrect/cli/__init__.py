@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn, TextIO
 
@@ -113,9 +113,7 @@ def _no_empty_folder(path: Path | None) -> Iterator[None]:
 
 @contextmanager
 def _logging(options: argparse.Namespace) -> Iterator[None]:
-    """Log to the terminal and to ``run.log``, which also takes what C libraries print.
-
-    Commands without an output folder have no such log.
+    """Log to the terminal and, if there is an output folder, to ``run.log``.
 
     COLMAP and image decoders write to file descriptor 2: it leads to the log while the
     command runs, and Python's ``sys.stderr`` to the terminal.
@@ -129,22 +127,18 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     log_path.parent.mkdir(parents=True, exist_ok=True)
     python_stderr, terminal_fd = sys.stderr, os.dup(2)
     terminal = os.fdopen(terminal_fd, "w", buffering=1, encoding="utf-8", errors="replace")
-    with (
-        terminal,
-        _quietly_closed(
-            log_path.open("a", encoding="utf-8", errors="backslashreplace", buffering=1)
-        ) as log,
-    ):
+    log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
+    with terminal, closing(log):
+        shown = logging.StreamHandler(terminal)
         level = logging.DEBUG if options.verbose else logging.WARNING
-        handlers: list[logging.Handler] = [logging.StreamHandler(terminal), _LogHandler(log)]
-        handlers[0].setLevel(logging.ERROR if options.quiet else level)
-        handlers[0].setFormatter(_OneLine("%(levelname)s: %(message)s"))
-        handlers[1].setFormatter(_OneLine("%(asctime)s %(levelname)s %(message)s"))
-        for handler in handlers:
-            logger.addHandler(handler)
+        shown.setLevel(logging.ERROR if options.quiet else level)
+        shown.setFormatter(_OneLine("%(levelname)s: %(message)s"))
+        log.setFormatter(_OneLine("%(asctime)s %(levelname)s %(message)s"))
+        logger.addHandler(shown)
+        logger.addHandler(log)
         logger.setLevel(logging.DEBUG)
         logger.info("colmap-affrect %s: %s", __version__, " ".join(sys.argv[1:]))
-        os.dup2(log.fileno(), 2)
+        os.dup2(log.stream.fileno(), 2)
         sys.stderr = terminal
         try:
             yield
@@ -154,8 +148,8 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
         finally:
             sys.stderr = python_stderr
             os.dup2(terminal.fileno(), 2)
-            for handler in handlers:
-                logger.removeHandler(handler)
+            logger.removeHandler(shown)
+            logger.removeHandler(log)
 
 
 class _OneLine(logging.Formatter):
@@ -165,17 +159,13 @@ class _OneLine(logging.Formatter):
         return one_line(super().formatMessage(record))
 
 
-class _LogHandler(logging.StreamHandler[TextIO]):
-    """Writes to ``run.log``; when that cannot be written the command goes on without."""
+class _Log(logging.StreamHandler[TextIO]):
+    """Writes to ``run.log``; where the disk has no room for that the command goes on without."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Pass over what the disk has no room for."""
+        pass
 
-
-@contextmanager
-def _quietly_closed(file: TextIO) -> Iterator[TextIO]:
-    try:
-        yield file
-    finally:
+    def close(self) -> None:
+        super().close()
         with suppress(OSError):
-            file.close()
+            self.stream.close()

@@ -138,7 +138,7 @@ GUIDED = _choice("--guided", ["auto", "always", "never"],
     "match verified pairs again, guided by their geometry: those of images that are missing or "
     "hang on few tracks, all, or none (default: auto)")  # fmt: skip
 DEVICE = _value("--device", "DEVICE",
-    "for networks and matching: auto, cpu, cuda, cuda:1, mps (default: auto)",
+    "for networks: auto, cpu, cuda, cuda:1, mps (default: auto)",
     default="auto")  # fmt: skip
 RESOURCES = (
     _path("--weights", "FOLDER",

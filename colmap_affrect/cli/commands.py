@@ -64,7 +64,7 @@ def extract(options: argparse.Namespace) -> int:
         report = stage.extract(context, inputs, given.recipe(options), overwrite=options.overwrite)
         if options.database_descriptors:
             stage.write_descriptors(context)
-    show(report.summary())
+        show(report.summary())
     return _exit_code(report.failures, options)
 
 
@@ -73,8 +73,7 @@ def pairs(options: argparse.Namespace) -> None:
 
     with given.context(options) as context:
         chosen = given.over(context.pairing, options, "pairs")
-        report = choose_pairs(context, chosen, overwrite=options.overwrite)
-    show(report.summary())
+        show(choose_pairs(context, chosen, overwrite=options.overwrite).summary())
 
 
 def match(options: argparse.Namespace) -> None:
@@ -85,8 +84,7 @@ def match(options: argparse.Namespace) -> None:
             matching = given.recipe(options).matching
         else:
             matching = given.changed(context.matching, options, "matching")
-        report = match(context, matching, overwrite=options.overwrite)
-    show(report.summary())
+        show(match(context, matching, overwrite=options.overwrite).summary())
 
 
 def verify(options: argparse.Namespace) -> None:
@@ -94,8 +92,7 @@ def verify(options: argparse.Namespace) -> None:
 
     with given.context(options) as context:
         chosen = given.verification(options, context.verification)
-        report = verify_matches(context, chosen, overwrite=options.overwrite)
-    show(report.summary())
+        show(verify_matches(context, chosen, overwrite=options.overwrite).summary())
 
 
 def escalate(options: argparse.Namespace) -> None:
@@ -103,11 +100,9 @@ def escalate(options: argparse.Namespace) -> None:
 
     with given.context(options) as context:
         chosen = given.changed(context.escalation, options, "escalate")
-        report = escalate(context, chosen, overwrite=options.overwrite)
-        levels = pair_levels(context)
-    show(report.summary())
-    if levels:
-        show(", ".join(by_level(*item) for item in levels.items()))
+        show(escalate(context, chosen, overwrite=options.overwrite).summary())
+        if levels := pair_levels(context):
+            show(", ".join(by_level(*item) for item in levels.items()))
 
 
 def guide(options: argparse.Namespace) -> None:
@@ -115,11 +110,9 @@ def guide(options: argparse.Namespace) -> None:
 
     with given.context(options) as context:
         chosen = given.changed(context.guiding, options, "guided")
-        report = guide(context, chosen, overwrite=options.overwrite)
-        counts = guided_counts(context)
-    show(report.summary())
-    if counts:
-        show("{pairs} pairs, {matches_before} to {matches_after} inliers".format(**counts))
+        show(guide(context, chosen, overwrite=options.overwrite).summary())
+        if counts := guided_counts(context):
+            show("{pairs} pairs, {matches_before} to {matches_after} inliers".format(**counts))
 
 
 def map(options: argparse.Namespace) -> int:
@@ -144,13 +137,8 @@ def map(options: argparse.Namespace) -> int:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
     with given.context(options) as context:
         mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
-        report = map_and_report(
-            context,
-            mapper,
-            extend,
-            overwrite=options.overwrite,
-            page=options.page,
-        )
+        how = {"overwrite": options.overwrite, "page": options.page}
+        report = map_and_report(context, mapper, extend, **how)
     return _print_reconstruction(report, options)
 
 
@@ -182,8 +170,8 @@ def compare(options: argparse.Namespace) -> int:
 
 def evaluate(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.methods import parse_methods
-    from colmap_affrect.evaluation.data import ScoreOptions
     from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
+    from colmap_affrect.evaluation.truths import ScoreOptions
     from colmap_affrect.recipes import with_settings
 
     given.key_values("--protocol-options", options.protocol_options)
@@ -401,17 +389,14 @@ def weights(options: argparse.Namespace) -> None:
         return
     for row in describe_weights(given.folder("--weights", options.weights), keys):
         file = row.published
-        where = f"{row.path}{', verified' if row.verified else ''}"
-        if row.path and row.verified is False:
-            where += f", NOT the published file: unless it is your own, {remedy(row.path)}"
-        elif row.path and row.verified is None:
-            where += ", not checked: the sha256 of the published file is not known"
-        elif not row.path:
-            where = f"not found: {install_hint([file])}colmap-affrect weights fetch {row.key}"
-        show(f"{row.key:32s} {file.used_for}, {file.file_name}")
-        show(f"{'':4s}{where}")
-        sha256, licence = file.sha256 or "not known", file.licence or "not stated"
-        show(f"{'':4s}sha256 {sha256}; licence {licence}")
+        where = f"not found: {install_hint([file])}colmap-affrect weights fetch {row.key}"
+        if row.path:
+            unlike = f"NOT the published file: unless it is your own, {remedy(row.path)}"
+            unknown = "not checked: the sha256 of the published file is not known"
+            states = {True: "verified", False: unlike, None: unknown}
+            where = f"{row.path}, {states[row.verified]}"
+        show(f"{row.key:32s} {file.used_for}, {file.file_name}\n    {where}")
+        show(f"    sha256 {file.sha256 or 'not known'}; licence {file.licence or 'not stated'}")
 
 
 def _weight_keys(names: Sequence[str]) -> list[str]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from colmap_affrect.errors import OptionError, WorkspaceError
-from colmap_affrect.options import Options, suggestion
+from colmap_affrect.options import Options
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.record import WEIGHTS, placeless, read_record
 from colmap_affrect.project.workspace import Workspace
@@ -87,21 +87,9 @@ def record(options: argparse.Namespace) -> Mapping[str, Any]:
         raise OptionError(f"--config {path}: of another version, or no config.toml") from error
     if "extract" not in found:
         raise OptionError(f"--config {path}: has no options of a run; give its config.toml")
-    _refuse_unknown(found["extract"], f"--config {path}")
     if not options.image_path:
         return found
     return {key: placeless(v) if isinstance(v, dict) else v for key, v in found.items()}
-
-
-def _refuse_unknown(names: Iterable[str], where: str) -> None:
-    """Refuse options of extraction that no run has recorded: typos of an editor."""
-    from colmap_affrect.recipes import ExtractionOptions
-    from colmap_affrect.stages.inputs import Inputs
-
-    known = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}
-    for name in names:
-        if name not in known:
-            raise OptionError(f"{where}: unknown {name!r}{suggestion(name, known)}")
 
 
 def inputs(
@@ -144,7 +132,8 @@ def extension(options: argparse.Namespace) -> Extension | None:
 
 def recipe(options: argparse.Namespace, record: Mapping[str, Any] | None = None) -> Recipe:
     """Return the recipe that is named, or the one on record, with single options changed."""
-    from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe, with_settings
+    from colmap_affrect.recipes import Recipe, load_recipe, with_settings
+    from colmap_affrect.stages.inputs import Inputs
 
     changes = [*_settings(options, "matching", "guided"), *options.set, *depth_settings(options)]
     if options.recipe or not record:
@@ -155,8 +144,8 @@ def recipe(options: argparse.Namespace, record: Mapping[str, Any] | None = None)
         for stage, name in sections.items()
         if stage in record
     }
-    known = ExtractionOptions.model_fields
-    values |= {key: value for key, value in record["extract"].items() if key in known}
+    others = {*Inputs.model_fields, WEIGHTS}
+    values |= {key: value for key, value in record["extract"].items() if key not in others}
     return Recipe.from_mapping(record["recipe"], with_settings(values, changes), "--config")
 
 

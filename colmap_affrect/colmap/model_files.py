@@ -264,22 +264,20 @@ def _require_written(folder: Path) -> None:
         raise cannot_write(folder, error) from error
 
 
-def read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a model; StoreError if it is damaged, or of ours and not as it was written."""
-    require_intact(folder)
-    with damage(folder, _mend(folder)):
-        return pycolmap.Reconstruction(folder)
-
-
 def read_given_model(
     folder: Path, option: str = "", error_class: type[AffrectError] = OptionError
 ) -> pycolmap.Reconstruction:
-    """Read a model that the user gives, text or binary; an error names the option it came by."""
+    """Read a model, text or binary; an error names the option it came by.
+
+    Raises StoreError if it is damaged, or of ours and not as it was written.
+    """
     wanted = "give the folder that holds cameras, images and points3D as .bin or .txt"
     if not folder.is_dir():
         raise OptionError(f"{option}{folder}: no such folder; {wanted}")
     if _is_binary(folder) or kept_digests(folder):
-        return read_model(folder)
+        require_intact(folder)
+        with damage(folder, _mend(folder)):
+            return pycolmap.Reconstruction(folder)
     try:
         return pycolmap.Reconstruction(folder)
     except DAMAGE as error:

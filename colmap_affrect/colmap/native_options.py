@@ -38,17 +38,20 @@ def set_values(options: Any, values: Mapping[str, Plain]) -> None:
         setattr(reduce(getattr, sections, options), name, value)
 
 
-def resolve(options: Any, given: Mapping[str, Any], flag: str) -> dict[str, Plain]:
+def resolve(
+    options: Any, given: Mapping[str, Any], flag: str, owned: Mapping[str, str] = OWNED
+) -> dict[str, Plain]:
     """Set values, which may be text, in ``options``; return them by full dotted key.
 
     Of keys sections may be left out where a name exists once. OptionError, which begins with
-    ``flag``, names a key that is unknown or ambiguous, or whose value is of a wrong type.
+    ``flag``, names a key that is unknown, ambiguous, or ``owned``, or whose value is of a wrong
+    type.
     """
     known = flat_values(options)
     resolved: dict[str, Plain] = {}
     for text, value in given.items():
         key = _full_key(text, known, flag)
-        if reason := OWNED.get(_name(key)):
+        if reason := owned.get(_name(key)):
             raise OptionError(f"{flag} {text}: cannot be changed here; {reason}")
         resolved[key] = _converted(value, known[key], f"{flag} {text}")
         try:

@@ -97,7 +97,10 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
     images = list(rows("image_id name camera_id", "images"))
     cameras = rows("camera_id width height model params", "cameras")
     return Tables(
-        cameras={int(key): Camera(*map(int, row), params) for key, *row, params in cameras},
+        cameras={
+            int(key): Camera(int(width), int(height), int(model), params)
+            for key, width, height, model, params in cameras
+        },
         names={int(key): str(name) for key, name, _ in images},
         camera_ids={int(key): int(camera_id) for key, _, camera_id in images},
         frame_images={

@@ -4,7 +4,6 @@ DEFAULT_METHODS = (
     "sift-colmap", "sift", "sift-affine-dsp", "unrectified-rootsift", "default", "on-demand",
 )  # fmt: skip
 """What is compared where nothing else is asked for."""
-
 LEARNED_METHODS = (
     "aliked-lightglue", "disk-lightglue", "xfeat-lighterglue", "on-demand-learned",
 )  # fmt: skip

@@ -49,10 +49,9 @@ def compare(
 ) -> Comparison:
     """Find out how many photographs each method registers, and which; go on after a stop.
 
-    Each method runs in a process of its own. One that fails is reported as failed, and the others
-    go on; with ``overwrite`` methods run again though they have results there. What is returned is
-    also written to ``comparison.json`` and ``report.html`` in the output folder, which is made if
-    missing. Raises AffrectError for anything that the caller can mend, before any method is run.
+    Each method runs in a process of its own; one that fails is reported, and the others go on. With
+    ``overwrite`` methods run again. Writes ``comparison.json`` and ``report.html``, too. Raises
+    AffrectError for anything that the caller can mend, before any method is run.
     """
     options = options or CompareOptions()
     Workspace(output_path).require_own(image_path)
@@ -140,23 +139,17 @@ def _same_for_all(
 
 
 def _settings(same: Mapping[str, Any], options: CompareOptions) -> dict[str, Any]:
-    """Return the settings of all methods, for people."""
-    paths = {
-        "image_list_path": options.image_list_path,
-        "from_database": options.from_database,
-        "ground_truth_path": options.ground_truth_path,
-    }
+    places = ("image_list_path", "from_database", "ground_truth_path")
     return {
         **{key: same[key] for key in ("camera", "verification", "mapping")},
+        **{key: str(getattr(options, key) or "") for key in places},
         "masks": options.masks.to_mapping(),
-        **{key: str(path.resolve()) if path else "" for key, path in paths.items()},
         "match_list_path": options.pairs.match_list_path,
         "preset": options.mapping.preset_name,
     }
 
 
 def _without_seed(options: Options) -> dict[str, Any]:
-    """Return options without their seed: a comparison runs with several."""
     return {key: value for key, value in options.to_mapping().items() if key != "random_seed"}
 
 

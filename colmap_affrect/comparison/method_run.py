@@ -26,7 +26,7 @@ from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP, SIFT_COLMAP, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
-from colmap_affrect.comparison.sift import describe_options, extract_sift, match_sift
+from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.errors import ComparisonError, StaleStoreError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database
@@ -114,7 +114,7 @@ class MethodRun:
         """Return options of features and matching, and the seed where verification decides."""
         recipe = self.method.recipe
         if recipe is None:
-            return describe_options(affine=self.method.label == SIFT_AFFINE_DSP)
+            return {"affine": self.method.label == SIFT_AFFINE_DSP}
         seed = {"seed": self.options.seeds[0]} if self.method.escalates else {}
         return {**recipe.to_mapping(), **seed}
 

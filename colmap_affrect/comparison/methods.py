@@ -56,10 +56,9 @@ def without_weights(weights_path: Path | None = None) -> dict[str, list[WeightFi
 def parse_methods(
     given: Iterable[str | Method], depth_settings: Sequence[str] = ()
 ) -> tuple[Method, ...]:
-    """Read methods, each as :func:`parse_method` takes them, several separated by commas.
+    """Read methods as :func:`parse_method` takes them, several separated by commas.
 
-    What follows a colon belongs to the last method of its text. Methods stay as they are. Raises
-    OptionError for an unknown method or option, no method, or two with one name.
+    What follows a colon belongs to the last of a text. OptionError for none, or two of one name.
     """
     methods: list[Method] = []
     for text in given:

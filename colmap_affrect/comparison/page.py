@@ -38,11 +38,9 @@ KINDS = {"shared": "registered", "uncertain": "doubtful", "wrong": "at a wrong p
 
 
 def write_page(comparison: Comparison, output_path: Path, progress: Progress = SILENT) -> Path:
-    """Write ``report.html`` into the folder of a comparison, and return its path.
+    """Write ``report.html``, one file that loads nothing, and return its path.
 
-    It is one file that loads nothing. Whatever is missing, such as a photograph that cannot be read
-    or a model that is not there, is said in its place. Raises WorkspaceError when it cannot be
-    written.
+    What is missing, as an unreadable photograph, is said in its place. Raises WorkspaceError.
     """
     columns = columns_of(comparison)
     names, folder = comparison.image_names, Path(comparison.image_path)
@@ -50,8 +48,8 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
     cards = cards_of(columns, comparison)
     index = {name: number for number, name in enumerate(names)}
     layout = view_graph.lay_out(names, graphs)
-    paths = {c.name: comparison.model_path(c.method, output_path) for c in columns}
-    views = read_scene(paths)
+    shown = {column.name: column.method.shown_seed for column in columns}
+    views = read_scene({n: output_path / s.model_path if s else None for n, s in shown.items()})
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
     content = {
         "comparison": comparison,

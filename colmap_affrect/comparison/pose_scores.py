@@ -22,7 +22,6 @@ PairErrors = Annotated[
 ]
 """By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
 and of the direction of the translation; in JSON rows of both."""
-
 AUC_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
 MAX_CORRECT_ERROR_DEG = 5.0
 """An image is registered correctly if its relative poses to at least half of the other registered
@@ -63,10 +62,7 @@ def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
 
 
 def correct_images(errors: PairErrors) -> tuple[str, ...]:
-    """Return the images whose relative poses to at least half of the others are right.
-
-    A pair is right if both of its errors are at most ``MAX_CORRECT_ERROR_DEG``; all are given.
-    """
+    """Return the images in at least half of whose pairs both errors are at most the limit."""
     right = (pair for pair, both in errors.items() if max(both) <= MAX_CORRECT_ERROR_DEG)
     num_right = Counter(itertools.chain.from_iterable(right))
     names = {name for pair in errors for name in pair}
@@ -74,10 +70,9 @@ def correct_images(errors: PairErrors) -> tuple[str, ...]:
 
 
 def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg: float) -> float:
-    """Integrate the share of pairs with at most an error over errors from 0 to a threshold.
+    """Return the area under the steps of recall over errors, divided by the threshold: 0 to 1.
 
-    The exact area under the steps, divided by the threshold: from 0 to 1. Of ``num_pairs`` those
-    without an error were not estimated, and are never below a threshold.
+    Of ``num_pairs`` those without an error were not estimated.
     """
     if not num_pairs:
         return 0.0
@@ -85,10 +80,9 @@ def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg:
 
 
 def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
-    """Compute the distances of camera centres after the best similarity has aligned them.
+    """Return distances of camera centres after a robust similarity, in units of the truth.
 
-    Centres that are far off do not pull at the alignment. In units of the ground truth; empty with
-    fewer than three images, or centres on one line, which leaves the similarity open.
+    Empty with fewer than three images, or centres on one line.
     """
     names = sorted(estimated.keys() & truth.keys())
     if len(names) < MIN_IMAGES_TO_ALIGN:
@@ -130,10 +124,7 @@ def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> P
 
 
 def disagreeing_images(poses: Poses, other: Poses) -> tuple[str, ...]:
-    """Return the images that two models have both, in poses that contradict each other.
-
-    An image agrees if its relative poses to at least half of the other common images do.
-    """
+    """Return common images whose poses relative to over half of the others contradict."""
     errors = pair_errors(poses, other)
     agreeing = set(correct_images(errors))
     return tuple(sorted({name for pair in errors for name in pair} - agreeing))

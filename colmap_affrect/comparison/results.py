@@ -1,14 +1,9 @@
-"""What a comparison found, as frozen data; pydantic writes and reads it.
-
-Everything derived (means, who registers what alone) is computed here from the results of single
-seeds, so that terminal, page and JSON cannot disagree.
-"""
+"""What a comparison found, as frozen data; pydantic writes and reads it."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
-from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Self
 
@@ -41,11 +36,7 @@ class Span:
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Self:
-        """Return the span of one or more values.
-
-        >>> Span.of([1, 3, 2])
-        Span(mean=2.0, min=1.0, max=3.0)
-        """
+        """Return the span of one or more values."""
         numbers = [float(value) for value in values]
         return cls(sum(numbers) / len(numbers), min(numbers), max(numbers))
 
@@ -89,6 +80,9 @@ class SeedResult:
         return {"seed": self.seed, **{k: m.of(self) for k, m in MEASURES.items()}, **plain(self)}
 
 
+Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
+
+
 @dataclass(frozen=True)
 class Measure:
     """A number of every seed, and how tables write it."""
@@ -96,8 +90,12 @@ class Measure:
     of: Callable[[SeedResult], float | None]  # None where a seed has no such number
     title: str  # of its line
     digits: int  # decimals, where not all values are whole
-    better: Callable[[Iterable[float]], float] | None = None  # which mean is best, if any
+    better: Better = None
     column: str = ""  # title of its column in the terminal; empty: not shown there
+
+
+def _of_scores(value: Callable[[PoseScores], float | None]) -> Callable[[SeedResult], float | None]:
+    return lambda seed: value(seed.scores) if seed.scores else None
 
 
 def _of_model(name: str) -> Callable[[SeedResult], float | None]:
@@ -109,7 +107,7 @@ MEASURES = {
         lambda seed: len(seed.registered_names), "Registered, of {images}", 1, max, "registered"
     ),
     "correct": Measure(
-        lambda seed: len(seed.correct_names) if seed.scores else None,
+        _of_scores(lambda scores: len(scores.correct_names)),
         "Registered correctly, of {images}", 1, max, "correct",
     ),
     "num_doubtful": Measure(lambda seed: len(seed.reasons_to_doubt), "Doubtful", 1, min),
@@ -125,11 +123,11 @@ MEASURES = {
         _of_model("mean_reprojection_error_px"), "Reprojection error, px", 2, None, "px"
     ),
     "median_rotation_error_deg": Measure(
-        lambda seed: seed.scores and seed.scores.median_rotation_error_deg,
+        _of_scores(lambda scores: scores.median_rotation_error_deg),
         "Median rotation error, °", 2, min,
     ),
     "auc_5": Measure(
-        lambda seed: seed.scores and seed.scores.auc["5"], "AUC of relative poses at 5°", 3, max
+        _of_scores(lambda scores: scores.auc["5"]), "AUC of relative poses at 5°", 3, max
     ),
 }  # fmt: skip
 """Numbers of every seed, by their names in JSON."""
@@ -205,20 +203,13 @@ class MethodResult:
 
     @model_serializer(mode="wrap")
     def _with_spans(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = plain(self)
-        if self.failed:
-            return {key: values[key] for key in KEPT_OF_FAILED}
-        del values["failed"]
         return {
             **{key: self.span(key) for key in MEASURES},
             "registered_names": {str(s.seed): s.registered_names for s in self.seeds},
             "total_s": self.total_s,
-            **values,
+            **plain(self),
             "wall_s": self.stage_seconds,
         }
-
-
-KEPT_OF_FAILED = ("failed", "name", "summary", "failures", "options", "folder")
 
 
 def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
@@ -243,11 +234,6 @@ class Comparison:
     def finished(self) -> tuple[MethodResult, ...]:
         """The methods that did not fail."""
         return tuple(method for method in self.methods if not method.failed)
-
-    def model_path(self, method: MethodResult, output_path: Path) -> Path | None:
-        """Return the folder of the first model of a method; None for none."""
-        seed = method.shown_seed
-        return output_path / seed.model_path if seed else None
 
     @property
     def only_registered_by(self) -> dict[str, str]:

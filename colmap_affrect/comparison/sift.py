@@ -2,12 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database, require_database_space
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.native_options import differences
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
@@ -18,20 +16,6 @@ ROWS_PER_PAIR = 8
 TEMPORARY_NAME = "id:{}"  # name of an image by its id while COLMAP matches
 
 
-def extraction_options(*, affine: bool) -> pycolmap.FeatureExtractionOptions:
-    """Return COLMAP's defaults, or with affine shapes and domain-size pooling."""
-    options = pycolmap.FeatureExtractionOptions()
-    options.sift.estimate_affine_shape = affine
-    options.sift.domain_size_pooling = affine
-    return options
-
-
-def describe_options(*, affine: bool) -> dict[str, Any]:
-    """Return what differs from COLMAP's defaults, by pycolmap's dotted keys."""
-    default = pycolmap.FeatureExtractionOptions()
-    return {"extraction": differences(extraction_options(affine=affine), default), "matching": {}}
-
-
 def extract_sift(
     database_path: Path,
     image_path: Path,
@@ -40,18 +24,18 @@ def extract_sift(
     *,
     affine: bool,
 ) -> dict[str, str]:
-    """Extract SIFT features of images that the database has; those with features are kept.
+    """Extract SIFT features of images of a database; those that have some are kept.
 
-    COLMAP takes memory for whatever a header claims, so images that claim more pixels than
-    photographs have, and those with such masks, are passed over as our extraction does.
-
-    Returns the images that have no features now, with the reason.
+    Images and masks that claim more pixels than photographs have are passed over: COLMAP takes
+    memory for whatever a header claims. Options are COLMAP's defaults, if ``affine`` with affine
+    shapes and domain-size pooling. Returns the images without features, with the reason.
     """
     photographs = Photographs(image_path, masks)
     impossible = {name: why for name in image_names if (why := photographs.why_impossible(name))}
     usable = [name for name in image_names if name not in impossible]
     require_database_space(database_path, len(image_names) * ROWS_PER_IMAGE)
-    reader = pycolmap.ImageReaderOptions()
+    options, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
+    options.sift.estimate_affine_shape = options.sift.domain_size_pooling = affine
     if masks.path:
         reader.mask_path = Path(masks.path)
     if masks.camera_path:
@@ -62,7 +46,7 @@ def extract_sift(
             image_path,
             image_names=usable,
             reader_options=reader,
-            extraction_options=extraction_options(affine=affine),
+            extraction_options=options,
         )
     ids = image_ids(database_path)
     with open_database(database_path) as database:
@@ -73,8 +57,7 @@ def extract_sift(
 def match_sift(database_path: Path, pairs: Sequence[Pair]) -> None:
     """Match pairs of images by COLMAP's defaults, without verification.
 
-    COLMAP's lists of pairs cannot hold names with spaces: it matches in a copy, in which the images
-    have other ones.
+    In a copy in which images have other names: COLMAP's lists of pairs cannot hold spaces.
     """
     ids = image_ids(database_path)
     names = {image_id: name for name, image_id in ids.items()}
@@ -95,7 +78,6 @@ def match_sift(database_path: Path, pairs: Sequence[Pair]) -> None:
 
 
 def _rename_images(database_path: Path, names: Mapping[int, str]) -> None:
-    """Give the images of a database these names by id."""
     with open_database(database_path) as database:
         for image in database.read_all_images():
             image.name = names[image.image_id]

@@ -10,7 +10,7 @@ from itertools import zip_longest
 
 from pydantic import TypeAdapter
 
-from colmap_affrect.comparison.results import MEASURES, Comparison, Measure, MethodResult, Span
+from colmap_affrect.comparison.results import MEASURES, Better, Comparison, MethodResult, Span
 from colmap_affrect.comparison.verdict import ranked, verdict
 from colmap_affrect.project.record import STAGES
 
@@ -18,13 +18,11 @@ METHOD_COLORS = (
     "#0b62a8", "#a34700", "#00714f", "#9b2d79", "#5d4bb0", "#7a5c00", "#a3213b", "#46606e",
 )  # fmt: skip
 """Of the marks of methods; white text on them is readable."""
-
 MAIN_ROWS = {
     "registered", "correct", "num_models", "verified_pairs", "points3D", "mean_track_length",
     "total_s",
 }  # fmt: skip
 """Rows that decide; the others are folded away."""
-
 BYTES_PER_MB = 1_000_000
 NOTHING = "-"  # where there is no number
 WIDTH = 88  # of the verdict in the terminal
@@ -73,38 +71,39 @@ def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]
     counts = {"images": len(comparison.image_names), "pairs": f"{comparison.num_pairs:,}"}
     stages = {stage for method in methods for stage in method.stage_seconds}
     rows = [
-        _row(key, measure, [method.span(key) for method in methods], counts)
-        for key, measure in MEASURES.items()
+        _row(key, m.title.format(**counts), m.digits, m.better, m.column,
+             [method.span(key) for method in methods])
+        for key, m in MEASURES.items()
         if key != "num_models"
-    ]
+    ]  # fmt: skip
     splits = [_splits(method) for method in methods]
-    no_best = (False,) * len(splits)
-    rows.insert(2, Row("num_models", "Images in each model", splits, no_best, ""))
-    costs = {
-        f"{stage}_s": (f"Seconds to {stage}", 1, [m.stage_seconds.get(stage) for m in methods], "")
-        for stage in sorted(stages, key=STAGES.index)
-    }
-    costs["total_s"] = ("Seconds in all", 1, [method.total_s for method in methods], "seconds")
-    memory = [method.peak_memory_bytes / BYTES_PER_MB for method in methods]
-    costs["peak_memory_bytes"] = ("Peak memory, MB", 0, list(memory), "MB")
-    for key, (title, digits, values, column) in costs.items():
+    rows.insert(2, Row("num_models", "Images in each model", splits, (False,) * len(splits), ""))
+    costs: list[tuple[str, str, int, str, list[float | None]]] = [
+        *((f"{stage}_s", f"Seconds to {stage}", 1, "",
+           [method.stage_seconds.get(stage) for method in methods])
+          for stage in sorted(stages, key=STAGES.index)),
+        ("total_s", "Seconds in all", 1, "seconds", [method.total_s for method in methods]),
+        ("peak_memory_bytes", "Peak memory, MB", 0, "MB",
+         [method.peak_memory_bytes / BYTES_PER_MB for method in methods]),
+    ]  # fmt: skip
+    for key, title, digits, column, values in costs:
         spans = [None if value is None else Span.of([value]) for value in values]
-        rows.append(_row(key, Measure(lambda _: None, title, digits, min, column), spans, counts))
+        rows.append(_row(key, title, digits, min, column, spans))
     return [row for row in rows if any(cell != NOTHING for cell in row.cells)]
 
 
 def _row(
-    key: str, measure: Measure, spans: Sequence[Span | None], counts: dict[str, object]
+    key: str, title: str, digits: int, better: Better, column: str, spans: Sequence[Span | None]
 ) -> Row:
     """Write means and, in brackets, ranges with as many decimals in all cells as any needs."""
-    digits, known = measure.digits, [span for span in spans if span]
+    known = [span for span in spans if span]
     means = {round(span.mean, digits) for span in known}
-    best = measure.better(means) if measure.better and len(means) > 1 else None
+    best = better(means) if better and len(means) > 1 else None
     digits_of_mean = digits_of((span.mean for span in known), digits)
     digits_of_ends = digits_of((end for span in known for end in (span.min, span.max)), digits)
     cells = [span_text(span, digits_of_mean, digits_of_ends) for span in spans]
     is_best = tuple(span is not None and round(span.mean, digits) == best for span in spans)
-    return Row(key, measure.title.format(**counts), cells, is_best, measure.column)
+    return Row(key, title, cells, is_best, column)
 
 
 def digits_of(values: Iterable[float], digits: int) -> int:
@@ -126,7 +125,6 @@ def span_text(span: Span | None, digits: int = 1, digits_of_ends: int = 0) -> st
 
 
 def _splits(method: MethodResult) -> str:
-    """Write the sizes of the models, once where all seeds agree."""
     splits = [" + ".join(str(len(m)) for m in s.model_names) or "none" for s in method.seeds]
     if len(set(splits)) == 1:
         return splits[0]

@@ -11,11 +11,9 @@ from colmap_affrect.comparison.results import Comparison, MethodResult, Span, in
 
 REFERENCES = ("sift", "sift-affine-dsp", "sift-colmap")
 """What gains are measured against: the first of these that was run."""
-
 MIN_MEAN_GAIN = 0.5
 """More photographs on average over the seeds than this is a gain, though no single photograph is
 registered in most seeds that was not before."""
-
 MIN_IMAGES = 3  # fewer are a pair, not a reconstruction
 MAX_NAMES = 6
 
@@ -67,10 +65,7 @@ def headline(comparison: Comparison) -> str:
 
 
 def changes(comparison: Comparison) -> list[str]:
-    """Say for every method what it gains and loses against SIFT, and at what cost.
-
-    Rectified methods are set against our own features without warps too.
-    """
+    """Say what methods gain and lose against SIFT, warps also against features without."""
     finished, reference = comparison.finished, _reference(comparison)
     pairs = [(method, reference) for method in finished if reference and method is not reference]
     recipes = [method for method in finished if "rectifier" in method.options]
@@ -152,10 +147,7 @@ def _change_text(method: MethodResult, reference: MethodResult) -> str:
 
 
 def _doubts(comparison: Comparison) -> list[str]:
-    """Name what cannot be trusted in the models of most seeds, and in which methods.
-
-    Each reason stands once, with all photographs that it is true of.
-    """
+    """Name what is doubtful in most seeds: each reason once, with photographs and methods."""
     methods = defaultdict(list)
     for method in comparison.finished:
         reasons = {name: why for seed in method.seeds for name, why in seed.doubtful.items()}
@@ -170,10 +162,7 @@ def _doubts(comparison: Comparison) -> list[str]:
 
 
 def _contradictions(comparison: Comparison) -> list[str]:
-    """Doubt poses that differ between methods; the method with most contradictions comes first.
-
-    Where ground truth knows the pose, it says who is right.
-    """
+    """Name poses that differ between methods, unless ground truth knows them; worst first."""
     known, images_of = comparison.names_with_truth, {}
     for method in comparison.finished:
         unknown = {name: set(v) - known for name, v in method.disagreements.items()}

@@ -1,7 +1,6 @@
 """One method of a comparison, in a process of its own: ``python -m ... TASK``.
 
-Its peak memory is the method's, and when it dies the other methods go on. What was done stays:
-run again, it goes on. Progress goes to stdout; everything else that is printed goes to stderr.
+Progress goes to stdout; everything else that is printed goes to stderr.
 """
 
 import logging

@@ -19,8 +19,7 @@ def diagnose(
 ) -> Diagnosis:
     """Examine the installation and, if a path is given, an output folder or a COLMAP database.
 
-    ``path`` may be damaged. With the folder of the photographs their sizes are compared with the
-    cameras. Weights of networks are looked for in ``weights_path`` first. OptionError when
+    With the folder of the photographs their sizes are compared with the cameras. OptionError when
     something that is given is not there.
     """
     if path is not None and not path.exists():

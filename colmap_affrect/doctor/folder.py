@@ -28,10 +28,9 @@ SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 def examine_database(
     diagnosis: Diagnosis, path: Path, image_path: Path | None, advice: str = ""
 ) -> bool:
-    """Examine a COLMAP database, and the sizes of its photographs if their folder is given.
+    """Examine a COLMAP database and the sizes of its photographs; return whether it is usable.
 
-    ``advice`` is what to do about problems, where it is not what ``CHECKS`` says. Returns whether
-    the database can be used.
+    ``advice`` is what to do about problems, where it is not what ``CHECKS`` says.
     """
     try:
         version, newest = refuse_newer(path), newest_schema_version()
@@ -140,7 +139,6 @@ class _Examination:
         return path.exists()
 
     def _record(self) -> Mapping[str, Any]:
-        """Return the record, with options that later stages would take."""
         context, record = Context(self.workspace), self.workspace.recorded()
         if "extract" in self.workspace.begun:
             _ = context.inputs, context.extraction
@@ -149,14 +147,12 @@ class _Examination:
         return record
 
     def _stages(self, record: Mapping[str, Any]) -> list[str]:
-        """Return the stages on record."""
         done = [stage for stage in STAGES if stage in record.get("begun", [])]
         stages, recipe = ", ".join(done) or "none", record.get("recipe", "")
         self.diagnosis.checked.append(f"{self.path}: stages on record: {stages}; recipe {recipe}")
         return done
 
     def _models(self) -> None:
-        """Read the models."""
         sparse = self.workspace.sparse
         sizes = [self._read(f, partial(self._num_images, f)) for f in model_folders(sparse)]
         listed = ", ".join(str(size) for size in sizes if size) or "no"
@@ -172,5 +168,4 @@ class _Examination:
 
 
 def _without_path(path: Path, error: Exception) -> str:
-    """Return the message of an error without the path that it begins with."""
     return str(error).removeprefix(f"{path}: ").removeprefix(f"{path}/") or type(error).__name__

@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,7 +15,6 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError, damage, such_as
-from colmap_affrect.evaluation.data import Dataset, EvaluationImage, EvaluationPair
 from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import colmap_from_pixel, pixel_from_colmap
@@ -27,11 +26,47 @@ from colmap_affrect.project.outputs import leads_outside
 Names = tuple[str, str]  # of the images of a pair, without suffix
 Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 """Cameras and cam_from_world poses by the name of the image without suffix."""
-
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
 CALIBRATION_PREFIX = "calibration_"
 ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
+
+
+@dataclass(frozen=True)
+class EvaluationImage:
+    """An image of a dataset; its name is the key of its features and depth map."""
+
+    name: str
+    path: Path
+    camera: pycolmap.Camera | None = None  # None where it is not known
+
+    @property
+    def intrinsics(self) -> Array | None:
+        """(3, 3) camera matrix in pixel-centre px, without distortion; None without a camera."""
+        if self.camera is None:
+            return None
+        matrix = np.asarray(self.camera.calibration_matrix(), dtype=np.float64)
+        matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])
+        return matrix
+
+
+@dataclass(frozen=True)
+class EvaluationPair:
+    """Two images whose matches are scored; one with a problem has no truth, and fails."""
+
+    name: str
+    images: tuple[EvaluationImage, EvaluationImage]
+    category: str = ""  # of difficulty, as tables group pairs; empty for none
+    truth: Any = None  # one of :mod:`colmap_affrect.evaluation.truths`
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """The pairs of a dataset, and what is missing in it, in words."""
+
+    pairs: tuple[EvaluationPair, ...]
+    notes: tuple[str, ...] = ()
 
 
 class _Entry(Options):
@@ -71,10 +106,7 @@ def load_evd(folder: Path) -> Dataset:
 
 
 def _scenes(pattern: str, load: Callable[[Path], Dataset], path: Path) -> Dataset:
-    """Read one or all scenes, by the file or folder that makes a folder one.
-
-    Raises EvaluationError when there is none, or its files are unusable.
-    """
+    """Read one or all scenes, by the file that makes a folder one; EvaluationError if none."""
     folders = [path, *sorted(path.glob("*/"))]
     scenes = [load(each) for folder in folders for each in sorted(folder.glob(pattern))]
     notes = tuple(note for scene in scenes for note in scene.notes)
@@ -163,12 +195,10 @@ def stem(name: str) -> str:
 
 
 def _damaged(path: Path) -> AbstractContextManager[None]:
-    """Make one EvaluationError of whatever a damaged file leads to."""
     return damage(path, "see docs/own-evaluation-set.md for the format", EvaluationError)
 
 
 def _lines(path: Path) -> list[str]:
-    """Return the lines of a text file that are not empty or comments."""
     with _damaged(path):
         lines = map(str.strip, path.read_text(encoding="utf-8-sig").splitlines())
         return [line for line in lines if line and not line.startswith("#")]
@@ -210,10 +240,7 @@ def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
 
 
 def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
-    """Return an array, of any number of rows where ``shape`` begins with -1.
-
-    EvaluationError says what is wrong with ``what``.
-    """
+    """Return an array; a shape that begins with -1 has any number of rows. EvaluationError."""
     try:
         values = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -235,10 +262,7 @@ def pinhole(matrix: Array, what: str) -> pycolmap.Camera:
 
 
 def load_pairs(folder: Path) -> Dataset:
-    """Read ``pairs.json``; EvaluationError when that cannot be used.
-
-    A pair whose images or truth cannot be used is returned with its problem.
-    """
+    """Read ``pairs.json``; pairs that cannot be used have a problem, else EvaluationError."""
     path = folder / "pairs.json"
     with _damaged(path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))

@@ -1,8 +1,7 @@
 """Evaluate recipes on a dataset by a protocol: features, matches, scores, tables, a plot.
 
-The output folder has ``features/`` and ``pairs/`` (scores of single pairs), both by recipe and a
-digest of all that decides them, ``evaluation.json`` and ``errors.png``. An evaluation that was
-stopped goes on, and after a change only what depends on it is made again.
+``features/`` and ``pairs/`` (scores of pairs) are by recipe and a digest of what decides them: only
+what changed is made again.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ from statistics import fmean
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import EvaluationError, OptionError, such_as
 from colmap_affrect.evaluation import datasets, truths
-from colmap_affrect.evaluation.data import Dataset, PairResult, ScoreOptions
+from colmap_affrect.evaluation.datasets import Dataset
 from colmap_affrect.evaluation.results import (
     SECONDS,
     Evaluation,
@@ -22,6 +21,7 @@ from colmap_affrect.evaluation.results import (
     write_plot,
 )
 from colmap_affrect.evaluation.runner import RecipeRun
+from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
@@ -79,11 +79,9 @@ def evaluate(
 ) -> Evaluation:
     """Score recipes on a dataset by one of ``PROTOCOLS``.
 
-    An image or pair that cannot be used counts as failed, and the others go on; so does an
-    evaluation that was stopped, unless ``overwrite`` discards features and scores of these recipes
-    first. What is returned is also written to ``evaluation.json`` and ``errors.png`` in the output
-    folder, which is made if missing. Raises AffrectError for anything that the caller can mend,
-    before any image is worked on.
+    An image or pair that cannot be used counts as failed. One that was stopped goes on, unless
+    ``overwrite`` discards features and scores of these recipes. Writes ``evaluation.json`` and
+    ``errors.png``, too. AffrectError for what the caller can mend, before any image is worked on.
     """
     require_png()
     if protocol not in PROTOCOLS:

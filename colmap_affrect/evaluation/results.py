@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from pydantic import Field, TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
-from colmap_affrect.evaluation.data import Number, PairResult
-from colmap_affrect.evaluation.truths import GROUP
+from colmap_affrect.evaluation.truths import GROUP, Number, PairResult
 from colmap_affrect.project.atomic_files import replace_bytes
 
 DATA = Path(__file__).with_name("published.toml")
@@ -128,10 +127,7 @@ def _table(
 
 
 def write_plot(evaluation: Evaluation, path: Path) -> None:
-    """Draw the number of pairs of each recipe over the threshold of the error, as PNG.
-
-    The axes are those of the paper's figure.
-    """
+    """Draw how many pairs each recipe has below each error, as in the paper, as PNG."""
     figure = Figure(figsize=(8.0, 5.0), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     axes, (low, high) = figure.add_subplot(), ERROR_LIMITS

@@ -1,8 +1,7 @@
 """One recipe on the pairs of a dataset: features, matches and scores, kept for the next run.
 
-A pair is matched as a run of its two images alone would match it: a recipe with escalation tries
-its levels until COLMAP's geometric verification finds enough inliers. The level with most of them
-counts. Cameras are taken as unknown for that.
+A pair is matched as a run of its two images alone would match it, with cameras unknown. Of levels
+of escalation the one with most inliers of COLMAP's verification counts.
 """
 
 import json
@@ -25,8 +24,8 @@ from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
 from colmap_affrect.comparison.methods import Method
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.evaluation import data
-from colmap_affrect.evaluation.data import EvaluationPair, PairResult, PairScore
+from colmap_affrect.evaluation.datasets import EvaluationImage, EvaluationPair
+from colmap_affrect.evaluation.truths import PairResult, PairScore, ScoreOptions
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
@@ -68,13 +67,12 @@ class RecipeRun:
     ) -> None:
         """Find everything that the recipe needs before any image is worked on.
 
-        Features depend on the recipe and ``inputs``, and scores on ``settings`` too. Others are
-        kept beside; ``overwrite`` removes all that this method has.
+        Features depend on recipe and ``inputs``, scores on ``settings`` too.
         """
         if method.recipe is None:
             raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
         self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
-        self._options = data.ScoreOptions(**settings["scores"]), settings["random_seed"]
+        self._options = ScoreOptions(**settings["scores"]), settings["random_seed"]
         extraction, matching = self.recipe.extraction, self.recipe.matching
         images = {image.name for pair in pairs if not pair.problem for image in pair.images}
         self._extractor = prepare(extraction, resources, sorted(images))
@@ -131,17 +129,13 @@ class RecipeRun:
         return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
 
     def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
-        """Return the result of a pair that has no matches."""
         score = pair.truth.score(*NOTHING, *self._options) if pair.truth else NO_SCORE
         return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
 
     def _matched(
         self, matchers: Sequence[CachedMatcher], pair: EvaluationPair
     ) -> tuple[PairResult, tuple[Array, Array]]:
-        """Return the (M, 2) and (M, 2) points of the best level, and a result without score.
-
-        It has no levels where an image cannot be used.
-        """
+        """Return a result without score, and (M, 2) and (M, 2) points of the best level, if any."""
         best = PairResult(**vars(NO_SCORE), name=pair.name, category=pair.category)
         points, most, seconds, num_levels = NOTHING, 0, 0.0, 0
         for level, matcher in enumerate(matchers):
@@ -166,7 +160,7 @@ class RecipeRun:
                 break
         return replace(best, seconds=seconds, num_levels=num_levels), points
 
-    def _extract(self, image: data.EvaluationImage, level: int) -> bool:
+    def _extract(self, image: EvaluationImage, level: int) -> bool:
         """Extract what an image lacks up to a level; tell whether it can be used."""
         name, store = image.name, self._store
         num_levels = len(store.level_ends(name)) if name in store.names() else 0

@@ -1,36 +1,35 @@
 """The three kinds of truth: scores of matches by them, and the columns of their tables.
 
 A truth scores (M, 2) and (M, 2) matched points, pixel-centre px of the stored images; its repr has
-all that it knows. Columns are named as the paper's rows where they have the same numbers. Results
-of failed pairs may have no details; their errors are infinite.
+all that it knows. Results of failed pairs have infinite errors.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from statistics import fmean, median_low
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from pydantic import BeforeValidator
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, pose_errors
 from colmap_affrect.comparison.pose_scores import area_under_curve
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
 from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 from colmap_affrect.images.reading import read_gray
+from colmap_affrect.options import Options, within
 
 Points = Floats
 Sides = tuple[Floats, Floats]  # points or rays of both images
-Results = Sequence[PairResult]
 Size = tuple[int, int]  # (width, height) in px
 
 GROUP = ": "  # separates the name of a table from that of its column in the names of columns
@@ -45,6 +44,49 @@ MAX_ERROR_PX, MAX_ERROR_DEG = 5.0, 5.0  # homographies and rotations of solved p
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
 MAX_AUC_ERROR_DEG = 10.0
 NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
+
+
+Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
+"""Infinite where JSON has null."""
+
+
+class ScoreOptions(Options):
+    """How models are estimated from matches: ``--protocol-options`` of the command line."""
+
+    threshold_px: Annotated[float, within(1e-6, 1e9)] = 0.5
+    """Of an inlier of plain RANSAC, for homographies and poses (the paper: 0.5)."""
+    max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
+    """Of estimators, as the paper says; its numbers of relative poses are those of 1000."""
+
+
+@dataclass(frozen=True)
+class PairScore:
+    """How good the matches of one pair are."""
+
+    error: Number  # of the protocol, px or degrees; infinite where no model was found
+    num_inliers: int  # of the model that was estimated
+    num_correct: int | None = None  # matches that agree with the truth; None where it cannot say
+    details: Mapping[str, Number] = field(default_factory=dict)  # beside the error
+    solved: float = 0.0  # how far it counts as matched: 1 or 0 where there is a threshold
+    kind: str = ""  # of the truth, as tables name it; empty without one
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairResult(PairScore):
+    """The score of one pair by one recipe: what ``evaluation.json`` lists."""
+
+    name: str
+    category: str = ""
+    num_matches: int = 0
+    num_keypoints: tuple[int, int] = (0, 0)
+    seconds: float = 0.0
+    seconds_by_step: Mapping[str, float] = field(default_factory=dict)  # ``match``, ``estimate``
+    level: str = ""  # of escalation, that decided: its rectifier, ``none`` if none was verified
+    num_levels: int = 0  # that were matched
+    failure: str = ""  # why the pair counts as failed, with an infinite error
+
+
+Results = Sequence[PairResult]
 
 
 def estimate_matrix(
@@ -93,10 +135,7 @@ def estimate_pose(
 
 @dataclass(frozen=True, eq=False)
 class TrueHomography:
-    """The (3, 3) image2_from_image1 of pixel-centre px, and the sizes of the images.
-
-    Its third coordinate is positive in the part of image 1 that image 2 shows.
-    """
+    """The (3, 3) image2_from_image1 of pixel-centre px, > 0 where visible; sizes of images."""
 
     matrix: Array
     size1: Size
@@ -106,8 +145,7 @@ class TrueHomography:
     def of(cls, matrix: Array, paths: Sequence[Path], what: str) -> "TrueHomography":
         """Return the truth of two image files, of a (3, 3) matrix of any scale and sign.
 
-        Raises ImageError when an image cannot be read, and EvaluationError, naming ``what``, when
-        image 2 shows no part of image 1 by it.
+        ImageError when one cannot be read, EvaluationError when image 2 shows no part of image 1.
         """
         size1, size2 = ((gray.shape[1], gray.shape[0]) for gray in map(read_gray, paths))
         both = [cls(sign * matrix, size1, size2) for sign in (1.0, -1.0)]
@@ -127,7 +165,7 @@ class TrueHomography:
     def error_px(self, estimate: Array | None) -> float:
         """Return the mean distance in image 2 between truth and estimate, over the visible part.
 
-        It is infinite without an estimate, or when its horizon runs through that part.
+        Infinite without an estimate, or when its horizon runs through that part.
         """
         if estimate is None:
             return math.inf
@@ -205,8 +243,7 @@ def rays(camera: pycolmap.Camera, points: Points) -> Points:
 def pose_columns(results: Results, *, by_category: bool = True) -> dict[str, float]:
     """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
 
-    Also the area under the curve of the larger of rotation and direction error up to 10 degrees.
-    Categories are in the order of the results.
+    And the area under the curve of the larger of rotation and direction error up to 10 degrees.
     """
     groups: dict[str, list[bool]] = {}
     for result in results if by_category else ():
@@ -244,10 +281,7 @@ class Correspondences:
 
 
 def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2: Points) -> Array:
-    """Return (N,) sqrt(d1^2 + d2^2) of points from their epipolar lines, px, as WxBS has it.
-
-    Infinite without a matrix, and where a line is not defined.
-    """
+    """Return (N,) sqrt(d1^2 + d2^2) from epipolar lines, px; infinite if undefined."""
     if matrix is None:
         return np.full(len(points1), np.inf)
     lines1, lines2 = epipolar_lines(matrix, points1, points2)

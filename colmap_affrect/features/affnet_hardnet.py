@@ -36,19 +36,16 @@ class AffNetHardNetOptions(DogOptions):
 
     name: Literal["affnet-hardnet"] = "affnet-hardnet"
     descriptor: Literal["hardnet", "hardtfeat"] = "hardnet"
-    affine_shape: bool = True
-    """Estimate affine shapes by AffNet; otherwise measurement regions are circles."""
 
     @property
     def kind(self) -> str:
-        """The same where shapes are circles: descriptors are."""
+        """Name of the chain with this descriptor."""
         return f"dog-affnet-{self.descriptor}"
 
     @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights that the networks read."""
-        shape = ("affnet",) if self.affine_shape else ()
-        return (*shape, "orinet", self.descriptor)
+        return ("affnet", "orinet", self.descriptor)
 
 
 class AffNetHardNet:
@@ -63,10 +60,7 @@ class AffNetHardNet:
 
         weights, device = network.weights, network.device
         self.options, self.device = options, networks.resolve_device(device)
-        self.affine_shapes = None
-        if options.affine_shape:
-            affnet = networks.load_affnet(weights["affnet"], device)
-            self.affine_shapes = networks.OnPatches(affnet)
+        self.affnet = networks.OnPatches(networks.load_affnet(weights["affnet"], device))
         self.orinet = networks.load_orinet(weights["orinet"], device)
         name = options.descriptor
         self.descriptor = networks.load_descriptor(name, weights[name], device)
@@ -81,9 +75,8 @@ class AffNetHardNet:
     ) -> list[LocalFeatures]:
         """Estimate shape, orientation and descriptor of features, a list element for each image.
 
-        Patches of all (H, W) uint8 images share batches. Of the frames given, in px of the image,
-        centre and scale count. Features whose shape is degenerate or whose descriptor is not finite
-        are left out; the others keep their order.
+        Of the frames given, in px, centre and scale count. Features whose shape is degenerate or
+        whose descriptor is not finite are left out; the others keep their order.
         """
         counts = [len(features) for features in detected]
         if not sum(counts):
@@ -110,9 +103,8 @@ class AffNetHardNet:
         """Return (N, 2, 2) shapes of determinant 1, and (N, 128) descriptors of any length."""
         half_widths_px = PATCH_SIGMAS / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
-        if self.affine_shapes is not None:
-            upright = sample(_frames(shapes, half_widths_px, found.keypoints))
-            shapes = _shapes_from_outputs(self._run(self.affine_shapes, upright))
+        upright = sample(_frames(shapes, half_widths_px, found.keypoints))
+        shapes = _shapes_from_outputs(self._run(self.affnet, upright))
         unturned = sample(_frames(shapes, half_widths_px, found.keypoints))
         # kornia's angles are of the opposite sense to those of our rotation().
         shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))
@@ -151,10 +143,7 @@ def _sampler(
 
 
 def _shapes_from_outputs(outputs: Floats) -> Array:
-    """Return (N, 2, 2) shapes of determinant 1 of (N, 3) outputs of AffNet, lower triangular.
-
-    NaN where the frame has no area.
-    """
+    """Return (N, 2, 2) shapes of determinant 1 of AffNet's outputs; NaN without an area."""
     shapes = frames_from_affnet(outputs)
     areas = shapes[:, 0, 0] * shapes[:, 1, 1]
     return shapes / np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
 front, that patch has the block of rows and columns 0...3 in its middle."""
-
 PAPER_CROP_PX = (-LEAD_PX) % STEP_PX  # puts the patches of all cells round whole blocks
 PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX  # blocks before the first with a patch
 CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9  # cell i depends on rows 4 i - 11...4 i + 39
@@ -79,10 +78,7 @@ class AffNetOptions(ShapeOptions):
 
 
 class AffNet:
-    """Shapes of all 4 x 4 blocks of an image, or of its keypoints.
-
-    Keypoints are by DoG, with the thresholds of the recipe's features where those are.
-    """
+    """Shapes of all 4 x 4 blocks of an image, or of its DoG keypoints."""
 
     Options = AffNetOptions
 
@@ -104,10 +100,9 @@ class AffNet:
     def grid(self, image: GrayImage) -> ShapeGrid:
         """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
 
-        By default the border is reflected, and blocks whose surroundings deviate by less than
-        ``min_deviation`` are not textured and get the identity. With ``paper`` the network sees
-        the image without padding (the shorter side must have 32 px), and blocks near the border
-        get the shape of the nearest one that has a patch inside. All blocks are textured.
+        By default the border is reflected; blocks without texture (``min_deviation``) get the
+        identity. With ``paper`` the network sees the image without padding (at least 32 px), blocks
+        near the border get the nearest shape, and all are textured.
         """
         if self.options.paper:
             logs = self._paper_logs(image)
@@ -118,10 +113,7 @@ class AffNet:
         return ShapeGrid(metrics_from_log(logs), textured, grid_origin(STEP_PX), STEP_PX)
 
     def samples(self, image: GrayImage) -> ShapeSamples:
-        """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image.
-
-        Keypoints whose shape is not finite or turns the patch over are left out.
-        """
+        """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
         keypoints = self.detect(image)
         order = np.argsort(-keypoints.responses, kind="stable")
         keypoints = keypoints.select(order[: self.options.max_num_keypoints])

@@ -1,7 +1,7 @@
 """What a feature extractor and a source of affine shapes are.
 
-Those of another package become known by an entry point of the group ``colmap_affrect.features`` or
-``colmap_affrect.shapes``. Several threads may call the same object at once.
+Entry points are in the groups ``colmap_affrect.features`` and ``colmap_affrect.shapes``. Several
+threads may call the same object at once.
 """
 
 from collections.abc import Mapping, Sequence

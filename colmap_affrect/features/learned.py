@@ -1,7 +1,6 @@
 """Features ``aliked``, ``disk`` and ``xfeat``: networks that detect and describe in one pass.
 
-They have points without scale or shape: all frames are upright circles of RADIUS_PX, which a warp
-makes ellipses in the image.
+Frames are upright circles of RADIUS_PX in the view, which a warp makes ellipses in the image.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 RADIUS_PX = 12.0
 """Radius of all frames: a sigma of 2 px, within which all three networks find a point again, so
 that a point that warps show again is known as the same."""
-
 MIN_NETWORK_PX = 32  # views are filled up to it: DISK normalises over a sixteenth of it
 
 Found = tuple["Tensor", "Tensor", Callable[["Tensor"], "Tensor"]]
@@ -94,10 +92,7 @@ class LearnedFeatures(FeatureExtractor):
         self.network: Any = load_extractor(key, threshold, path, context.device)
 
     def detect(self, view: View) -> LocalFeatures:
-        """Detect and describe, by falling response; none for views under 8 px.
-
-        The mask chooses among what was found, so that its edge is no feature.
-        """
+        """Detect and describe, by falling response; the mask chooses, its edge is no feature."""
         image, mask = view
         if not is_searchable(image, mask):
             return LocalFeatures.empty(self.descriptor_size)

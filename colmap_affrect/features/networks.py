@@ -1,7 +1,6 @@
 """Networks with their weights, ready for inference, and the patches that they take.
 
-kornia builds the architectures, empty, and nothing is downloaded: a file must have the parameters
-of its network, all of them and no others, in their shapes.
+kornia builds them empty; a file must have all parameters of its network and no others.
 """
 
 import re
@@ -29,7 +28,7 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 def resolve_device(name: str) -> torch.device:
-    """Return the device of ``auto`` (CUDA if there is any, else CPU), ``cpu``, ``cuda:1``, ``mps``.
+    """Return the device of ``auto`` (CUDA if there is any), ``cpu``, ``cuda:1``, ``mps``.
 
     OptionError for another name, DeviceError when the device is not there.
     """
@@ -186,9 +185,8 @@ PATCHES_AT_ONCE = 512  # sampled at once
 class PatchSampler:
     """Patches of local affine frames, sampled from an (H, W) image and its halved versions.
 
-    They are those of ``kornia.feature.extract_patches_from_pyramid``, to rounding, in a quarter of
-    the time on a CPU: the pyramid is built once for all samplings, and positions are computed in
-    pieces that stay in the cache.
+    Those of ``kornia.feature.extract_patches_from_pyramid``, to rounding, in a quarter of the time:
+    the pyramid is built once, and positions are computed in pieces that stay in the cache.
     """
 
     def __init__(self, image: Singles, device: torch.device) -> None:

@@ -49,10 +49,9 @@ class RootSift(FeatureExtractor):
     def detect(self, view: View) -> LocalFeatures:
         """Detect and describe in one pass over the scale space; none for images under 8 px.
 
-        A location with several dominant orientations yields one feature for each: their descriptors
-        differ, and the matcher's second neighbour never lies at the same location, so none of them
-        is lost. Of too many the strongest are kept, by response times sigma; they are returned by
-        falling response.
+        A location with several orientations yields one feature for each: the matcher's second
+        neighbour never lies at the same location, so none is lost. Of too many the strongest by
+        response times sigma are kept; they are returned by falling response.
         """
         image, mask = view
         if not is_searchable(image, mask):
@@ -97,10 +96,7 @@ def is_searchable(image: GrayImage | ColorImage, mask: Bytes | None) -> bool:
 
 
 def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Indices, Array, Singles]:
-    """Sort keypoints by falling response; those of equal response keep their order.
-
-    Returns (N,) indices, (N, 4) x, y, sigma in px and angle in radians, and (N,) responses.
-    """
+    """Return (N,) order, (N, 4) x, y, sigma in px and angle in radians, and (N,) responses."""
     responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
     order = np.argsort(-responses, kind="stable")
     rows = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float64)
@@ -111,12 +107,9 @@ def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Indices, Arr
 def detect_dog(image: GrayImage, options: DogOptions, mask: Bytes | None = None) -> LocalFeatures:
     """Detect DoG keypoints for descriptors that assign orientations themselves.
 
-    OpenCV returns a location once for each of its dominant orientations. With another one put in
-    their place these would be equal features, which no ratio test tells apart; so there is one per
-    centre and scale.
-
-    The (H, W) uint8 mask is 0 where none are wanted. Returns features by falling response, frames
-    upright circles of 6 sigma, descriptors (N, 0); none for images under 8 px.
+    OpenCV returns a location once for each dominant orientation; these would become equal features,
+    so there is one per centre and scale. The (H, W) uint8 mask is 0 where none are wanted. Returns
+    upright circles of 6 sigma by falling response, descriptors (N, 0); none for images under 8 px.
     """
     if not is_searchable(image, mask):
         return LocalFeatures.empty()

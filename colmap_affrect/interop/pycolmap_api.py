@@ -8,7 +8,7 @@ functions go on where an earlier call stopped.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
@@ -48,16 +48,14 @@ Token = pycolmap.CancellationToken | None
 Reports = tuple[StageReport, ...]
 
 
-class Ours(TypedDict, total=False):
-    """Arguments of the functions that match, beside those of pycolmap.
+Choose = Callable[[Context, Any], Iterable[Pair]]  # by pycolmap's pairing options
 
-    ``random_seed`` is that of verification and wins over the one of its options; ``weights_path``
-    is a folder with the weights of networks; ``progress`` says where to show it.
-    """
+ARGUMENTS = """
 
-    random_seed: int | None
-    weights_path: PathLike | None
-    progress: Progress
+    Arguments are those of pycolmap. ``matching_options`` may be ours, by default those of the
+    recipe, of which a dictionary without ``name`` changes some, and ``verification_options`` too.
+    ``random_seed`` is that of verification, ``weights_path`` a folder with weights of networks.
+"""
 
 
 def extract_features(
@@ -105,97 +103,107 @@ def extract_features(
     return report
 
 
-def match_exhaustive(
-    database_path: PathLike,
-    matching_options: GivenMatching = None,
-    pairing_options: pycolmap.ExhaustivePairingOptions | Native = None,
-    verification_options: GivenVerification = None,
-    device: pycolmap.Device | str = "auto",
-    cancellation_token: Token = None,
-    **ours: Unpack[Ours],
-) -> Reports:
-    """Match and verify all pairs of the images that :func:`extract_features` was given.
+def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
+    """Make a function that matches and verifies the pairs that another one chooses."""
 
-    ``matching_options`` are ours, by default those of the recipe, of which a dictionary without
-    ``name`` changes some; of pycolmap's, what to verify and where the work is done.
-    ``verification_options`` are ours, or what differs from pycolmap's defaults. Others are those of
-    pycolmap, and of :class:`Ours`.
-    """
-    translate.changes(pairing_options, pycolmap.ExhaustivePairingOptions, "pairing_options")
-    given = (database_path, matching_options, verification_options, device, cancellation_token)
-    return _match(lambda context: exhaustive_pairs(context.features.names()), *given, **ours)
+    def decorate(choose: Choose) -> Callable[..., Reports]:
+        def matched(
+            database_path: PathLike,
+            matching_options: GivenMatching = None,
+            pairing_options: object = None,
+            verification_options: GivenVerification = None,
+            device: pycolmap.Device | str = "auto",
+            cancellation_token: Token = None,
+            *,
+            random_seed: int | None = None,
+            weights_path: PathLike | None = None,
+            progress: Progress = SILENT,
+        ) -> Reports:
+            translate.changes(pairing_options, kind, "pairing_options")
+            pairing: Any = translate.native(pairing_options, kind, "pairing_options")
+            verification = translate.verification_options(verification_options, random_seed)
+            recorded = Workspace.beside(Path(database_path)).planned("match")
+            matching, asked = translate.matching_options(matching_options, recorded)
+            shown = _Cancellable(progress, cancellation_token)
+            with _context(database_path, device, asked, weights_path, shown) as context:
+                context.workspace.require("extract")
+                write_images_and_keypoints(context)
+                pairs = choose(context, pairing)
+                return _match(context, pairs, matching, verification, asked, cancellation_token)
+
+        matched.__name__ = matched.__qualname__ = choose.__name__
+        matched.__doc__ = (choose.__doc__ or "").rstrip() + ARGUMENTS
+        return matched
+
+    return decorate
 
 
-def match_sequential(
-    database_path: PathLike,
-    matching_options: GivenMatching = None,
-    pairing_options: pycolmap.SequentialPairingOptions | Native = None,
-    verification_options: GivenVerification = None,
-    device: pycolmap.Device | str = "auto",
-    cancellation_token: Token = None,
-    **ours: Unpack[Ours],
-) -> Reports:
-    """Match images that follow each other by name; arguments as in :func:`match_exhaustive`.
+@_matching(pycolmap.ExhaustivePairingOptions)
+def match_exhaustive(context: Context, _: pycolmap.ExhaustivePairingOptions) -> Iterable[Pair]:
+    """Match and verify all pairs of the images that :func:`extract_features` was given."""
+    return exhaustive_pairs(context.features.names())
+
+
+@_matching(pycolmap.SequentialPairingOptions)
+def match_sequential(context: Context, options: pycolmap.SequentialPairingOptions) -> list[Pair]:
+    """Match images that follow each other by name.
 
     With ``loop_detection`` also images that are alike as a whole, which needs no vocabulary tree:
     as many as ``loop_detection_num_images`` of every ``loop_detection_period``th image.
     """
-    kind = pycolmap.SequentialPairingOptions
-    translate.changes(pairing_options, kind, "pairing_options")
-    options = translate.native(pairing_options, kind, "pairing_options")
     num_alike = -(-options.loop_detection_num_images // max(1, options.loop_detection_period))
-    in_order = kind({**options.todict(), "loop_detection": False})
-
-    def choose(context: Context) -> list[Pair]:
-        path = context.workspace.database
-        pairs = generated_pairs(path, pycolmap.SequentialPairGenerator, in_order)
-        if options.loop_detection:
-            names = [name for name, count in context.features.num_keypoints().items() if count]
-            pairs += retrieved_pairs(names, context.features.read, num_alike, context.progress)
-        return pairs
-
-    given = (database_path, matching_options, verification_options, device, cancellation_token)
-    return _match(choose, *given, **ours)
+    in_order = type(options)({**options.todict(), "loop_detection": False})
+    path = context.workspace.database
+    pairs = generated_pairs(path, pycolmap.SequentialPairGenerator, in_order)
+    if options.loop_detection:
+        names = [name for name, count in context.features.num_keypoints().items() if count]
+        pairs += retrieved_pairs(names, context.features.read, num_alike, context.progress)
+    return pairs
 
 
-def match_spatial(
-    database_path: PathLike,
-    matching_options: GivenMatching = None,
-    pairing_options: pycolmap.SpatialPairingOptions | Native = None,
-    verification_options: GivenVerification = None,
-    device: pycolmap.Device | str = "auto",
-    cancellation_token: Token = None,
-    **ours: Unpack[Ours],
-) -> Reports:
-    """Match images taken near to each other; arguments as in :func:`match_exhaustive`.
-
-    Raises DatabaseError when fewer than two images have a position.
-    """
-    options = translate.native(pairing_options, pycolmap.SpatialPairingOptions, "pairing_options")
-    given = (database_path, matching_options, verification_options, device, cancellation_token)
-    return _match(lambda at: spatial_pairs(at.workspace.database, options), *given, **ours)
+@_matching(pycolmap.SpatialPairingOptions)
+def match_spatial(context: Context, options: pycolmap.SpatialPairingOptions) -> list[Pair]:
+    """Match images near to each other; DatabaseError when fewer than two have a position."""
+    return spatial_pairs(context.workspace.database, options)
 
 
-def match_image_pairs(
-    database_path: PathLike,
-    matching_options: GivenMatching = None,
-    pairing_options: pycolmap.ImportedPairingOptions | Native = None,
-    verification_options: GivenVerification = None,
-    device: pycolmap.Device | str = "auto",
-    cancellation_token: Token = None,
-    **ours: Unpack[Ours],
-) -> Reports:
-    """Match and verify the pairs of a list; arguments are those of :func:`match_exhaustive`.
+@_matching(pycolmap.ImportedPairingOptions)
+def match_image_pairs(context: Context, options: pycolmap.ImportedPairingOptions) -> Iterable[Pair]:
+    """Match and verify the pairs of a list, ``match_list_path``, a file of two names per line.
 
-    But ``pairing_options`` are needed, with ``match_list_path``, a file of two names per line.
     Raises PairListError without one, or when it names images without features.
     """
-    asked = translate.changes(pairing_options, pycolmap.ImportedPairingOptions, "pairing_options")
-    if "match_list_path" not in asked:
+    path = translate.given_path(options.match_list_path)
+    if not path:
         raise PairListError("pairing_options: give match_list_path, a file with two names per line")
-    path = Path(asked["match_list_path"])
-    given = (database_path, matching_options, verification_options, device, cancellation_token)
-    return _match(lambda context: read_pairs(path, context.features.names()), *given, **ours)
+    return read_pairs(Path(path), context.features.names())
+
+
+def _match(
+    context: Context,
+    pairs: Iterable[Pair],
+    matching: MatcherOptions | None,
+    verification: VerificationOptions,
+    asked: Mapping[str, Any],
+    token: Token,
+) -> Reports:
+    """Match and verify pairs, and do what pycolmap's options ask for besides."""
+    known = set(context.features.names())
+    pairs = [pair for pair in pairs if known.issuperset(pair)]
+    if asked.get("skip_image_pairs_in_same_frame"):
+        pairs = _of_different_frames(context.workspace.database, pairs)
+    add_pairs(context, pairs)
+    reports = [match(context, matching)]
+    if asked.get("skip_geometric_verification"):
+        return tuple(reports)
+    reports.append(verify_stage.verify_matches(context, verification))
+    if context.extraction.escalation:
+        reports.append(escalate(context))
+    if asked.get("rig_verification"):
+        _verify_rigs(context.workspace.database, verification, token)
+    if asked.get("guided_matching"):
+        reports.append(guide(context, GuidedOptions(enabled="always")))
+    return tuple(reports)
 
 
 def verify_matches(
@@ -231,43 +239,6 @@ def verify(
             listed = read_pairs(Path(pairs_path), list(ids))
             pairs = {(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in listed}
         verify_database(path, verification, advance=advance, pairs=pairs)
-
-
-def _match(
-    choose: Callable[[Context], Iterable[Pair]],
-    database_path: PathLike,
-    matching_options: GivenMatching,
-    verification_options: GivenVerification,
-    device: pycolmap.Device | str,
-    token: Token,
-    **ours: Unpack[Ours],
-) -> Reports:
-    """Match pairs and do what pycolmap's options ask for besides."""
-    if unknown := ours.keys() - Ours.__annotations__.keys():
-        raise TypeError(f"unexpected keyword argument {min(unknown)!r}")
-    verification = translate.verification_options(verification_options, ours.get("random_seed"))
-    recorded = Workspace.beside(Path(database_path)).planned("match")
-    matching, asked = translate.matching_options(matching_options, recorded)
-    shown = _Cancellable(ours.get("progress", SILENT), token)
-    with _context(database_path, device, asked, ours.get("weights_path"), shown) as context:
-        context.workspace.require("extract")
-        write_images_and_keypoints(context)
-        known = set(context.features.names())
-        pairs = [pair for pair in choose(context) if known.issuperset(pair)]
-        if asked.get("skip_image_pairs_in_same_frame"):
-            pairs = _of_different_frames(context.workspace.database, pairs)
-        add_pairs(context, pairs)
-        reports = [match(context, matching)]
-        if asked.get("skip_geometric_verification"):
-            return tuple(reports)
-        reports.append(verify_stage.verify_matches(context, verification))
-        if context.extraction.escalation:
-            reports.append(escalate(context))
-        if asked.get("rig_verification"):
-            _verify_rigs(context.workspace.database, verification, token)
-        if asked.get("guided_matching"):
-            reports.append(guide(context, GuidedOptions(enabled="always")))
-    return tuple(reports)
 
 
 def _of_different_frames(path: Path, pairs: Sequence[Pair]) -> list[Pair]:

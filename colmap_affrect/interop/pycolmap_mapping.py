@@ -1,7 +1,7 @@
 """``incremental_mapping`` with pycolmap's signature, by our mapper; on any verified database."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from itertools import chain, islice, repeat
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
@@ -13,6 +13,8 @@ from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.project.outputs import new_results, temporary_folder
 
+Callback = Callable[[], None] | None
+
 
 def incremental_mapping(
     database_path: PathLike,
@@ -20,8 +22,8 @@ def incremental_mapping(
     output_path: PathLike,
     options: pycolmap.IncrementalPipelineOptions | Native = None,
     input_path: PathLike = "",
-    initial_image_pair_callback: Callable[[], None] | None = None,
-    next_image_callback: Callable[[], None] | None = None,
+    initial_image_pair_callback: Callback = None,
+    next_image_callback: Callback = None,
     cancellation_token: Token = None,
 ) -> dict[int, pycolmap.Reconstruction]:
     """Map any verified database by our mapper and write the models as pycolmap does.
@@ -47,7 +49,7 @@ def incremental_mapping(
             cancellation=cancellation_token,
         )
         extends = existing is not None
-        show = _Callbacks(initial_image_pair_callback, next_image_callback, extends).show
+        show = _calling(initial_image_pair_callback, next_image_callback, extends=extends)
         try:
             map_database(mapper, task, folder / "sparse", show)
         except KeyboardInterrupt as error:
@@ -70,22 +72,20 @@ def _written(found: Path, output: Path, *, extends: bool) -> dict[int, pycolmap.
     return dict(sorted(models.items()))
 
 
-@dataclass
-class _Callbacks:
-    """Calls pycolmap's callbacks for numbers of newly registered images."""
+def _calling(begun: Callback, following: Callback, *, extends: bool) -> Callable[[int], None]:
+    """Return what calls pycolmap's callbacks for a number of newly registered images.
 
-    begun: Callable[[], None] | None
-    following: Callable[[], None] | None
-    extends: bool
-    count: int = 0
+    The first are a pair, or all images of the model that is extended.
+    """
+    calls = chain((begun,), repeat(following))
+    num_shown = 0
 
-    def show(self, number: int) -> None:
-        is_first, rest = not self.count, number
-        self.count += number
-        if is_first:  # of a model that is extended, all images that it has
-            rest = 0 if self.extends else max(0, number - 2)
-            if self.begun:
-                self.begun()
-        if self.following:
-            for _ in range(rest):
-                self.following()
+    def show(number: int) -> None:
+        nonlocal num_shown
+        first = 1 if extends else max(1, number - 1)
+        for call in islice(calls, number if num_shown else first):
+            if call:
+                call()
+        num_shown += number
+
+    return show

@@ -7,16 +7,16 @@ A field that keeps pycolmap's default asks for nothing. One that differs is hono
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.native_options import differences, flat_values
+from colmap_affrect.colmap.native_options import differences, flat_values, resolve
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
-from colmap_affrect.options import CUSTOM, Options, flat, suggestion
+from colmap_affrect.options import CUSTOM, Options, flat
 from colmap_affrect.recipes import ExtractionOptions, Recipe, RecipeOptions, load_recipe
 
 Native = TypeVar("Native")  # an option class of pycolmap
@@ -62,17 +62,10 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
         return given
     if given is not None and not isinstance(given, Mapping):
         raise _not_ours(given, argument, f"pycolmap.{kind.__name__}")
-    known = flat_values(kind())
-    sections = {key.rpartition(".")[0] for key in known}
-    for key in flat(given or {}):
-        if key not in known and key not in sections:
-            raise OptionError(f"{argument}: unknown option '{key}'{suggestion(key, known)}")
-    options: Any = kind()
-    try:
-        options.mergedict(dict(given or {}))
-    except (AttributeError, TypeError, ValueError, RuntimeError) as error:
-        raise OptionError(f"{argument}: {' '.join(str(error).split())}") from error
-    return cast("Native", options)
+    options, usual = kind(), flat_values(kind())
+    values = {k: v for k, v in flat(given or {}).items() if k not in usual or v != usual[k]}
+    resolve(options, values, f"{argument}:", owned={})
+    return options
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:

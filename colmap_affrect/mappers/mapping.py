@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from colmap_affrect.colmap.database import image_ids
-from colmap_affrect.colmap.model_files import SUMMARY, read_model, write_model
+from colmap_affrect.colmap.model_files import SUMMARY, read_given_model, write_model
 from colmap_affrect.mappers.arrivals import arrivals
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import FOCAL_DOUBT, find_doubts, without_impossible
@@ -88,7 +88,7 @@ def read_models(sparse_path: Path, task: MappingTask) -> list[ModelSummary]:
 
 def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
     logger.warning("%s: %s is missing or damaged; the model is judged anew", folder, SUMMARY)
-    return summarize(MappedModel(read_model(folder)), task, is_largest=folder.name == "0")
+    return summarize(MappedModel(read_given_model(folder)), task, is_largest=folder.name == "0")
 
 
 def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> ModelSummary:

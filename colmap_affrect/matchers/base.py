@@ -1,7 +1,7 @@
 """What a matcher is: it finds which features of two images may show the same.
 
-A matcher of another package becomes known by an entry point of the group
-``colmap_affrect.matchers``. Several threads may call the same object at once.
+Entry points are in the group ``colmap_affrect.matchers``. Several threads may call an object at
+once.
 """
 
 from dataclasses import dataclass
@@ -25,11 +25,7 @@ class MatcherOptions(NetworkOptions):
     one such place to another: captions, frames of scans, watermarks."""
 
     def require_extractor(self, extractor: str) -> None:
-        """Raise OptionError for a kind of features that cannot be matched.
-
-        It is :attr:`~colmap_affrect.features.base.FeatureOptions.kind`; an empty one is that of
-        another program, and passes.
-        """
+        """Raise OptionError for a kind of features that cannot be matched; an empty one passes."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +68,7 @@ class Matcher(Protocol):
     """Matches pairs of images; called with its ``Options`` and a :class:`MatcherContext`."""
 
     def prepare(self, image: ImageFeatures) -> Any:
-        """Return what :meth:`match` needs of an image, made once for all of its pairs.
-
-        It has an attribute ``nbytes``, the memory that it takes.
-        """
+        """Return what :meth:`match` needs of an image, with its memory as attribute ``nbytes``."""
 
     def match(self, first: Any, second: Any) -> Matches:
         """Match two prepared images one to one (:class:`Matches`). Either may have no features."""

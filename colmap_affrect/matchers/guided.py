@@ -68,10 +68,7 @@ class GuidableImage:
 
     @property
     def has_directions(self) -> bool:
-        """Whether frames can tell a direction.
-
-        Similarities (COLMAP's SIFT) do, circles do not, nor what warps made of them.
-        """
+        """Whether frames tell a direction: circles do not, nor what warps made of them."""
         return self.shapes is not None and len(self.shapes) > 0 and vary_singly(self.shapes)
 
 
@@ -250,7 +247,7 @@ def frame_angles_deg(
 ) -> Array:
     """Return (M,) angles between the frames of (M, 2) matches and the geometry.
 
-    The sign of all directions that the geometry leaves open is that of most of the matches ``of``.
+    The sign that the geometry leaves open is that of most of the matches ``of``.
     """
     cosines, known = (
         guide.model.cosines(pairs[:, 0], pairs[:, 1], shapes) for pairs in (indices, of)
@@ -268,11 +265,10 @@ def guided_matches(
 ) -> Indices:
     """Return the (M, 2) inliers of a pair and its guided matches, one to one, as (K, 2).
 
-    They rise by features of image 1. All inliers, which the geometry was estimated from, stay.
-    There are no others where the frames of the inliers (without any, of the guided matches) do not
-    agree with the geometry (:data:`MIN_AGREEING`), or where too many are found beside it
-    (:data:`MAX_ACCIDENTAL`). Frames without a direction (:attr:`GuidableImage.has_directions`) are
-    not compared; of these images there are no guided matches without inliers.
+    They rise by features of image 1; all inliers stay. There are no others where the frames do not
+    agree with the geometry (:data:`MIN_AGREEING`), or too many are found beside it
+    (:data:`MAX_ACCIDENTAL`). Frames without a direction are not compared; without inliers these
+    images have no guided matches.
     """
     has_directions = first.has_directions and second.has_directions
     if not (has_directions or len(inliers)):
@@ -289,24 +285,17 @@ def guided_matches(
     if len(trusted) and agrees(guide, trusted).mean() < MIN_AGREEING:
         return inliers
     found = found[agrees(guide, found)]
-    limit = MAX_ACCIDENTAL * len(found)
+    limit, ours = MAX_ACCIDENTAL * len(found), {*map(tuple, found.tolist())}
     for beside in guide.beside():
         accidental = nearest_allowed(first, second, beside, options)
         accidental = accidental[agrees(beside, accidental)]
-        if len(_without(accidental, found)) <= limit:
+        if len({*map(tuple, accidental.tolist())} - ours) <= limit:
             break
     else:
         return inliers
     free = ~(np.isin(found[:, 0], inliers[:, 0]) | np.isin(found[:, 1], inliers[:, 1]))
     both = np.concatenate([inliers, found[free]])
     return np.asarray(both[np.argsort(both[:, 0], kind="stable")])
-
-
-def _without(matches: Indices, others: Indices) -> Indices:
-    """Return the (M, 2) matches that are not among others, in both of which features are unique."""
-    partner = dict(others.tolist())
-    is_other = [partner.get(row) != column for row, column in matches.tolist()]
-    return np.asarray(matches[np.array(is_other, bool)])
 
 
 def nearest_allowed(

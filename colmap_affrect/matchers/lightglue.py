@@ -130,8 +130,8 @@ class PreparedViews:
 class LightGlue:
     """Matches with one network, a pair of views at a time.
 
-    On a CPU each calling thread uses one core, so that results do not depend on their number. A GPU
-    takes one pair at a time; where its memory is full the CPU matches.
+    On a CPU each thread uses one core, so that results do not depend on their number; a GPU takes
+    one pair at a time, and where its memory is full the CPU matches.
     """
 
     Options = LightGlueOptions
@@ -167,10 +167,9 @@ class LightGlue:
         if features.rectification_ids[0]:
             lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
         values = network_inputs(lafs, size, max(image_size), self.options.trained_for)
-        values["descriptors"] = features.descriptors
         return {
             name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
-            for name, array in values.items()
+            for name, array in (*values.items(), ("descriptors", features.descriptors))
         }
 
     def match(self, first: PreparedViews, second: PreparedViews) -> Matches:
@@ -251,9 +250,9 @@ def renamed(name: str) -> str:
 def frames_of_view(lafs: Array, *, has_circles: bool) -> tuple[Array, Array]:
     """Undo the warp of a view, whose frames were carried back into the image.
 
-    Circles became the linear part of the warp; of other frames the mean shape gives it up to a
-    rotation, of which none is assumed. The view is as large as its features reach. Returns (N, 2,
-    3) frames in px of the view, and its (width, height).
+    Circles became the linear part of the warp; other frames give it up to a rotation, of which none
+    is assumed. Returns (N, 2, 3) frames in px of the view, and its (width, height): as far as they
+    reach.
     """
     shapes = of_unit_area(lafs[:, :, :2])
     if has_circles:
@@ -273,9 +272,9 @@ def network_inputs(
 ) -> dict[str, Array]:
     """Return what the network reads of (N, 2, 3) frames in a view of (width, height).
 
-    Positions are pixel-centre px, as in training, and stay inside. Scales are those of images of
-    ``TRAINING_SIZE_PX``, of which only larger ones were shrunk; orientations have the range and
-    the sense of training: COLMAP's of SIFT, else kornia's.
+    Pixel-centre px, as in training. Scales are those of images of ``TRAINING_SIZE_PX``, of which
+    only larger ones were shrunk; orientations have range and sense of training: COLMAP's of SIFT,
+    else kornia's.
     """
     values = {"keypoints": np.clip(lafs[:, :, 2], 0.0, size), "image_size": size}
     if trained_for not in ("sift", "dog-affnet-hardnet"):

@@ -117,10 +117,7 @@ def match_features(
 def _nearest(
     image1: MatchableImage, rows: Indices, image2: MatchableImage, max_ratio: float
 ) -> tuple[Indices, Singles]:
-    """Return nearest features, and the ratios to the nearest non-rivals.
-
-    They may be -1 and infinite where the ratio is ``max_ratio`` or larger.
-    """
+    """Return nearest features and ratios to non-rivals; perhaps -1 and infinite from the limit."""
     queries = image1.descriptors[rows]
     if image1.coarse is None or image2.coarse is None:
         return _nearest_of_all(queries, image2)
@@ -136,10 +133,7 @@ def _nearest(
 def _nearest_of_listed(
     queries: Singles, image: MatchableImage, short: ShortList
 ) -> tuple[Indices, Singles, Bools]:
-    """Return nearest and ratio among the features listed for each row, and where they are doubtful.
-
-    So they are, too, where the second neighbour by coarse similarities is a rival of the nearest.
-    """
+    """Return nearest and ratio among the listed features, and where these are doubtful."""
     similarity = np.empty(len(short.entry_rows), np.float32)
     for begin in range(0, len(similarity), CHUNK_ROWS):
         part = slice(begin, begin + CHUNK_ROWS)

@@ -1,11 +1,9 @@
 """Short lists for the ratio test, by similarities of descriptors in 8 bits.
 
-Few features pass the test. Coarse similarities say which may, and which features may be their two
-nearest neighbours; only these are compared exactly. Six standard deviations of the rounding error
-are allowed for, so that matches are those of exact similarities. A run of ten photographs without
-8-bit products takes 1.7 times the processor time and 1.4 times as long (Sceaux, default recipe).
-
-torch is loaded here, when there is enough to match to pay for that.
+Coarse similarities say which features may pass the test and what their neighbours may be; only
+these are compared exactly. Six standard deviations of the rounding error are allowed for, so that
+matches are those of exact similarities. torch is loaded where there is enough to match to pay for
+that.
 """
 
 import math
@@ -125,10 +123,10 @@ def _is_hidden(
     is_close: Bools,
     rivals: NeighborLists,
 ) -> Bools:
-    """Tell where the second neighbour is not known, for each of R rows.
+    """Return where the second neighbour is not known, for each of R rows.
 
-    A rival of the best may be nearer than it and have the runner-up for a rival, of which the best
-    is none. The second neighbour then may be far less similar than the runner-up.
+    A rival of the best may be nearer than it and have the runner-up, no rival of the best, for a
+    rival; the second neighbour then may be far less similar.
     """
     rows, columns = (indices[is_close] for indices in of_best)
     is_other = columns != best[rows]

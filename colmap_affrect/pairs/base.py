@@ -16,10 +16,7 @@ AT_ONCE = 1 << 16  # pairs that are given names together
 
 
 class PairList(Sequence[Pair]):
-    """Pairs as (N, 2) int32 ``numbers`` of their images in the sorted ``names``.
-
-    All pairs of 5,000 images take 100 MB, as tuples of names they would take many times as much.
-    """
+    """Pairs as (N, 2) int32 ``numbers`` of their images in the sorted ``names``."""
 
     def __init__(self, names: Sequence[str], numbers: NDArray[np.integer]) -> None:
         self.names, self.numbers = names, numbers.astype(np.int32, copy=False).reshape(-1, 2)

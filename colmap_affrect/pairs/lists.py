@@ -44,11 +44,8 @@ def most_similar_pairs(
 ) -> list[Pair]:
     """Choose pairs so that images have ``num_neighbors`` (1 or more) neighbours on average.
 
-    Each image is paired with half as many that are most similar to it. The rest goes to the pairs
-    that are the most similar of all: of some places there are many photographs, of others few. So
-    the sorted pairs are ``num_neighbors * N / 2``, or more if the nearest of each image are more.
-    ``similarities`` has for each of N images its (N,) similarities with all, larger is more
-    similar.
+    Each image is paired with half as many that are most similar to it; the rest goes to the most
+    similar pairs of all. ``similarities`` has for each of N images its (N,) similarities with all.
     """
     half, count = -(-num_neighbors // 2), len(names)
     candidates = [
@@ -121,10 +118,9 @@ def _breadth_first(pairs: PairList) -> NDArray[np.int32]:
 def read_pairs(path: Path, names: Sequence[str]) -> PairList:
     """Read a pair list as COLMAP and hloc write it: two names per line.
 
-    Names may be separated by spaces, a tab or a comma, and may contain spaces. Empty lines and
-    lines that begin with # are skipped; pairs given twice, in either order, count once; pairs of an
-    image with itself are dropped. The pairs are sorted. Raises OptionError when there is no
-    such file, PairListError when it is unreadable or a name is not among ``names``.
+    Separated by spaces, a tab or a comma; names may contain spaces. Empty lines and lines with #
+    are skipped, repeated pairs count once, in either order. The pairs are sorted. OptionError when
+    there is no such file, PairListError when it is unreadable or a name is not among ``names``.
     """
     ordered = sorted(set(names))
     number = {name: index for index, name in enumerate(ordered)}
@@ -165,10 +161,7 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
 
 
 def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) -> None:
-    """Write 'name1 name2' lines; with a tab where a name contains white space.
-
-    With the names of the images the pairs may be an iterator, of which none is kept.
-    """
+    """Write 'name1 name2' lines, with tabs if a name has white space; names for an iterator."""
     if not names:
         pairs = list(pairs)
         names = {name for pair in pairs for name in pair}

@@ -1,10 +1,8 @@
 """Which images show the same: by one vector per image (VLAD), or by their strongest features.
 
-The vocabulary is built from descriptors of the images themselves. An image is described by the sums
-of the differences between its descriptors and their nearest words (Jegou et al., Aggregating local
-descriptors into a compact image representation, 2010), each sum of unit length and damped by square
-roots, so that neither repeated structures nor single words decide (Arandjelovic and Zisserman, All
-about VLAD, 2013). What all images have in common is subtracted.
+The vocabulary is of descriptors of the images themselves. An image is the sums of differences of
+its descriptors to their nearest words (Jegou et al. 2010), each of unit length and damped by square
+roots (Arandjelovic and Zisserman 2013), less what all images have in common.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -87,10 +85,7 @@ def retrieved_pairs(
     num_neighbors: int,
     progress: Progress,
 ) -> list[Pair]:
-    """Return pairs of images that are alike as a whole, of so many neighbours on average.
-
-    None if all features are those of warps, which are not looked at.
-    """
+    """Return pairs of images that are alike as a whole; none if all features are of warps."""
     random = np.random.default_rng(0)
     sampled = random.permutation(len(names))[:NUM_SAMPLED_IMAGES]
     num_each = -(-NUM_SAMPLES // max(1, len(sampled)))

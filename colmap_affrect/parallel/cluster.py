@@ -62,8 +62,9 @@ class WorkerEnvironment:
             tuple((path, _size(Path(path))) for path in paths),
         )
 
-    def require_same(self, worker: WorkerEnvironment) -> None:
-        """Refuse a worker that would give other results: ClusterError with the first reason."""
+    def require_here(self) -> None:
+        """Refuse a worker, where this is called, that would give other results: ClusterError."""
+        worker = self.of([path for path, _ in self.files])
         for (name, here), (_, there) in zip(self.versions, worker.versions, strict=True):
             if here != there:
                 raise ClusterError(
@@ -107,8 +108,7 @@ _loading = threading.Lock()
 @lru_cache(maxsize=1)
 def _function(job: _Job) -> Callable[[Any], Any]:
     """Unpickle a function once per process; the next one replaces it and frees its memory."""
-    paths = [path for path, _ in job.environment.files]
-    job.environment.require_same(WorkerEnvironment.of(paths))
+    job.environment.require_here()
     threadpool_limits(1, user_api="blas")
     cv2.setNumThreads(1)
     function: Callable[[Any], Any] = pickle.loads(job.function)  # noqa: S301 - from the driver
@@ -216,7 +216,7 @@ class Cluster:
         here = WorkerEnvironment.of([])
         try:
             self._client.run_on_scheduler(WorkerEnvironment.of, [])  # which unpickles tasks
-            workers = list(self._client.run(WorkerEnvironment.of, []).values())
+            workers = self._client.run(here.require_here)
         except (ModuleNotFoundError, AttributeError) as error:
             raise self._not_installed(error) from error
         if not workers:
@@ -224,8 +224,6 @@ class Cluster:
                 f"{self._address}: the cluster has no workers; start some, with 'dask worker "
                 f"{self._address}' on each machine"
             )
-        for worker in workers:
-            here.require_same(worker)
 
     def _not_installed(self, error: Exception) -> ClusterError:
         return ClusterError(

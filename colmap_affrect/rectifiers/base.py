@@ -1,7 +1,6 @@
 """What a rectifier is: it decides which warps of a photograph to look at.
 
-A rectifier of another package becomes known by an entry point of the group
-``colmap_affrect.rectifiers``. Several threads may call the same object at once.
+Entry points are in the group ``colmap_affrect.rectifiers``. Several threads may call an object.
 """
 
 from dataclasses import dataclass
@@ -11,7 +10,6 @@ import numpy as np
 from pydantic import BeforeValidator, SerializeAsAny
 
 from colmap_affrect.data import Photograph, RectificationPlan
-from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import SHAPES, ShapeOptions, ShapeSource
 from colmap_affrect.features.second_moment import SecondMomentOptions
 from colmap_affrect.geometry.arrays import Floats
@@ -81,20 +79,10 @@ class CoverOptions(AffineWarpOptions):
 class WithInputs:
     """Base of our rectifiers: what their options ask for is there, as ``shapes`` and ``depth``."""
 
-    shapes: ShapeSource
-    depth: DepthSource
-
     def __init__(self, options: Any, inputs: RectifierInputs) -> None:
-        """Keep options and inputs; OptionError when an input is missing."""
         self.options = options
-        if isinstance(options, CoverOptions):
-            if inputs.shapes is None:
-                raise OptionError("the rectifier needs affine shapes: name a shape_source")
-            self.shapes = inputs.shapes
-        if options.uses_depth:
-            if inputs.depth is None:
-                raise OptionError("the rectifier needs depth maps: give a folder or a network")
-            self.depth = inputs.depth
+        self.shapes: Any = inputs.shapes
+        self.depth: Any = inputs.depth
 
 
 RECTIFIERS: Registry[Rectifier] = Registry(

@@ -40,10 +40,7 @@ class DenseShapes(WithInputs):
 def plan_dense_shapes(
     grid: ShapeGrid, image_size: tuple[int, int], options: DenseShapesOptions
 ) -> RectificationPlan:
-    """Turn a grid of shapes into disjoint regions with one affine warp each.
-
-    Blocks that are not textured count as identity; ``image_size`` is (width, height) in px.
-    """
+    """Turn a grid of shapes into disjoint regions of an image of (width, height), one warp each."""
     votes = grid.textured.ravel().astype(np.float64)
     cover = options.cover(grid.metrics.reshape(-1, 3), votes)
     labels = cover.labels.reshape(grid.textured.shape)

@@ -94,13 +94,11 @@ def planar_segments(
 ) -> list[PlanarSegment]:
     """Segment a photograph into connected parts of planes.
 
-    A pixel belongs to a plane if its normal is nearest to that of the plane and near enough, and if
-    it sees the plane at no more than ``max_angle_deg``, the angle between the plane's normal and
-    the pixel's ray. (The authors compare the normal with the optical axis, and leave out or keep a
-    plane as a whole.) In the view from the front an area grows by 1 / cos^3 of that angle, so the
-    far end of a plane, where the view would explode, is left out.
-
-    ``depth`` is (h, w) z-depth of the whole photograph, of any resolution; NaN where unknown.
+    A pixel belongs to the plane whose normal is nearest, if near enough, and if it sees it at no
+    more than ``max_angle_deg``, the angle between normal and ray. (The authors take the optical
+    axis, and keep a plane as a whole.) From the front an area grows by 1 / cos^3 of it, so far ends
+    are left out. ``depth`` is (h, w) z-depth of the whole photograph, of any resolution; NaN where
+    unknown.
     """
     size_of_depth = (depth.shape[1], depth.shape[0])
     depth, shrunk_from_depth = shrink_depth(depth, MAX_DEPTH_SIZE_PX)

@@ -86,8 +86,7 @@ def _usable(
 ) -> Mask:
     """Return which features, frames in image px, belong to their part of the image.
 
-    Those of a warp must have their measurement region inside the image: what lies outside
-    is invented by the warp.
+    Measurement regions of a warp's must be inside: what lies outside is invented by the warp.
     """
     if rectification is None:
         if plan.original_region is None:
@@ -113,10 +112,9 @@ def _keep_strongest(keep: list[Mask], features: list[LocalFeatures], limit: int)
 def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
     """Return which features of the image itself a warp shows at the same place and scale.
 
-    Same means centres within half a sigma and scales within ``SAME_SCALE_RATIO`` in the
-    image, whatever the orientation. The region of a warp holds just those pixels whose shape
-    is nearer to its class than to the identity, so of the two the residual tilt of the
-    rectified feature is the smaller one, and the one to keep.
+    Centres are within half a sigma and scales within ``SAME_SCALE_RATIO``, whatever the
+    orientation. Of the two the residual tilt of the rectified one is smaller, in its region, and
+    that stays.
     """
     scales1, scales2 = original.scales, rectified.scales
     radius = DUPLICATE_RADIUS_SIGMAS / MEASUREMENT_SIGMAS * scales1

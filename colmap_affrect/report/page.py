@@ -24,12 +24,11 @@ FOLDERS = re.compile(r"(?<![^\s'\"(=\[])(?:[A-Za-z]:[\\/]|~?/)(?:[^/\\\s'\"]+[/\
 def write_page(
     path: Path, template: Path, content: Mapping[str, Any], folders: Iterable[Path] = ()
 ) -> Path:
-    """Fill a template and write it as one file that loads nothing; return its path.
+    """Fill a template, write it as one file that loads nothing, and return its path.
 
-    The template extends ``base.html`` and may use the macros of ``parts.html``, which say what they
-    look for in the content; ``script_data`` of the content is for ``page.js``. No folder of this
-    machine is in the page, ``folders`` in particular, since pages are sent to others. Raises
-    WorkspaceError when it cannot be written.
+    The template extends ``base.html`` and may use ``parts.html``; ``script_data`` of the content is
+    for ``page.js``. No folder of this machine is in the page, ``folders`` in particular, since
+    pages are sent to others. Raises WorkspaceError when it cannot be written.
     """
     known = [f"{place}{os.sep}" for folder in folders for place in (folder, folder.parent)]
     hidden = sorted(known, key=len, reverse=True)

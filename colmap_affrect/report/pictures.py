@@ -18,11 +18,7 @@ MAX_NUM_THUMBNAILS = 1000
 
 
 def thumbnail_size_px(count: int) -> int:
-    """Return the longer side of so many thumbnails, with which a page stays below some MB.
-
-    >>> thumbnail_size_px(9), thumbnail_size_px(300), thumbnail_size_px(1000)
-    (640, 230, 126)
-    """
+    """Return the longer side of so many thumbnails, with which a page stays below some MB."""
     return int(min(MAX_SIDE_PX, (4 / 3 * MAX_TOTAL_PX / max(1, count)) ** 0.5))
 
 
@@ -50,10 +46,7 @@ def base64_text(data: bytes) -> str:
 def thumbnails(
     folder: Path, names: Sequence[str], progress: Progress = SILENT
 ) -> dict[str, Picture]:
-    """Read photographs as stored for a page; unreadable ones are left out.
-
-    They are shrunk so that a page of hundreds is as large as one of some.
-    """
+    """Read photographs as stored, shrunk for a page of that many; unreadable ones are left out."""
     size_px, shown = thumbnail_size_px(len(names)), names[:MAX_NUM_THUMBNAILS]
 
     def picture(name: str) -> Picture | None:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from colmap_affrect.errors import such_as
-from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport, by_story
@@ -25,7 +24,6 @@ KINDS = {
     "doubtful": "doubtful",
 }
 """How cameras came in; each has a colour of this name."""
-
 FILTERS = {
     "all": "All", "missing": "Missing", "doubtful": "Doubtful", "added": "New",
     "guided": "Guided", "bridged": "Bridged",
@@ -58,10 +56,10 @@ def write_run_page(
     image_path: Path | None,
     progress: Progress = SILENT,
 ) -> Path:
-    """Write ``report.html`` into the folder of a run, one file that loads nothing.
+    """Write ``report.html`` of a run, one file that loads nothing; WorkspaceError if it cannot.
 
-    ``names`` are those of all photographs, ``image_path`` their folder, None where it is not known;
-    ``pair_inliers`` are of the verified pairs. Raises WorkspaceError when it cannot be written.
+    ``names`` are those of all photographs, ``image_path`` their folder, if known; ``pair_inliers``
+    are of the verified pairs.
     """
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
     cards = [_fate(number, name, report, model) for number, name in enumerate(names, 1)]
@@ -90,10 +88,7 @@ def write_run_page(
         "layout": layout,
         "edges": view_graph.edge_paths(names, layout, pair_inliers),
         "matrix": matrix,
-        "guided": _guided(report),
         **_cameras(report, index),
-        "stages": _stages(report),
-        "settings": _settings(report),
         "script_data": {
             "matrices": [matrix],
             "views": [view.script_data(index, {card.name: card.kind for card in cards})],
@@ -153,7 +148,6 @@ def _why_no_model(report: ReconstructionReport) -> list[str]:
 
 
 def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
-    """Return the numbers that are read first."""
     tiles = {
         "photographs in the model": f"{len(model.registered_names)} of {report.images_total}",
         "verified pairs": f"{report.num_verified_pairs:,} of {report.num_pairs:,}",
@@ -168,14 +162,6 @@ def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
         tiles["models"] = str(len(report.models))
     seconds = sum(stage.wall_s for stage in report.stages)
     return tiles | {"seconds": f"{seconds:,.1f}".removesuffix(".0")}
-
-
-def _guided(report: ReconstructionReport) -> str:
-    if not report.guided:
-        return ""
-    pairs, before, after = (report.guided[k] for k in ("pairs", "matches_before", "matches_after"))
-    taken = f"{pairs} pair{'s' if pairs != 1 else ''}"
-    return f"Guided matching took {taken} from {before:,} to {after:,} inliers."
 
 
 def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
@@ -198,22 +184,3 @@ def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str
     if total > len(rows):
         note += f" The first {len(rows)} are listed, report.json has all."
     return {"cameras": rows, "camera_note": note}
-
-
-def _stages(report: ReconstructionReport) -> list[dict[str, Any]]:
-    longest = max((stage.wall_s for stage in report.stages), default=0.0) or 1.0
-    return [
-        {"label": stage.name, "shares": [stage.wall_s / longest], "text": f"{stage.wall_s:.1f}"}
-        for stage in report.stages
-    ]
-
-
-def _settings(report: ReconstructionReport) -> dict[str, Mapping[str, Any]]:
-    settings = {
-        "Two-view geometry": flat(report.verification),
-        "Mapping": flat(report.mapping),
-        "What differs from COLMAP's defaults": flat(report.differs_from_colmap),
-        "Verified pairs by level of the recipe": report.pair_levels,
-        "Versions": report.versions,
-    }
-    return {title: values for title, values in settings.items() if values}

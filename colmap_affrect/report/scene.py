@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import read_model
+from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.report.pictures import base64_text
@@ -35,11 +35,7 @@ class View3D:
     note: str = ""  # what is special about it; empty if nothing is
 
     def script_data(self, index: Mapping[str, int], kinds: Mapping[str, str]) -> dict[str, Any]:
-        """Return what the script of the page reads.
-
-        ``index`` is that of the photographs on the page, ``kinds`` the names of the colours that
-        the style has for their cameras.
-        """
+        """Return what the page's script reads; ``kinds`` are names of colours by photograph."""
         cameras = [
             {
                 "index": index[name],
@@ -53,16 +49,13 @@ class View3D:
 
 
 def read_scene(paths: Mapping[str, Path | None]) -> list[View3D]:
-    """Read models, bring them into the frame of the largest, and prepare them for the page.
-
-    ``paths`` are the folders by the names that the page has for the models; None for no model.
-    """
+    """Read models (None: no model) by name, and bring them into the frame of the largest."""
     models: dict[str, pycolmap.Reconstruction] = {}
     notes = {name: "There is no model." for name, path in paths.items() if path is None}
     for name, path in paths.items():
         try:
             if path is not None:
-                models[name] = read_model(path)
+                models[name] = read_given_model(path)
         except AffrectError as error:
             notes[name] = f"The model cannot be shown: {error}"
     if models:
@@ -93,10 +86,7 @@ def _bring_into_one_frame(models: Mapping[str, pycolmap.Reconstruction]) -> dict
 
 
 def _turn_upright(model: pycolmap.Reconstruction) -> None:
-    """Turn a model so that z is up, as cameras are held on average, and y is where they look.
-
-    The middle of cameras and points goes to the origin, and the radius of the view becomes 1.
-    """
+    """Turn z up, as cameras are held on average, and y where they look; radius 1 about 0."""
     axes, centers = _poses(model)
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     up = -axes[:, :, 1].mean(axis=0)

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,14 +18,15 @@ from colmap_affrect.data import (
 from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.project.atomic_files import replace_bytes
-from colmap_affrect.report.levels import InspectedLevel, summary
+
+if TYPE_CHECKING:
+    from colmap_affrect.report.inspection import InspectedLevel
 
 Color = tuple[int, int, int]
 Marks = dict[tuple[float, float], str]  # text by place, px
 
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#882255")
 """Okabe and Ito's colours for all kinds of colour vision, and one of Paul Tol's."""
-
 TINT = 0.45  # share of the colour over a region
 WIDTH_PX, PANELS_PER_ROW, WARPS_PER_ROW, MAX_NUM_WARPS = 1596, 2, 6, 24
 TITLE_PX, MARGIN_PX = 24, 4
@@ -35,8 +37,8 @@ UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
 DARK: Color = (85, 85, 85)
 
 
-def draw_sheet(level: InspectedLevel, path: Path) -> None:
-    """Draw one level and write it as PNG.
+def draw_sheet(level: "InspectedLevel", summary: str, path: Path) -> None:
+    """Draw one level under its summary, and write it as PNG.
 
     Above the photograph with the regions and their warps in one colour each, beside it its
     features; below the largest warps with theirs.
@@ -48,14 +50,12 @@ def draw_sheet(level: InspectedLevel, path: Path) -> None:
     for first in range(0, len(warps), WARPS_PER_ROW):
         rows.append(_row(warps[first : first + WARPS_PER_ROW], WARPS_PER_ROW))
     title = np.full((TITLE_PX, WIDTH_PX, 3), 255, np.uint8)
-    width, height = level.photograph.size
-    which = f"level {level.number}: {level.rectifier}, {level.extractor}, {width} x {height} px"
-    _write(title, f"{which}; {summary(level)}", (MARGIN_PX, TITLE_PX - 8))
+    _write(title, summary, (MARGIN_PX, TITLE_PX - 8))
     _, data = cv2.imencode(".png", np.concatenate([title, *rows])[:, :, ::-1])
     replace_bytes(path, data.tobytes())
 
 
-def _regions(level: InspectedLevel) -> tuple[ColorImage, str]:
+def _regions(level: "InspectedLevel") -> tuple[ColorImage, str]:
     image = tinted(level.photograph, level.plan)
     if level.photograph.mask is not None:
         image[~level.photograph.mask] //= 3
@@ -71,7 +71,7 @@ def _regions(level: InspectedLevel) -> tuple[ColorImage, str]:
     return _panel(image, PANELS_PER_ROW, marks=marks), title
 
 
-def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImage, str]:
+def _features(level: "InspectedLevel", colors: Sequence[Color]) -> tuple[ColorImage, str]:
     features = level.features
     palette = [DARK, *colors]
     drawn = [palette[number] for number in features.rectification_ids.tolist()]
@@ -81,7 +81,7 @@ def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImag
     return image, f"the strongest {shown} of {len(features)} features; gray: without a warp"
 
 
-def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, str]:
+def _warp(level: "InspectedLevel", index: int, color: Color) -> tuple[ColorImage, str]:
     item = level.plan.items[index]
     found, kept = level.found[index + 1], level.kept_of(index + 1)
     image, mask = level.views[index + 1]
@@ -105,8 +105,9 @@ def _panel(
     side, height, width = WIDTH_PX // per_row - MARGIN_PX, *image.shape[:2]
     scale = side / max(width, height)
     size = max(1, round(scale * width)), max(1, round(scale * height))
-    panel = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    panel = np.array(np.broadcast_to(panel.reshape(*size[::-1], -1), (*size[::-1], 3)))
+    shrunk = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    panel: ColorImage = np.empty((*size[::-1], 3), np.uint8)
+    panel[:] = shrunk.reshape(*size[::-1], -1)
     panel_from_image = resized_from_original((width, height), size)
     if features is not None:
         order = np.argsort(-features.responses, kind="stable")[:max_num]
@@ -122,7 +123,6 @@ def _panel(
 
 
 def _row(panels: Sequence[tuple[ColorImage, str]], per_row: int) -> ColorImage:
-    """Put panels beside each other, each below its title."""
     height = max(len(panel) for panel, _ in panels) + TITLE_PX
     row = np.full((height, WIDTH_PX, 3), 255, np.uint8)
     for place, (panel, title) in enumerate(panels):
@@ -141,11 +141,7 @@ def _write(image: ColorImage, text: str, place: tuple[int, int]) -> None:
 
 
 def warp_colors(plan: RectificationPlan) -> list[Color]:
-    """Choose a colour for each warp of a plan.
-
-    Warps of one segment, or of one class that shows the whole image, have the same; where these are
-    more than the palette has, it begins anew.
-    """
+    """Choose colours, the same for warps of one segment or of one class of the whole image."""
     keys = [
         (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
         for item in plan.items

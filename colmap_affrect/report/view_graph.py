@@ -14,38 +14,27 @@ from colmap_affrect.report.pictures import base64_text
 CLASS_STARTS = (1, 30, 60, 120, 240, 480)  # smallest number of inliers of each class
 CLASS_COLORS = ("#e3b341", "#f08c3c", "#e2604f", "#cf4080", "#a14bb5", "#6f60dd")
 """Of few to many inliers; all stand out from white and from nearly black."""
-
 CLASS_WIDTHS = (1.2, 2.0, 3.0, 4.2, 5.6, 7.2)  # of the edges, in units of the graph
 GRAPH_SIZE = (640.0, 620.0)
 MAX_NUM_THUMBNAILS = 60  # with more photographs the nodes are dots
 MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
 """With more photographs the nodes are on a circle; and there is no matrix."""
-
 MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0  # sides of nodes in units of the graph
 EDGE = 3.0  # free edge of a graph, in which frames of nodes are
 SPACING = 1.6  # of nodes that are thumbnails, in their sides: edges show between them
 MIDDLE, GRAVITY = "", 0.1
 """A node and the weight of its edges to all others: they hold parts of the graph
 together that have no edge between them."""
-
 MAX_NUM_EDGES = 4000
 
 
 def inlier_class(num_inliers: int) -> int:
-    """Return the class of a number of inliers.
-
-    >>> [inlier_class(count) for count in (1, 29, 30, 10_000)]
-    [0, 0, 1, 5]
-    """
+    """Return the class of a number of inliers."""
     return sum(num_inliers >= start for start in CLASS_STARTS) - 1
 
 
 def class_labels() -> list[str]:
-    """Return the range of each class.
-
-    >>> class_labels()[0], class_labels()[-1]
-    ('1-29', '480 or more')
-    """
+    """Return the range of each class, as "1-29"."""
     ends = [f"-{start - 1}" for start in CLASS_STARTS[1:]]
     return [f"{start}{end}" for start, end in zip(CLASS_STARTS, [*ends, " or more"], strict=True)]
 

@@ -25,17 +25,11 @@ AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 @dataclass(frozen=True)
 class Resources:
-    """What is needed from outside and does not change results.
+    """What is needed from outside and does not change results."""
 
-    Attributes:
-        weights_path: folder with the weights of networks; None searches the usual places.
-        device: ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``; of networks and of matching.
-        depth_cache_path: folder that keeps the depth maps of a network; None keeps none.
-    """
-
-    weights_path: Path | None = None
-    device: str = "auto"
-    depth_cache_path: Path | None = None
+    weights_path: Path | None = None  # folder with the weights of networks; None: the usual places
+    device: str = "auto"  # of networks and of matching: auto, cpu, cuda, cuda:1, mps
+    depth_cache_path: Path | None = None  # folder that keeps the depth maps of a network, if any
 
     def require_device(self, *, uses_network: bool = False) -> str:
         """Return the device, if it is there; torch is loaded only to ask for one or use it."""

@@ -9,8 +9,7 @@ from colmap_affrect.colmap.checks import FATAL, refuse_unusable
 from colmap_affrect.colmap.database_copy import add_frames, copy_database
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.errors import DatabaseError, OptionError, such_as
-from colmap_affrect.images.headers import header_size
+from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
@@ -53,7 +52,6 @@ def copy_verified(
         workspace.record_made_from("copy", digest)
     if not workspace.database.exists():
         copy_database(source, workspace.database, FATAL, add_frames)
-    warnings |= _other_sizes(workspace.database, image_path) if image_path else {}
     for name, what in warnings.items():
         logger.warning("%s: %s", name, what)
     record_cameras(workspace.database, workspace.cameras)
@@ -68,14 +66,3 @@ def copy_verified(
         verify(workspace.database, verification, advance=advance)
     wall_s = time.perf_counter() - start
     return StageReport("verify", wall_s, todo, num_pairs - todo, warnings=warnings)
-
-
-def _other_sizes(database: Path, image_path: Path) -> dict[str, str]:
-    """Return which photographs cannot be those that a database was made from."""
-    cameras = colmap_database.read_cameras(database)
-    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
-    odd = [n for n, size in sizes.items() if header_size(image_path / n) not in (None, size)]
-    if not odd:
-        return {}
-    line = f"{len(odd)} photographs have another size than their cameras, such as {such_as(odd)}"
-    return {str(image_path): f"{line}: the database was made from others"}

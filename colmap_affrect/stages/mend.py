@@ -45,21 +45,13 @@ RIGS = ("rigs", "rig_sensors", "frames", "frame_data")
 
 @dataclass(frozen=True)
 class Edits:
-    """What others have changed in a database.
+    """What others have changed in a database."""
 
-    Attributes:
-        lost: why it must be made again, empty if it need not be.
-        changed_pairs: what of matches and geometries was changed, empty if nothing was.
-        deleted: ids and names of pairs that were deleted.
-        cameras: ids of cameras whose intrinsics were changed.
-        others: what else was changed and is kept.
-    """
-
-    lost: tuple[str, ...] = ()
-    changed_pairs: tuple[str, ...] = ()
-    deleted: dict[int, Pair] = field(default_factory=dict)
-    cameras: tuple[int, ...] = ()
-    others: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()  # why it must be made again, empty if it need not be
+    changed_pairs: tuple[str, ...] = ()  # what of matches and geometries was changed
+    deleted: dict[int, Pair] = field(default_factory=dict)  # ids and names of pairs
+    cameras: tuple[int, ...] = ()  # ids of those whose intrinsics were changed
+    others: tuple[str, ...] = ()  # what else was changed and is kept
 
     @property
     def kept(self) -> str:
@@ -170,11 +162,9 @@ def mend(context: Context, *, follows: bool) -> None:
     begun, is_copied = workspace.begun, workspace.is_copy
     if not begun or not (path.exists() or "verify" in begun):
         return
-    edits, is_sealed = edits_of(path), has_seal(path)
-    if edits and not str(edits) and not (is_copied or is_sealed):
-        edits = Edits(_unlike_features(context))
+    edits = edits_of(path)
     if not edits or not str(edits):
-        if edits and is_sealed:
+        if edits and has_seal(path):
             keep_seal(path)
         return
     if not is_copied:
@@ -191,20 +181,6 @@ def mend(context: Context, *, follows: bool) -> None:
             database.delete_matches(*images)
             database.delete_two_view_geometry(*images)
     _keep_cameras(workspace, edits.cameras)
-
-
-def _unlike_features(context: Context) -> tuple[str, ...]:
-    """Return which images are not those of the features, where a killed run has left no seal."""
-    with open_read_only(context.workspace.database) as connection:
-        tables = read_tables(connection)
-    sizes, found = context.features.image_sizes(), list[str]()
-    for image_id, name in tables.names.items():
-        camera = tables.cameras[tables.camera_ids[image_id]]
-        if name not in sizes and not context.workspace.require("extract")["from_database"]:
-            found.append(f"images: {name} has no features")
-        elif sizes.get(name, (camera.width, camera.height)) != (camera.width, camera.height):
-            found.append(f"cameras: that of {name} has another size")
-    return tuple(found[:1])
 
 
 def _make_again(context: Context, why: str, begun: Sequence[str], *, follows: bool) -> None:

@@ -29,11 +29,11 @@ from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.images.reading import decode, in_eight_bits, read_color, shrink_to, tones
 from colmap_affrect.parallel.executor import (
+    SHARED_OPENCV_THREADS,
     available_cores,
     available_memory_bytes,
     unless_gpu_is_full,
 )
-from colmap_affrect.parallel.opencv_threads import SHARED_OPENCV_THREADS
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions, Level
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
@@ -46,20 +46,12 @@ MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
 
 @dataclass(frozen=True)
 class ExtractedImage:
-    """Features of one image file.
+    """Features of one image file."""
 
-    Attributes:
-        features: frames in px of the stored image.
-        image_size: (width, height) of the stored image in px.
-        warning: why it was not rectified though it was to be, or not on the GPU; empty if all
-            went well.
-        stretched: whether its contrast was low and was stretched.
-    """
-
-    features: LocalFeatures
-    image_size: tuple[int, int]
-    warning: str = ""
-    stretched: bool = False
+    features: LocalFeatures  # frames in px of the stored image
+    image_size: tuple[int, int]  # (width, height) of the stored image in px
+    warning: str = ""  # why it was not rectified or not on the GPU; empty if all went well
+    stretched: bool = False  # whether its contrast was low and was stretched
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
 
 
 def listed_pairs(context: Context) -> PairList:
-    """Return the pairs of the list whose images have features."""
+    """Return the pairs of the list whose images have features, but for deleted ones."""
     context.workspace.require("pairs")
     if not context.workspace.pairs.exists():
         raise PairListError(
@@ -163,15 +163,9 @@ def listed_pairs(context: Context) -> PairList:
         )
     names = context.features.names()
     pairs = read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())
-    return without_deleted(context.workspace, pairs)
-
-
-def without_deleted(workspace: Workspace, pairs: PairList) -> PairList:
-    """Leave out the pairs that somebody has deleted in the database."""
-    deleted = deleted_pairs(workspace)
-    if not deleted:
-        return pairs
-    return pairs.at(np.array([frozenset(pair) not in deleted for pair in pairs], np.bool_))
+    if deleted := deleted_pairs(context.workspace):
+        return pairs.at(np.array([frozenset(pair) not in deleted for pair in pairs], np.bool_))
+    return pairs
 
 
 def deleted_pairs(workspace: Workspace) -> set[frozenset[str]]:

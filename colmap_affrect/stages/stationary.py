@@ -7,9 +7,8 @@ camera that does not move, and may be more than those of the scene.
 import logging
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
-from typing import Self
 
 import numpy as np
 
@@ -33,30 +32,6 @@ MAX_SHARE_BESIDE = 0.2
 are so few: one in 25 of the scene's goes with them then, and of a watermark all over, all would."""
 
 Size = tuple[int, int]
-
-
-@dataclass
-class _Evidence:
-    """What the pairs of photographs of one size say, by cell: numbers of pairs, and images."""
-
-    matched: Indices
-    still: Indices
-    images: defaultdict[tuple[int, int], set[str]] = field(default_factory=lambda: defaultdict(set))
-
-    @classmethod
-    def empty(cls, size: Size) -> Self:
-        width, height = _cells(np.array([size], np.float64) - 1.0, size)[0] + 1
-        return cls(np.zeros((height, width), np.int64), np.zeros((height, width), np.int64))
-
-    def places(self) -> Mask:
-        """Return the cells that nothing moves in."""
-        found = (self.still >= MIN_NUM_PAIRS) & (self.still >= MIN_SHARE * self.matched)
-        for row, column in np.argwhere(found):
-            found[row, column] = len(self.images[column, row]) >= MIN_NUM_IMAGES
-        num_matched = np.count_nonzero(self.matched >= MIN_NUM_PAIRS)
-        if np.count_nonzero(found) > MAX_SHARE_OF_PHOTOGRAPH * num_matched:
-            return np.zeros_like(found)
-        return found
 
 
 class StationaryFilter:
@@ -125,18 +100,25 @@ class StationaryFilter:
         )
 
     def _find(self, pairs: Sequence[Pair]) -> dict[Size, Indices]:
-        """Return the (N, 2) cells, column and row, of each size of photographs."""
-        evidence: dict[Size, _Evidence] = {}
-        alike = [pair for pair in pairs if self._common_size(pair)]
-        for found in self._matches.read(alike):
+        """Return the (N, 2) cells, column and row, in which nothing moves, by size."""
+        numbers = {name: number for number, name in enumerate(self._sizes)}
+        cells = NUM_CELLS, NUM_CELLS
+        # By size and cell: numbers of pairs with a match, and with one that does not move; images.
+        matched: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
+        still: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
+        images: dict[Size, Mask] = defaultdict(lambda: np.zeros((*cells, len(numbers)), bool))
+        for found in self._matches.read([pair for pair in pairs if self._common_size(pair)]):
             size = self._sizes[found.names[0]]
-            of_size = evidence.setdefault(size, _Evidence.empty(size))
-            still, cells, _ = self._still(found.names, found.indices, size)
-            of_size.matched[tuple(np.unique(cells, axis=0).T[::-1])] += 1
-            for column, row in np.unique(cells[still], axis=0).tolist():
-                of_size.still[row, column] += 1
-                of_size.images[column, row].update(found.names)
-        return {size: np.argwhere(e.places())[:, ::-1] for size, e in evidence.items()}
+            are_still, first, _ = self._still(found.names, found.indices, size)
+            matched[size] += _mask(first)
+            unmoved = _mask(first[are_still])
+            still[size] += unmoved
+            for name in found.names:
+                images[size][unmoved, numbers[name]] = True
+        return {
+            size: np.argwhere(_places(matched[size], still[size], images[size].sum(2)))[:, ::-1]
+            for size in matched
+        }
 
     def _still(self, names: Pair, indices: Indices, size: Size) -> tuple[Mask, Indices, Indices]:
         """Return which matches do not move; also the (M, 2) cells, column and row, of both ends."""
@@ -153,6 +135,15 @@ def _cells(points: Floats, size: Size) -> Indices:
     """Return the (N, 2) cells, column and row, of (N, 2) points in pixel-centre px."""
     inside = np.clip(points, 0.0, np.array(size) - 1.0)
     return np.asarray(inside * (NUM_CELLS / max(size)), np.int64)
+
+
+def _places(matched: Indices, still: Indices, num_images: Indices) -> Mask:
+    """Return the cells that nothing moves in; none where that is most of a photograph."""
+    found = (still >= MIN_NUM_PAIRS) & (still >= MIN_SHARE * matched)
+    found &= num_images >= MIN_NUM_IMAGES
+    num_matched = np.count_nonzero(matched >= MIN_NUM_PAIRS)
+    is_most = np.count_nonzero(found) > MAX_SHARE_OF_PHOTOGRAPH * num_matched
+    return np.zeros_like(found) if is_most else found
 
 
 def _mask(cells: Indices) -> Mask:

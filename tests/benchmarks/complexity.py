@@ -23,7 +23,7 @@ from colmap_affrect.comparison.methods import parse_method
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.whole_image import IdentityOptions
-from colmap_affrect.report.levels import PIXELS_PER_MEGAPIXEL, inspect_level
+from colmap_affrect.report.inspection import inspect_level
 from colmap_affrect.stages.context import Resources
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
@@ -46,7 +46,7 @@ def cost(extractor: ImageExtractor, path: Path) -> np.ndarray:
     """Return megapixels of warps, keypoints, regions, warps, and seconds without reading."""
     photograph, _ = extractor.photograph(path)
     level = inspect_level(extractor, photograph, 0)
-    area_mpx = level.plan.rectified_area_px / PIXELS_PER_MEGAPIXEL
+    area_mpx = level.plan.rectified_area_px / 1_000_000
     counts = len(level.features), level.plan.num_regions, len(level.plan.items)
     return np.array([area_mpx, *counts, sum(level.seconds.values())])
 

@@ -69,9 +69,7 @@ def test_help_loads_no_heavy_package() -> None:
 
 
 def test_recipes_are_listed_with_what_they_need(call: Call) -> None:
-    done = call("recipes")
-    assert (done.code, done.stderr) == (0, [])
-    lines = done.stdout.splitlines()
+    lines = call("recipes").stdout.splitlines()
     assert [line.split()[0] for line in lines[::2]] == recipe_names()
     needs = {name.split()[0]: line.strip() for name, line in zip(*[iter(lines)] * 2, strict=True)}
     assert needs["default"] == needs["on-demand"] == "needs nothing"
@@ -92,23 +90,25 @@ def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "message"),
     [
-        [],
-        ["rum"],
-        ["run", "--image-path", "x"],
-        ["map", "--output-path", "{out}", "--camera-mode", "single"],
-        ["match", "--output-path", "{out}", "-q", "-v"],
+        ("", "COMMAND"),
+        ("rum", "invalid choice: 'rum'"),
+        ("run --image-path x", "required: --output-path"),
+        ("map --output-path {out} --camera-mode single", "unknown argument --camera-mode"),
+        ("match --output-path {out} -q -v", "not allowed with argument"),
+        ("run --output-path {out} --recipie x", "--recipie (did you mean --recipe?)"),
     ],
 )
 def test_wrong_usage_ends_with_2_and_does_nothing(
-    tmp_path: Path, arguments: list[str], call: Call
+    tmp_path: Path, arguments: str, message: str, call: Call
 ) -> None:
     out = tmp_path / "out"
-    done = call(*[argument.format(out=out) for argument in arguments])
+    done = call(*arguments.format(out=out).split())
     assert (done.code, done.stdout) == (2, "")
     (line,) = done.stderr
     assert line.startswith("error: ")
+    assert message in line
     assert "; see colmap-affrect" in line
     assert not out.exists()
 
@@ -224,12 +224,10 @@ def test_file_or_folder_that_is_not_there_is_wrong_usage_before_anything_is_made
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images" / "view_5_tilt70.jpg"
 
 
-def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path, call: Call) -> None:
+def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
     out = tmp_path / "out č"
     done = call("inspect", FACADE, "--output-path", out, "--set", "max_image_size_px=240")
     assert (done.code, done.stderr) == (0, [])
-    plan = json.loads((out / "view_5_tilt70-plan.json").read_text(encoding="utf-8"))
-    assert plan["levels"][0]["warps"][0]["tilt"] > 1.7
     sheet = out / "view_5_tilt70-inspection.png"
     assert sheet.stat().st_size > 50_000
     assert str(sheet) in done.stdout
@@ -263,19 +261,19 @@ def test_wrong_options_are_refused_before_any_image_is_read(
     assert not out.exists()
 
 
-def test_misspelt_option_names_the_one_that_was_meant(tmp_path: Path, call: Call) -> None:
-    done = call("run", "--output-path", tmp_path / "out", "--recipie", "on-demand")
-    assert (done.code, len(done.stderr)) == (2, 1)
-    assert "unknown argument --recipie (did you mean --recipe?); see" in done.stderr[0]
-
-
-def test_typo_in_a_config_is_refused(tmp_path: Path, verified: Path, call: Call) -> None:
+@pytest.mark.parametrize(
+    ("right", "wrong"), [("verify", "verrify"), ("stretch_contrast", "stretch_kontrast")]
+)
+def test_typo_in_a_config_is_refused(
+    tmp_path: Path, verified: Path, call: Call, right: str, wrong: str
+) -> None:
     config = tmp_path / "config.toml"
     text = (verified / "config.toml").read_text(encoding="utf-8")
-    config.write_text(text.replace("[verify", "[verrify"), encoding="utf-8")
+    config.write_text(text.replace(right, wrong), encoding="utf-8")
     done = call("run", "--config", config, "--output-path", tmp_path / "out")
     assert done.code == 2
-    assert "unknown 'verrify' (did you mean 'verify'?)" in done.stderr[0]
+    assert wrong in done.stderr[0]
+    assert f"(did you mean '{right}'?)" in done.stderr[0]
 
 
 def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:

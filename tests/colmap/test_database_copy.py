@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import subprocess
 from contextlib import closing
 from pathlib import Path
 
@@ -31,8 +30,6 @@ from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 
 GPS = np.array([47.5, 8.25, 400.0])
-NUM_IMAGES = 6
-OLD_COLMAP = shutil.which("colmap")
 
 
 @pytest.fixture(scope="module")
@@ -186,34 +183,6 @@ def test_positions_of_old_databases_are_pose_priors_of_the_copy(
     }  # fmt: skip
     assert {prior.coordinate_system.name for prior in priors} == {system}
     assert old.read_bytes() == before
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not OLD_COLMAP, reason="the program colmap is not on PATH")
-def test_the_program_colmap_works_on_what_is_exported(source: Path, tmp_path: Path) -> None:
-    def colmap(*arguments: str | Path) -> str:
-        done = subprocess.run(
-            [str(OLD_COLMAP), *map(str, arguments)],
-            capture_output=True, text=True, check=False, env={"QT_QPA_PLATFORM": "offscreen"},
-        )  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout + done.stderr
-
-    export_database(source, tmp_path / "old.db")
-    for folder in ("photos", "sparse"):
-        (tmp_path / folder).mkdir()
-    given = ("--database_path", tmp_path / "old.db")
-    colmap(
-        "mapper", *given, "--image_path", tmp_path / "photos",
-        "--output_path", tmp_path / "sparse", "--Mapper.extract_colors", "0",
-        *MAPPER_OPTIONS.split(),
-    )  # fmt: skip
-    text = colmap("model_analyzer", "--path", tmp_path / "sparse" / "0")
-    assert f"Registered images: {NUM_IMAGES}" in text
-    colmap("database_cleaner", *given, "--type", "features")
-    assert schema_version(tmp_path / "old.db") == 3800
-    assert rows(tmp_path / "old.db", "SELECT count(*) FROM keypoints") == [(0,)]
-    assert rows(tmp_path / "old.db", "SELECT count(*) FROM images") == [(NUM_IMAGES,)]
 
 
 @pytest.fixture

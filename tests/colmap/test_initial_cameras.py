@@ -82,14 +82,6 @@ def test_images_of_one_body_lens_focal_length_and_size_share_a_camera(
     assert not camera_of(tmp_path / "c.db", "a.jpg").has_prior_focal_length
 
 
-def test_images_that_come_later_share_the_cameras_that_exif_says(
-    photos: Path, tmp_path: Path
-) -> None:
-    path = tmp_path / "a.db"
-    imported(path, photos, NAMES[1:5:2])
-    assert imported(path, photos, NAMES) == SHARED
-
-
 def test_forced_camera_takes_no_focal_length_that_its_images_contradict(
     photos: Path, tmp_path: Path
 ) -> None:

@@ -144,7 +144,7 @@ def test_json_and_summary_say_what_the_results_do(compared) -> None:
     values = json.loads((out / "comparison.json").read_text(encoding="utf-8"))
     assert values["verdict"] == list(verdict(comparison))
     assert values["registered_by_none"] == ["broken.png"]
-    assert next(iter(values["methods"]["depth-planes-recommended"])) == "failed"
+    assert "depth" in values["methods"]["depth-planes-recommended"]["failed"]
     for result in comparison.finished:
         method = values["methods"][result.name]
         for key, measure in MEASURES.items():

@@ -17,8 +17,7 @@ from small_scene import FOCAL_PX
 
 from colmap_affrect.colmap.poses import relative_pose
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.data import Dataset
-from colmap_affrect.evaluation.datasets import load_evd, load_imc, load_pairs, load_svp
+from colmap_affrect.evaluation.datasets import Dataset, load_evd, load_imc, load_pairs, load_svp
 
 SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
 Entry = dict[str, Any]

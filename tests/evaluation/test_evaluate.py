@@ -17,7 +17,6 @@ from posed_photographs import TRUTH, write_extreme_views, write_imc
 
 from colmap_affrect.errors import EvaluationError, OptionError
 from colmap_affrect.evaluation import evaluate as module
-from colmap_affrect.evaluation.data import ScoreOptions
 from colmap_affrect.evaluation.datasets import load_evd
 from colmap_affrect.evaluation.evaluate import (
     PROTOCOLS,
@@ -26,7 +25,7 @@ from colmap_affrect.evaluation.evaluate import (
 )
 from colmap_affrect.evaluation.results import Evaluation, RecipeResult
 from colmap_affrect.evaluation.runner import RecipeRun
-from colmap_affrect.evaluation.truths import TrueHomography
+from colmap_affrect.evaluation.truths import ScoreOptions, TrueHomography
 from colmap_affrect.stages.one_image import ImageExtractor
 
 Done = tuple[Path, Evaluation]

@@ -10,9 +10,11 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
-from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions
 from colmap_affrect.evaluation.truths import (
     Correspondences,
+    PairResult,
+    PairScore,
+    ScoreOptions,
     TrueHomography,
     TruePose,
     columns_by_kind,

@@ -68,13 +68,6 @@ def test_unit_metrics_hold_s11_s22_s12_of_the_gram_matrix() -> None:
     assert_allclose(unit_metrics(matrix), [4 / 6, 10 / 6, 2 / 6])
 
 
-@given(classes())
-def test_metrics_from_tilts_equal_the_metrics_of_the_maps(cls: Class) -> None:
-    assert_allclose(
-        metrics_from_tilts(*cls), unit_metrics(compose_affine(1.0, 0.0, *cls)), atol=1e-12
-    )
-
-
 @given(affine_shapes())
 def test_tilts_from_metrics_name_the_class_of_the_map(matrix: Array) -> None:
     tilt, angle = tilts_from_metrics(unit_metrics(matrix))

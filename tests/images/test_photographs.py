@@ -19,19 +19,9 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError
-from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.images.masks import read_mask, shrink_mask
 from colmap_affrect.images.photographs import MaskOptions, Photographs, list_images
 from colmap_affrect.project.stores import FeatureStore
-from colmap_affrect.recipes import ExtractionOptions
-from colmap_affrect.rectifiers.whole_image import AsiftOptions
-from colmap_affrect.stages.one_image import prepare
-
-OPTIONS = ExtractionOptions(
-    rectifier=AsiftOptions(),
-    features=SiftOptions(max_num_features=100_000, max_num_rectified_features=100_000),
-)
-"""Many warps, so that most features come from one, and all features that there are."""
 
 
 def diagonal_mask(size: tuple[int, int] = IMAGE_SIZE) -> Mask:
@@ -51,20 +41,6 @@ def photo_path(tmp_path: Path) -> Path:
 def write_mask(path: Path, mask: Mask, white: int = 255) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, mask.astype(np.uint8) * np.uint8(white))
-
-
-@pytest.mark.long
-def test_features_of_the_image_and_of_all_warps_keep_to_the_mask(photo_path: Path) -> None:
-    mask = diagonal_mask()
-    extractor = prepare(OPTIONS)
-    everywhere = extractor.extract_file(photo_path).features
-    inside = extractor.extract_file(photo_path, mask=mask).features
-    columns, rows = np.rint(inside.keypoints).astype(int).T
-    assert mask[rows, columns].all()
-    expected = np.count_nonzero(mask[tuple(np.rint(everywhere.keypoints).astype(int).T[::-1])])
-    # Features next to the mask's edge may differ: in warps the edge is a pixel coarse.
-    assert len(inside) == pytest.approx(expected, rel=0.03)
-    assert (inside.rectification_ids > 0).sum() > 0.8 * len(inside)
 
 
 def test_shrunk_mask_keeps_its_place() -> None:

@@ -27,7 +27,7 @@ from colmap_affrect.images.reading import (
     shrink_to,
     tones,
 )
-from colmap_affrect.parallel.opencv_threads import SHARED_OPENCV_THREADS
+from colmap_affrect.parallel.executor import SHARED_OPENCV_THREADS
 
 
 def test_opencv_threads_are_shared_by_those_who_hold_them() -> None:

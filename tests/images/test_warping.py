@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose
 from strategies import IMAGE_SIZE, Array, homographies, tilt_angles
 from synthetic import texture
 
-from colmap_affrect.data import GrayImage, Mask, Rectification
-from colmap_affrect.geometry.affine import fit_canvas, project, rectifying_affine
+from colmap_affrect.data import GrayImage, Rectification
+from colmap_affrect.geometry.affine import fit_canvas, image_corners, project, rectifying_affine
 from colmap_affrect.images.warping import halved, warp, warp_mask
 
 RAMP_ERROR_PX = 0.05
@@ -28,23 +28,30 @@ DITHER = 0.5
 """Noise in gray values that makes the rounding of the ramp random."""
 
 PERSPECTIVE_RAMP_ERROR_PX = 0.1
-"""A plane fitted to the errors of 500 samples or more, at the far end of the warp."""
+"""A plane fitted to the errors of 2000 samples or more, at the far end of the warp."""
 
 SIZE = (150, 100)
 
 
-def rectification(tilt: float, angle_rad: float, size: tuple[int, int] = SIZE) -> Rectification:
-    """Warp of a whole image of (width, height)."""
-    width, height = size
-    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1.0]])
-    matrix, canvas = fit_canvas(rectifying_affine(tilt, angle_rad), corners, margin_px=4.0)
-    return Rectification(matrix, canvas, np.ones((height, width), bool), tilt, angle_rad)
+def rectification(tilt: float, angle_rad: float) -> Rectification:
+    """Warp of a whole image of ``SIZE``."""
+    linear, corners = rectifying_affine(tilt, angle_rad), image_corners(SIZE)
+    matrix, canvas = fit_canvas(linear, corners, margin_px=4.0)
+    return Rectification(matrix, canvas, np.ones(SIZE[::-1], bool), tilt, angle_rad)
 
 
 def canvas_points(plan: Rectification) -> Array:
     """(H, W, 2) pixel-centre coordinates of all pixels of the canvas."""
     width, height = plan.canvas_size
     return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+
+
+def coordinate_ramp(size: tuple[int, int], axis: int) -> tuple[GrayImage, float]:
+    """An image whose gray values rise along an axis, and by how much a px."""
+    slope = 240.0 / size[axis]
+    noise = np.random.default_rng(0).uniform(-DITHER, DITHER, size[::-1])
+    ramp = np.rint(DITHER + noise + slope * np.indices(size[::-1])[1 - axis])
+    return ramp.astype(np.uint8), slope
 
 
 @settings(max_examples=40)
@@ -57,9 +64,7 @@ def test_warp_of_a_coordinate_ramp_shows_image_from_rectified(
     tilt: float, angle_rad: float, axis: int
 ) -> None:
     plan = rectification(tilt, angle_rad)
-    slope = 240.0 / SIZE[axis]
-    noise = np.random.default_rng(0).uniform(-DITHER, DITHER, SIZE[::-1])
-    ramp = np.rint(DITHER + noise + slope * np.indices(SIZE[::-1])[1 - axis]).astype(np.uint8)
+    ramp, slope = coordinate_ramp(SIZE, axis)
     values = (warp(ramp, plan) - DITHER) / slope
     assert values.shape == plan.canvas_size[::-1]
 
@@ -107,14 +112,11 @@ def test_warp_suppresses_what_the_compressed_axis_cannot_show(
     assert amplitude(coarse, plan) > 80.0
 
 
-def perspective(
-    homography: Array, scale: float, size: tuple[int, int], region: Mask | None = None
-) -> Rectification:
+def perspective(homography: Array, scale: float, size: tuple[int, int]) -> Rectification:
     """Warp of a whole image of (width, height) by a scaled homography."""
-    width, height = size
-    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1.0]])
-    matrix, canvas = fit_canvas(scale * np.eye(2), project(homography, corners), margin_px=4.0)
-    return Rectification(matrix @ homography, canvas, region, 1.0, 0.0)
+    corners = project(homography, image_corners(size))
+    matrix, canvas = fit_canvas(scale * np.eye(2), corners, margin_px=4.0)
+    return Rectification(matrix @ homography, canvas, None, 1.0, 0.0)
 
 
 def turned_camera(angle_deg: float, focal_px: float, size: tuple[int, int]) -> Array:
@@ -151,16 +153,14 @@ def test_warp_by_a_homography_of_a_coordinate_ramp_shows_image_from_rectified(
 ) -> None:
     size = IMAGE_SIZE
     plan = perspective(homography, scale, size)
-    slope = 240.0 / size[axis]
-    noise = np.random.default_rng(0).uniform(-DITHER, DITHER, size[::-1])
-    ramp = np.rint(DITHER + noise + slope * np.indices(size[::-1])[1 - axis]).astype(np.uint8)
+    ramp, slope = coordinate_ramp(size, axis)
     values = ((warp(ramp, plan) - DITHER) / slope).ravel()
     assert values.shape == (plan.canvas_area_px,)
     points = canvas_points(plan).reshape(-1, 2)
     sources = project(plan.image_from_rectified, points)
     reach = 3 * 0.8 * jacobian_spans(plan, points).max(axis=1, keepdims=True) + 1
     inside = ((sources >= reach) & (sources <= np.array(size) - 1 - reach)).all(axis=1)
-    if np.count_nonzero(inside) < 500:
+    if np.count_nonzero(inside) < 2000:
         return
     errors = values[inside] - sources[inside, axis]
     assert np.abs(errors).max() < (DITHER + 1.5) / slope

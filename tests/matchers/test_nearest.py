@@ -125,25 +125,6 @@ def spread(count: int) -> NDArray[np.float64]:
     return np.stack([100.0 * np.arange(count), np.full(count, 7.0)], axis=1)
 
 
-def test_match_features_does_not_wrap_indices_of_40000_keypoints() -> None:
-    count, dimension = 40_000, 8
-    rng = np.random.default_rng(1)
-    keypoints = np.stack(np.divmod(np.arange(count), 200), axis=1) * 25.0
-    # Only the last twenty are alike in both images; the others point elsewhere.
-    common = rng.standard_normal((20, dimension))
-    common[:, 4:6] += 9.0
-    common = unit_rows(common)
-    clutter = np.zeros((count - 20, dimension), np.float32)
-    clutter[:, 0] = 1.0
-    first = (np.concatenate([clutter, common]), keypoints)
-    second = (common[::-1].copy(), spread(20))
-    matches = run(second, first, NearestOptions(max_ratio=1.0))
-    expected = np.stack([np.arange(20), count - 1 - np.arange(20)], axis=1)
-    np.testing.assert_array_equal(matches.indices, expected)
-    reverse = run(first, second, NearestOptions(max_ratio=1.0))
-    np.testing.assert_array_equal(reverse.indices, expected[::-1, ::-1])
-
-
 def test_match_features_rejects_the_same_descriptor_at_two_far_places() -> None:
     # Repeated structure, the same to the last bit: rounding must not make it look unique.
     rng = np.random.default_rng(8)

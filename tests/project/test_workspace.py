@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +16,10 @@ from colmap_affrect.project.workspace import Workspace
 
 STAGES = tuple(stage for stage in ALL_STAGES if stage != "copy")
 
-OPTIONS = {"image_path": "photos", "camera": {"mode": "auto"}, "sigmas": (8.0, 16.0), "size": 3}
+OPTIONS = {
+    "image_path": "photos", "camera": {"mode": "auto"}, "part": {"name": "one"},
+    "sigmas": (8.0, 16.0), "size": 3,
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -63,7 +67,9 @@ def test_record_options_puts_the_options_on_record(workspace: Workspace) -> None
         ({**OPTIONS, "camera": {"mode": "single"}}, "camera.mode='auto', and it is 'single' now"),
         ({**OPTIONS, "sigmas": (8.0,)}, "sigmas=[8.0, 16.0], and it is [8.0] now"),
         ({**OPTIONS, "more": True}, "more=None, and it is True now"),
-        ({"image_path": "photos"}, "camera.mode='auto', and it is None now"),
+        ({**OPTIONS, "camera": {}}, "camera.mode='auto', and it is None now"),
+        # The name of a part before its options.
+        ({**OPTIONS, "part": {"depth": 2, "name": "two"}}, "part.name='one', and it is 'two' now"),
     ],
 )
 def test_record_options_with_other_options_names_the_first_that_differs(
@@ -71,21 +77,10 @@ def test_record_options_with_other_options_names_the_first_that_differs(
 ) -> None:
     workspace.record_options("extract", OPTIONS)
     before = workspace.config.read_bytes()
-    with pytest.raises(StaleStoreError) as error:
+    why = f"^.*the extract stage was run there with {re.escape(named)}.*--overwrite.*$"
+    with pytest.raises(StaleStoreError, match=why):
         workspace.record_options("extract", changed)
-    text = str(error.value)
-    assert named in text
-    assert "extract stage" in text
-    assert "--overwrite" in text
-    assert "\n" not in text
     assert workspace.config.read_bytes() == before
-
-
-def test_another_part_is_named_before_its_options(workspace: Workspace) -> None:
-    workspace.record_options("extract", OPTIONS)
-    workspace.record_options("match", {"max_ratio": 0.8, "name": "nearest"})
-    with pytest.raises(StaleStoreError, match="run there with name='nearest', and it is 'other'"):
-        workspace.record_options("match", {"depth": 2, "name": "other"})
 
 
 KEPT = {
@@ -206,13 +201,6 @@ def test_what_models_were_made_from_is_on_record_while_they_are_there(workspace:
     assert workspace.models_made_from() == ""
 
 
-def test_damaged_record_is_one_clear_line(workspace: Workspace) -> None:
-    workspace.config.write_text("[extract\nx = ")
-    with pytest.raises(WorkspaceError, match=r"config\.toml: damaged") as error:
-        workspace.recorded()
-    assert "\n" not in str(error.value)
-
-
 LOCK_AND_WAIT = """
 import sys
 from pathlib import Path
@@ -254,21 +242,34 @@ def test_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("version", ["", "format_version = 1\n"])
-def test_record_of_another_version_is_one_clear_line(workspace: Workspace, version: str) -> None:
-    workspace.config.write_text(f'{version}recipe = "default"\n[extract]\nimage_path = "/photos"\n')
-    with pytest.raises(WorkspaceError, match="made by another version of colmap-affrect"):
-        workspace.require("extract")
-    with pytest.raises(WorkspaceError, match="use another --output-path or remove it"):
-        workspace.record_options("extract", OPTIONS, overwrite=True)
+OTHER_VERSION = "was made by another version of .*; use another --output-path or remove it"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[extract\nx = ", r"config\.toml: damaged"),
+        ('recipe = "default"\n[extract]\nimage_path = "/photos"\n', OTHER_VERSION),
+        ('format_version = 1\nrecipe = "default"\n', OTHER_VERSION),
+    ],
+)
+def test_record_that_cannot_be_gone_on_with_is_one_clear_line(
+    workspace: Workspace, text: str, message: str
+) -> None:
+    workspace.config.write_text(text)
+    for read in (
+        lambda: workspace.require("extract"),
+        lambda: workspace.record_options("extract", OPTIONS, overwrite=True),
+    ):
+        with pytest.raises(WorkspaceError, match=f"^.*{message}.*$"):
+            read()
 
 
 def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path) -> None:
     branch = finished.branch(tmp_path / "branches" / "one")
     names = ["cameras.json", "config.toml", "features.h5", "matches.h5", "pairs.txt"]
     assert sorted(path.name for path in branch.path.iterdir()) == names
-    for path in (branch.features, branch.matches, branch.pairs):
-        assert path.read_bytes() == (finished.path / path.name).read_bytes()
+    assert branch.features.read_bytes() == b"features.h5"
     assert branch.recorded() == {
         **finished.recorded(), "begun": ["extract", "pairs", "match"],
     }  # fmt: skip

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from strategies import tilt_distance
 
 from colmap_affrect.data import Mask, Rectification, RectificationPlan, ShapeGrid
-from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.affine import rectifying_affine
 from colmap_affrect.geometry.tilts import (
     metrics_from_tilts,
@@ -87,23 +84,6 @@ def test_plan_dense_shapes_partitions_any_grid(
         np.testing.assert_array_equal(np.any(parts, axis=0), blocks[: size[1], : size[0]])
 
 
-def test_plan_dense_shapes_gives_each_plane_its_own_warp() -> None:
-    labels = np.zeros((20, 30), int)
-    labels[:, 12:] = 1
-    labels[14:, :12] = 2
-    classes = [(3.0, 0.4), (4.5, 1.7), (1.0, 0.0)]
-    size = (120, 80)
-    plan = plan_dense_shapes(shape_grid(classes, labels), size, DenseShapesOptions())
-    check_invariants(plan, size)
-    assert len(plan.items) == 2
-    # The larger region has more votes and comes first.
-    for item, label in zip(plan.items, (1, 0), strict=True):
-        distance = tilt_distance(item.tilt, item.tilt_angle_rad, *classes[label])
-        assert distance < np.log(1.7)
-        expected = np.kron(labels == label, np.ones((4, 4), bool))
-        np.testing.assert_array_equal(image_region(item, size), expected)
-
-
 def test_plan_dense_shapes_skips_regions_below_the_smallest_share() -> None:
     labels = np.zeros((10, 20), int)
     labels[:2, :5] = 1  # 5 % of the blocks
@@ -115,15 +95,6 @@ def test_plan_dense_shapes_skips_regions_below_the_smallest_share() -> None:
         grid, (80, 40), DenseShapesOptions(min_region_frac=0.06, covered_frac=1.0)
     )
     assert (len(kept.items), len(skipped.items)) == (1, 0)
-
-
-@pytest.mark.parametrize("size", [(80, 61), (1, 1), (1, 90)])
-def test_plan_of_a_flat_image_has_no_warps(size: tuple[int, int]) -> None:
-    image = np.full(size[::-1], 140, np.uint8)
-    grid = SecondMoment(SecondMomentOptions()).grid(image)
-    plan = plan_dense_shapes(grid, size, DenseShapesOptions())
-    assert (plan.image_size, plan.items) == (size, ())
-    assert plan.rectified_area_px == 0
 
 
 def test_region_in_two_places_is_one_warp_if_pieces_of_any_size_count() -> None:

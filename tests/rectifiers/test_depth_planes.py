@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -26,8 +25,6 @@ from strategies import Array, tilt_distance
 
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
 from colmap_affrect.geometry.affine import project, rectifying_affine
-from colmap_affrect.geometry.conventions import camera_matrix
-from colmap_affrect.images.reading import read_gray
 from colmap_affrect.images.warping import warp, warp_mask
 from colmap_affrect.rectifiers.base import RectifierInputs
 from colmap_affrect.rectifiers.depth_planes import (
@@ -39,8 +36,6 @@ from colmap_affrect.rectifiers.depth_planes import (
     PlaneOptions,
     planar_segments,
 )
-
-COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
 
 CREASE_PX = 3.0
 """Pixels of the image nearer to a crease may get the label of the other plane: two pixels of the
@@ -191,34 +186,6 @@ def test_warp_of_a_slanted_wall_is_its_frontal_view(normal: tuple[float, float, 
     # What the warp shows is the texture of the plane.
     frontal = look_up(pattern, *np.moveaxis(120.0 * shown, -1, 0))
     assert np.corrcoef(warp(image, item)[inside], frontal[inside])[0, 1] > MIN_CORRELATION
-
-
-def courtyard_view(name: str) -> tuple[Photograph, Array, Array]:
-    """A photograph of the courtyard, its depth in metres, and the direction up in its camera."""
-    path = COURTYARD / "images" / f"{name}.jpg"
-    gray = read_gray(path)
-    camera = camera_matrix((720, 540), (1080.0, 1080.0))
-    depth = cv2.imread(str(COURTYARD / "depth" / f"{name}.png"), cv2.IMREAD_UNCHANGED) / 500.0
-    depth[depth == 0] = np.nan
-    lines = (COURTYARD / "ground_truth" / "images.txt").read_text().splitlines()
-    (fields,) = (line.split() for line in lines if line.endswith(path.name))
-    w, x, y, z = map(float, fields[1:5])
-    up = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
-    return Photograph(gray, path.name, path, camera), depth, up
-
-
-def test_plan_of_the_courtyard_shows_its_wall_and_its_ground() -> None:
-    photograph, depth, up = courtyard_view("court_2")
-    segments = planar_segments(photograph, depth, PlaneOptions())
-    assert len(segments) == 2
-    wall, ground = segments
-    assert angles_deg(ground.normal, up) < 2.0
-    assert abs(90.0 - np.rad2deg(np.arccos(wall.normal @ up))) < 2.0
-    assert wall.region.area_px > 0.4 * photograph.gray.size
-    assert ground.region.area_px > 0.1 * photograph.gray.size
-    plan = plan_planes(photograph, depth)
-    assert [len(item.region) for item in plan.items] == [len(s.region.mask) for s in segments]
-    assert plan.rectified_area_px < 3.0 * photograph.gray.size
 
 
 def shapes_at(points: Array, tilt: float, angle_rad: float) -> Array:

@@ -22,8 +22,6 @@ from colmap_affrect.rectifiers.regions import (
 
 CAMERA = np.array([[300.0, 0.0, 95.0], [0.0, 320.0, 70.0], [0.0, 0.0, 1.0]])
 
-L_SHAPE = np.array([[1, 1, 1, 1, 1], [1, 0, 0, 0, 0], [1, 1, 0, 0, 0]], bool)
-
 
 @st.composite
 def regions(draw: st.DrawFn) -> Region:
@@ -51,16 +49,6 @@ def check_fit(item: Rectification, region: Region) -> None:
     assert (mapped.max(axis=0) + MARGIN_PX > last - 1 - 1e-6).all()
     np.testing.assert_array_equal(item.region, region.mask)
     assert item.region_origin == region.origin
-
-
-def test_region_knows_its_pixels() -> None:
-    region = Region(L_SHAPE, (20, 7))
-    assert region.area_px == 8
-    assert_allclose(region.middle(), pixels(region).mean(axis=0))
-    outline = {tuple(point) for point in region.outline()}
-    assert outline == {(20, 7), (24, 7), (20, 8), (20, 9), (21, 9)}
-    points = np.array([[24.4, 6.6], [21.0, 8.0], [20.6, 9.4], [19.4, 7.0], [25.0, 7.0]])
-    assert region.contains(points).tolist() == [True, False, True, False, False]
 
 
 @given(regions(), classes(), st.booleans())

@@ -94,7 +94,7 @@ def test_faded_photograph_is_stretched_and_said_to_be(tmp_path, stretch):
 
 COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
 COURTYARD_CAMERA = CameraOptions(mode="single", model="PINHOLE", params="1080,1080,360,270")
-DEPTH = ["depth.png_scale=0.002", "max_image_size_px=360"]
+DEPTH = ["depth.kind=z", "max_image_size_px=360"]
 
 
 def courtyard(tmp_path: Path, num_maps: int) -> tuple[Path, Path]:

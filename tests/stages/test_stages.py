@@ -71,8 +71,10 @@ def without_times(report: dict[str, object]) -> dict[str, object]:
     }
 
 
-def test_run_registers_all_photographs(finished: tuple[Workspace, ReconstructionReport]) -> None:
-    _, report = finished
+def test_run_registers_all_photographs_and_leaves_all_results(
+    finished: tuple[Workspace, ReconstructionReport],
+) -> None:
+    workspace, report = finished
     assert report.status == "ok"
     assert report.registered_names == tuple(sorted(NAMES))
     assert report.unregistered == {}
@@ -80,10 +82,6 @@ def test_run_registers_all_photographs(finished: tuple[Workspace, Reconstruction
     assert report.models[0].num_points3D > 300
     assert 2.0 <= report.models[0].mean_track_length <= 4.0
     assert 0.0 < report.models[0].mean_reprojection_error_px < 1.0
-
-
-def test_run_leaves_all_results(finished: tuple[Workspace, ReconstructionReport]) -> None:
-    workspace, report = finished
     assert {
         "config.toml", "database.db", "features.h5", "matches.h5", "pairs.txt", "report.json",
         "report.html", "sparse",
