@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -101,11 +102,9 @@ class Files:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.photos = write_photos(folder / "photos", NAMES)
-        self.features = folder / "features.h5"
-        self.matches = folder / "matches.h5"
+        self.features, self.matches = folder / "features.h5", folder / "matches.h5"
         self.database = folder / "new.db"
-        groups = {name: hloc_group(3 + n, n) for n, name in enumerate(NAMES)}
-        write_h5(self.features, groups)
+        write_h5(self.features, {name: hloc_group(3 + n, n) for n, name in enumerate(NAMES)})
         write_h5(self.matches, {"a.png/sub-b c.png": match_group([2, -1, 0])})
 
     def import_all(self, **options: Any) -> InterchangeReport:
@@ -120,16 +119,15 @@ class Files:
 
 
 def read_database(path: Path) -> tuple[dict[str, Array], dict[tuple[str, str], list[list[int]]]]:
-    database = pycolmap.Database.open(path)
-    images = database.read_all_images()
-    keypoints = {image.name: database.read_keypoints(image.image_id) for image in images}
-    pairs = {}
-    for first in images:
-        for second in images:
-            ids = first.image_id, second.image_id
-            if first.name < second.name and database.exists_matches(*ids):
-                pairs[first.name, second.name] = database.read_matches(*ids).tolist()
-    database.close()
+    """Keypoints by image, and matches by pair of sorted names."""
+    with pycolmap.Database.open(path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        keypoints = {name: database.read_keypoints(image_id) for name, image_id in ids.items()}
+        pairs = {
+            pair: database.read_matches(*(ids[name] for name in pair)).tolist()
+            for pair in itertools.combinations(sorted(ids), 2)
+            if database.exists_matches(*(ids[name] for name in pair))
+        }
     return keypoints, pairs
 
 

@@ -234,16 +234,16 @@ def link_to(target: str) -> Prepare:
     return prepare
 
 
-def linked_folder(out: Path, _: str) -> list[Path]:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.symlink_to(out.parents[1] / "photos")
-    return []
-
-
 def hard_link(out: Path, result: str) -> list[Path]:
     out.mkdir(parents=True)
     os.link(out.parents[1] / "photos" / "a.png", out / result)
     return [out]
+
+
+def linked_folder(out: Path, _: str) -> list[Path]:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.symlink_to(out.parents[1] / "photos")
+    return []
 
 
 TRAPS = {
