@@ -27,12 +27,8 @@ needs_chromium = pytest.mark.skipif(
 
 def _call(address: str, method: str = "POST", **arguments: Any) -> Any:
     """Send a command of WebDriver and return its value."""
-    request = urllib.request.Request(
-        address,
-        json.dumps(arguments).encode(),
-        {"Content-Type": "application/json"},
-        method=method,
-    )
+    data, headers = json.dumps(arguments).encode(), {"Content-Type": "application/json"}
+    request = urllib.request.Request(address, data, headers, method=method)
     with urllib.request.urlopen(request, timeout=60) as answer:
         return json.load(answer)["value"]
 
@@ -43,30 +39,25 @@ class Browser:
     def __init__(self, address: str) -> None:
         self._address = address
 
-    def _call(self, path: str, **arguments: Any) -> Any:
-        return _call(f"{self._address}/{path}", **arguments)
-
     def open(self, page: Path) -> None:
-        self._call("url", url=page.resolve().as_uri())
+        _call(f"{self._address}/url", url=page.resolve().as_uri())
 
     def run(self, script: str, *arguments: Any) -> Any:
         """Run a function body in the page and return what it returns."""
-        return self._call("execute/sync", script=script, args=list(arguments))
+        return _call(f"{self._address}/execute/sync", script=script, args=list(arguments))
 
     def click(self, selector: str) -> None:
         """Click as a person would: fails if the element is not visible."""
-        found = self._call("element", using="css selector", value=selector)
-        self._call(f"element/{found[ELEMENT]}/click")
+        found = _call(f"{self._address}/element", using="css selector", value=selector)
+        _call(f"{self._address}/element/{found[ELEMENT]}/click")
 
     def command(self, name: str, **parameters: Any) -> Any:
         """Send a command of the DevTools protocol."""
-        return self._call("goog/cdp/execute", cmd=name, params=parameters)
+        return _call(f"{self._address}/goog/cdp/execute", cmd=name, params=parameters)
 
     def resize(self, width: int, height: int = 800) -> None:
-        self.command(
-            "Emulation.setDeviceMetricsOverride",
-            width=width, height=height, deviceScaleFactor=1, mobile=width < 500,
-        )  # fmt: skip
+        sizes = {"width": width, "height": height, "deviceScaleFactor": 1}
+        self.command("Emulation.setDeviceMetricsOverride", **sizes, mobile=width < 500)
 
     def prefer(self, scheme: str) -> None:
         """Choose light or dark."""
@@ -75,7 +66,7 @@ class Browser:
 
     def log(self) -> list[str]:
         """What the console has said since the last call."""
-        return [entry["message"] for entry in self._call("se/log", type="browser")]
+        return [entry["message"] for entry in _call(f"{self._address}/se/log", type="browser")]
 
 
 @contextmanager
@@ -149,17 +140,13 @@ def assert_fits_and_is_readable(browser: Browser, scheme: str, width: int) -> No
 
 def until_drawn(browser: Browser) -> str:
     """Wait until the first model is on its canvas and return the picture."""
-    for _ in range(50):
-        time.sleep(0.02)
-        if drawn := browser.run(FIRST_MODEL):
-            return str(drawn)
-    pytest.fail("nothing was drawn")
+    return until_changed(browser, "")
 
 
 def until_changed(browser: Browser, before: str) -> str:
     """Wait until the first model looks different and return the picture."""
-    for _ in range(50):
-        now = until_drawn(browser)
-        if now != before:
-            return now
-    pytest.fail("the picture stays as it was")
+    for _ in range(100):
+        if (now := browser.run(FIRST_MODEL)) not in ("", before):
+            return str(now)
+        time.sleep(0.02)
+    pytest.fail("nothing new was drawn")

@@ -13,8 +13,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # One process per core: more threads in each would only wait for one another.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# Tests are imported by path (``--import-mode=importlib``), their helpers by name.
+# Tests are imported by path (``--import-mode=importlib``), their helpers and benchmarks by name.
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(1, str(Path(__file__).parent / "benchmarks"))
 
 from command import Call, Ended
 from small_scene import write_photographs

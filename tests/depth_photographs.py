@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from planar_scenes import Room, rays, unit
 
 from colmap_affrect.data import Photograph
 from colmap_affrect.geometry.conventions import pixel_from_colmap
@@ -26,17 +27,10 @@ def photograph(name="a.jpg", size=(12, 8), camera_matrix=CAMERA, path=None):
 def slanted_plane(size, camera_matrix):
     """Depth along the axis and along the rays of the plane n . X = 3 seen by a camera."""
     normal = np.array([0.3, -0.5, 1.0])
-    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-    rays = np.stack(
-        [
-            (columns - camera_matrix[0, 2]) / camera_matrix[0, 0],
-            (rows - camera_matrix[1, 2]) / camera_matrix[1, 1],
-            np.ones(size[::-1]),
-        ],
-        axis=-1,
-    )
-    z_depth = 3.0 / (rays @ normal)
-    return z_depth, z_depth * np.linalg.norm(rays, axis=-1)
+    wall = Room(-unit(normal)[None], 3.0 / np.linalg.norm(normal), camera_matrix, size)
+    z_depth, _ = wall.depth(size)
+    directions = rays(camera_matrix, np.arange(size[0]), np.arange(size[1]))
+    return z_depth, z_depth * np.linalg.norm(directions, axis=-1)
 
 
 def courtyard_photograph(name):

@@ -28,18 +28,9 @@ LIMITS = {
 lines, functions of 60, and 180 imports."""
 
 
-def lines_of(path: Path) -> int:
-    return len(path.read_text(encoding="utf-8").splitlines())
-
-
-def room_of(path: Path) -> str:
-    """Name the folder of the package that a file is in, or the file itself if it is in none."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-
-
-def imported_rooms(path: Path) -> Iterator[str]:
+def imported_rooms(tree: ast.Module) -> Iterator[str]:
     """Yield the folders and files right below the package that a file imports from."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree):
         modules: list[str] = []
         if isinstance(node, ast.Import):
             modules = [alias.name for alias in node.names]
@@ -51,35 +42,28 @@ def imported_rooms(path: Path) -> Iterator[str]:
                 yield rest[0]
 
 
-def longest_function(path: Path) -> tuple[int, str]:
-    functions = [
-        (node.end_lineno - node.lineno + 1, f"{node.name} in {path.relative_to(ROOT)}")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno
-    ]
-    return max(functions, default=(0, ""))
-
-
 def main() -> int:
     """Print the table and the limits."""
-    package = sorted(PACKAGE.rglob("*.py"))
-    tests = sorted((ROOT / "tests").rglob("*.py"))
     rooms = Counter[str]()
-    arrows = set()
-    for path in package:
-        rooms[room_of(path)] += lines_of(path)
-        arrows |= {(room_of(path), room) for room in imported_rooms(path)} - {
-            (room_of(path), room_of(path))
-        }
+    arrows, files, functions = set(), [], []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        text, where = path.read_text(encoding="utf-8"), path.relative_to(PACKAGE)
+        tree, room = ast.parse(text), where.parts[0].removesuffix(".py")
+        rooms[room] += text.count("\n")
+        arrows |= {(room, other) for other in imported_rooms(tree) if other != room}
+        files.append((text.count("\n"), str(where)))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                length = (node.end_lineno or 0) - node.lineno + 1
+                functions.append((length, f"{node.name} in {where}"))
     for room, count in sorted(rooms.items()):
         print(f"{count:7,}  {room}")
-    longest_file = max((lines_of(path), str(path.relative_to(ROOT))) for path in package)
-    longest = max(map(longest_function, package))
+    tests = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")]
     sizes = {
         "lines of the package": (sum(rooms.values()), ""),
-        "lines of the tests": (sum(map(lines_of, tests)), ""),
-        "lines of the longest file": longest_file,
-        "lines of the longest function": longest,
+        "lines of the tests": (sum(text.count("\n") for text in tests), ""),
+        "lines of the longest file": max(files),
+        "lines of the longest function": max(functions),
         "imports between folders": (len(arrows), ""),
     }
     for name in ("ARCHITECTURE.md", "BENCHMARKS.md"):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from synthetic import texture, write_image
 
 from colmap_affrect.data import GrayImage, Photograph, ShapeGrid, ShapeSamples
 from colmap_affrect.geometry.conventions import resized_from_original
@@ -24,9 +26,7 @@ class FixedDepth:
 
     values: Array
 
-    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
-        """The map as float32."""
-        del photograph
+    def depth(self, _: Photograph) -> NDArray[np.float32]:
         return self.values.astype(np.float32)
 
 
@@ -40,9 +40,7 @@ class FixedShapes:
         """Not for rectifiers that read samples."""
         raise NotImplementedError
 
-    def samples(self, image: GrayImage) -> ShapeSamples:
-        """The shapes."""
-        del image
+    def samples(self, _: GrayImage) -> ShapeSamples:
         return ShapeSamples(self.rows[:, :2], metrics_from_tilts(self.rows[:, 2], self.rows[:, 3]))
 
 
@@ -62,6 +60,19 @@ def rays(camera_matrix: Array, columns: Array, rows: Array) -> Array:
     """(h, w, 3) viewing rays with z = 1 of a grid of pixels."""
     points = np.stack(np.broadcast_arrays(columns, rows[:, None], 1.0), axis=-1)
     return points @ np.linalg.inv(camera_matrix).T
+
+
+def nearest_planes(
+    directions: Array, normals: Array, distances: Array
+) -> tuple[Array, NDArray[np.intp]]:
+    """(h, w) factors by which directions (h, w, 3) reach planes n . P = -d, and which planes.
+
+    Where none is reached the factor is infinite.
+    """
+    facing = -directions @ normals.T
+    with np.errstate(divide="ignore"):
+        factors = np.where(facing > 0, distances / facing, np.inf)
+    return factors.min(axis=-1), factors.argmin(axis=-1)
 
 
 def look_up(texture: GrayImage, x: NDArray[np.floating], y: NDArray[np.floating]) -> GrayImage:
@@ -95,11 +106,8 @@ class Room:
     def depth(self, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
         """(h, w) z-depth at pixel centres, NaN where no plane is seen, and the plane's number."""
         directions = rays(self.camera_at(size), np.arange(size[0]), np.arange(size[1]))
-        facing = -directions @ self.normals.T
-        with np.errstate(divide="ignore"):
-            depths = np.where(facing > 0, self.distances / facing, np.inf)
-        nearest = depths.min(axis=-1)
-        return np.where(np.isinf(nearest), np.nan, nearest), depths.argmin(axis=-1)
+        depth, labels = nearest_planes(directions, self.normals, self.distances)
+        return np.where(np.isinf(depth), np.nan, depth), labels
 
     def render(self, texture: GrayImage, px_per_unit: float) -> GrayImage:
         """Image of the room with the same texture on all planes, in plane coordinates."""
@@ -144,3 +152,29 @@ def slanted_wall(normal: ArrayLike, size: tuple[int, int] = (400, 300)) -> Room:
     """One plane at distance 2, seen off-centre by a camera with square pixels."""
     camera = np.array([[340.0, 0.0, 215.0], [0.0, 340.0, 130.0], [0.0, 0.0, 1.0]])
     return Room(unit(normal)[None], np.array([2.0]), camera, size)
+
+
+BOX_SIZE = np.array([6.0, 4.0, 8.0])
+"""Width, height and length of the box whose inside panoramas show."""
+PANORAMA_SIZE = (1024, 512)
+
+
+def write_panoramas(folder: Path, count: int) -> None:
+    """Write panoramas (equirectangular) of the inside of a textured box along a curve."""
+    faces = [texture((1024, 1024), seed, 2.0) for seed in range(6)]
+    normals = np.concatenate([np.eye(3), -np.eye(3)])  # inwards
+    width, height = PANORAMA_SIZE
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    yaw, pitch = (2 * x / width - 1) * np.pi, (2 * y / height - 1) * np.pi / 2
+    towards = [np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)]
+    directions = np.stack(towards, axis=-1)
+    for index in range(count):
+        position = np.array([0.5 * index - 0.5, 0.15 * index, 0.35 * index**1.5 - 0.6])
+        distances = np.concatenate([BOX_SIZE, BOX_SIZE]) / 2 + normals @ position
+        factors, labels = nearest_planes(directions, normals, distances)
+        places = (position + directions * factors[..., None]) / BOX_SIZE + 0.5  # 0 to 1
+        image = np.zeros((height, width), np.uint8)
+        for label, face in enumerate(faces):
+            u, v = np.moveaxis(np.delete(places, label % 3, axis=-1), -1, 0) * 1023
+            image = np.where(labels == label, look_up(face, u, v), image)
+        write_image(folder / f"{index}.png", np.dstack([image] * 3))

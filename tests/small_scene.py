@@ -35,25 +35,24 @@ FACES = (
 cached_texture = cache(texture)
 
 
+def world_to_camera(yaw_deg: float) -> Array:
+    """(3, 3) rotation of a camera that is turned about its y axis."""
+    yaw = np.deg2rad(yaw_deg)
+    return np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
+
+
 def photograph(
     position: tuple[float, float, float], yaw_deg: float, first_seed: int = 0
 ) -> GrayImage:
     """Render the faces, each over those before it; another seed makes another room."""
     width, height = IMAGE_SIZE
-    yaw = np.deg2rad(yaw_deg)
-    world_to_camera = np.array(
-        [[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]]
-    )
     camera = np.array([[FOCAL_PX, 0, width / 2 - 0.5], [0, FOCAL_PX, height / 2 - 0.5], [0, 0, 1]])
-    image = np.full((height, width), 90, np.uint8)
+    image, size = np.full((height, width), 90, np.uint8), (TEXTURE_PX, TEXTURE_PX)
     for seed, (origin, edge1, edge2) in enumerate(FACES, first_seed):
         plane = np.column_stack([edge1, edge2, np.subtract(origin, position)])
-        image_from_texture = camera @ world_to_camera @ plane @ np.diag([1 / TEXTURE_PX] * 2 + [1])
-        size = (TEXTURE_PX, TEXTURE_PX)
-        warped = cv2.warpPerspective(cached_texture(size, seed), image_from_texture, IMAGE_SIZE)
-        covered = cv2.warpPerspective(
-            np.full(size[::-1], 255, np.uint8), image_from_texture, IMAGE_SIZE
-        )
+        plane = camera @ world_to_camera(yaw_deg) @ plane @ np.diag([1 / TEXTURE_PX] * 2 + [1])
+        warped = cv2.warpPerspective(cached_texture(size, seed), plane, IMAGE_SIZE)
+        covered = cv2.warpPerspective(np.full(size, 255, np.uint8), plane, IMAGE_SIZE)
         image = np.where(covered > 127, warped, image)
     return image
 
@@ -63,7 +62,6 @@ def write_photographs(folder: Path, count: int = len(NAMES), first_seed: int = 0
     for index, name in enumerate(NAMES[:count]):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        shift = 0.55 * (index - 1.5)
-        position = (shift, -0.1 * index, 0.1 * index)
+        position = (0.55 * (index - 1.5), -0.1 * index, 0.1 * index)
         write_image(path, photograph(position, -5.0 * (index - 1.5), first_seed))
     return NAMES[:count]

@@ -20,13 +20,9 @@ from colmap_affrect.project.record import STAGES
 from colmap_affrect.recipes import load_recipe
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [
-    ROOT / "README.md",
-    ROOT / "BENCHMARKS.md",
-    ROOT / "sample_scenes" / "README.md",
-    *sorted((ROOT / "docs").glob("*.md")),
-]
-NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
+PAGES = ["README.md", "BENCHMARKS.md", "sample_scenes/README.md"]
+PAGES += sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.md"))
+TEXTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in PAGES}
 FOREIGN = {
     "--import_path", "--database_path", "--image_path", "--output_path", "--no-deps",
     "--Mapper.tri_ignore_two_view_tracks", "--nthreads", "--nworkers", "--claim",
@@ -35,70 +31,61 @@ FOREIGN = {
 MAX_WORDS = 1500
 """Of README.md, which is to be read in five minutes."""
 
+PARSER = build_parser()
+(CHOICES,) = (action.choices for action in PARSER._actions if action.dest == "command")
+ALL_FLAGS = {flag for command in CHOICES.values() for flag in command._option_string_actions}
 
-def text_of(name: str) -> str:
-    return (ROOT / name).read_text(encoding="utf-8")
-
-
-def blocks(text: str, language: str) -> list[str]:
-    return re.findall(rf"^ *```{language}\n(.*?)^ *```", text, re.MULTILINE | re.DOTALL)
+each_page = pytest.mark.parametrize("name", PAGES)
 
 
-def inline(text: str) -> list[str]:
-    prose = re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
+def blocks(name: str, language: str) -> list[str]:
+    return re.findall(rf"^ *```{language}\n(.*?)^ *```", TEXTS[name], re.MULTILINE | re.DOTALL)
+
+
+def inline(name: str) -> list[str]:
+    prose = re.sub(r"^ *```.*?^ *```", "", TEXTS[name], flags=re.MULTILINE | re.DOTALL)
     return [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose)]
 
 
 def shell_commands(name: str) -> Iterator[list[str]]:
     """Yield the words of each command, with those behind && as commands of their own."""
-    for block in blocks(text_of(name), "sh"):
+    for block in blocks(name, "sh"):
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line.partition(" > ")[0], comments=True)
             while "&&" in words:
                 yield words[: words.index("&&")]
                 words = words[words.index("&&") + 1 :]
-            yield words
+            if words:
+                yield words
 
 
-PARSER = build_parser()
-(CHOICES,) = (action.choices for action in PARSER._actions if action.dest == "command")
-ALL_FLAGS = {flag for command in CHOICES.values() for flag in command._option_string_actions}
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_commands_are_understood(name: str) -> None:
+@each_page
+def test_commands_and_scripts_are_understood(name: str) -> None:
     for words in shell_commands(name):
-        if not words or Path(words[0]).name != "colmap-affrect":
-            continue
-        options = PARSER.parse_args(words[1:])
-        recipe = getattr(options, "recipe", None) or "default"
-        if not recipe.endswith(".toml") and "recipe" in options:
-            load_recipe(recipe, options.set)
+        if Path(words[0]).name == "colmap-affrect":
+            options = PARSER.parse_args(words[1:])
+            recipe = getattr(options, "recipe", None) or "default"
+            if not recipe.endswith(".toml") and "recipe" in options:
+                load_recipe(recipe, options.set)
+        if words[0] == "python":
+            script = (ROOT / words[1]).read_text(encoding="utf-8")
+            own = words[: words.index("--")] if "--" in words else words
+            for flag in (word for word in own if word.startswith("--")):
+                assert f'"{flag}"' in script, f"{words[1]} {flag}"
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_page
 def test_stages_come_after_those_that_they_need(name: str) -> None:
-    for block in blocks(text_of(name), "sh"):
+    for block in blocks(name, "sh"):
         commands = re.findall(r"^colmap-affrect (\w+)", block, re.MULTILINE)
         stages = [command for command in commands if command in STAGES]
         if stages[:1] == ["extract"]:
             assert stages == list(STAGES[1 : len(stages) + 1]), block
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_scripts_exist_and_have_the_options(name: str) -> None:
-    for words in shell_commands(name):
-        if words[:1] != ["python"]:
-            continue
-        script = (ROOT / words[1]).read_text(encoding="utf-8")
-        own = words[: words.index("--")] if "--" in words else words
-        for flag in (word for word in own if word.startswith("--")):
-            assert f'"{flag}"' in script, f"{words[1]} {flag}"
-
-
-@pytest.mark.parametrize("name", NAMES)
+@each_page
 def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
-    for code in inline(text_of(name)):
+    for code in inline(name):
         words = code.split()
         if words[0] == "colmap-affrect" and len(words) > 1 and words[1].islower():
             assert words[1] in COMMANDS, code
@@ -113,24 +100,19 @@ def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
             load_recipe("default", [words[1]])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_page
 def test_python_names_exist(name: str) -> None:
-    for block in blocks(text_of(name), "python"):
-        for node in ast.walk(ast.parse(block)):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
-                "colmap_affrect"
-            ):
-                for alias in node.names:
-                    pkgutil.resolve_name(f"{node.module}:{alias.name}")
-            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "colmap_affrect":
-                assert node.attr in colmap_affrect.__all__
+    for node in (node for block in blocks(name, "python") for node in ast.walk(ast.parse(block))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("colmap_affrect"):
+            for alias in node.names:
+                pkgutil.resolve_name(f"{node.module}:{alias.name}")
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "colmap_affrect":
+            assert node.attr in colmap_affrect.__all__
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_page
 def test_links_lead_somewhere(name: str) -> None:
-    for target in re.findall(r"\]\(([^)]+)\)", text_of(name)):
-        if target.startswith("http"):
-            continue
+    for target in re.findall(r"\]\(((?!http)[^)]+)\)", TEXTS[name]):
         path, _, anchor = target.partition("#")
         file = (ROOT / name).parent / path if path else ROOT / name
         assert file.exists(), target
@@ -140,15 +122,13 @@ def test_links_lead_somewhere(name: str) -> None:
             assert anchor in slugs, target
 
 
-def test_readme_is_short_and_has_two_commands_that_set_everything_up() -> None:
-    text = text_of("README.md")
-    assert len(text.split()) < MAX_WORDS
-    assert len(re.findall(r"^python3 -m venv", text, re.MULTILINE)) == 2
-
-
-def test_every_command_is_in_the_pages() -> None:
-    text = "\n".join(text_of(name) for name in NAMES)
+def test_pages_name_every_command_and_readme_is_short() -> None:
+    text = "\n".join(TEXTS.values())
     assert all(f"colmap-affrect {command}" in text for command in COMMANDS)
+    readme = TEXTS["README.md"]
+    assert len(readme.split()) < MAX_WORDS
+    # The commands that set everything up, which .ci/run executes.
+    assert len(re.findall(r"^python3 -m venv", readme, re.MULTILINE)) == 2
 
 
 @pytest.mark.long

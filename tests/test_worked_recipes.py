@@ -1,7 +1,8 @@
-"""The scripts beside the recipes do what their pages in docs/ say."""
+"""The scripts beside the recipes and the notebook do what their pages in docs/ say."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scene import write_photographs
+from small_scene import IMAGE_SIZE, write_photographs
 
 from colmap_affrect.images.masks import read_mask
 
-RECIPES = Path(__file__).parents[1] / "recipes"
+ROOT = Path(__file__).parents[1]
+RECIPES = ROOT / "recipes"
 
 FAKE_CLUSTER = """
 class Cluster:
@@ -31,9 +33,11 @@ def make_cluster_spec(**options):
 """
 
 
-def run_script(*arguments: object) -> str:
+def run_script(*arguments: object, **options: object) -> str:
     command = [sys.executable, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.mark.long
@@ -45,12 +49,11 @@ def test_script_with_the_features_replaced_registers_the_scene(tmp_path: Path) -
 
 
 def test_masks_leave_out_borders_and_captions(tmp_path: Path) -> None:
-    names = write_photographs(tmp_path / "photos")  # 320 x 240 px
+    names = write_photographs(tmp_path / "photos", 2)
     script = RECIPES / "historical-photographs" / "border_masks.py"
-    run_script(
-        script, tmp_path / "photos", tmp_path / "masks", "--border", "0.05", "--caption", "0.2"
-    )
-    expected = np.zeros((240, 320), bool)
+    folders = tmp_path / "photos", tmp_path / "masks"
+    run_script(script, *folders, "--border", "0.05", "--caption", "0.2")
+    expected = np.zeros(IMAGE_SIZE[::-1], bool)
     expected[12 : 240 - 48, 12 : 320 - 12] = True
     for name in names:
         np.testing.assert_array_equal(read_mask(tmp_path / "masks" / f"{name}.png"), expected)
@@ -70,9 +73,17 @@ def test_cluster_is_started_and_its_address_handed_on(
     command.write_text('#!/bin/sh\necho "$@"\n')
     command.chmod(0o755)
     environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(tmp_path)}
-    path = RECIPES / "cluster" / f"{script}.py"
-    done = subprocess.run(
-        [sys.executable, str(path), *options, "--", "--image-path", "p", "--output-path", "o"],
-        capture_output=True, text=True, check=True, env=environment,
-    )  # fmt: skip
-    assert done.stdout == "run --image-path p --output-path o --scheduler tcp://there:8786\n"
+    given = [*options, "--", "--image-path", "p", "--output-path", "o"]
+    printed = run_script(RECIPES / "cluster" / f"{script}.py", *given, env=environment)
+    assert printed == "run --image-path p --output-path o --scheduler tcp://there:8786\n"
+
+
+@pytest.mark.long
+def test_cells_of_the_notebook_run_in_order_and_register_all_photographs(tmp_path: Path) -> None:
+    notebook = ROOT / "docs" / "first_run.ipynb"
+    cells = [c for c in json.loads(notebook.read_text())["cells"] if c["cell_type"] == "code"]
+    assert not any(cell["outputs"] for cell in cells)
+    code = "\n".join("".join(cell["source"]) for cell in cells)
+    environment = {"PATH": "/usr/bin:/bin", "TMPDIR": str(tmp_path), "HOME": str(tmp_path)}
+    environment |= {"MPLBACKEND": "agg"}
+    assert "9 of 9 photographs" in run_script("-c", code, cwd=notebook.parent, env=environment)

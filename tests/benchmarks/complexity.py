@@ -13,12 +13,11 @@ Of recipes with escalation only the first level counts: the others depend on pai
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from statistics import median
 
 import numpy as np
-from machine import describe_machine, table
+from machine import describe_machine, parser_of, span, table
 
 from colmap_affrect.comparison.methods import parse_method
 from colmap_affrect.images.photographs import list_images
@@ -52,24 +51,23 @@ def cost(extractor: ImageExtractor, path: Path) -> np.ndarray:
     return np.array([area_mpx, *counts, sum(level.seconds.values())])
 
 
-def table_row(label: str, costs: list[np.ndarray], baseline: list[np.ndarray]) -> list[str]:
-    """Format the mean costs of a method by round, and their ratios to the baseline."""
-    ratios = [mine[4] / base[4] for mine, base in zip(costs, baseline, strict=True)]
-    area_mpx, keypoints, regions, warps, _ = costs[0]
+def table_row(label: str, costs: np.ndarray) -> list[str]:
+    """Format the costs (rounds, 2, 5) of a method, with warps and without."""
+    area_mpx, keypoints, regions, warps, _ = costs[0, 0]
     return [
         label,
         f"{area_mpx:.1f}",
         f"{keypoints / 1000:.1f}",
         f"{regions:.1f}",
         f"{warps / regions:.1f}" if regions else "-",
-        f"{median(each[4] for each in costs):.1f}",
-        f"{median(ratios):.1f} [{min(ratios):.1f}-{max(ratios):.1f}]",
+        f"{median(costs[:, 0, 4]):.1f}",
+        span(costs[:, 0, 4] / costs[:, 1, 4], 1),
     ]
 
 
 def main() -> None:
-    """Print the table: means over images, medians over rounds."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    """Print the table: means over images, of the seconds the median over rounds."""
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--methods", nargs="+", default=["default", "second-moment-shapes"],
         help="[LABEL=]RECIPE[:KEY=VALUE[,...]]",
@@ -86,15 +84,17 @@ def main() -> None:
     extractors = {}
     for text in arguments.methods:
         extraction = parse_method(text, depth).recipe.extraction
-        extractors[text] = [
-            prepare(options, Resources(arguments.weights))
-            for options in (extraction, without_warps(extraction))
+        both = extraction, without_warps(extraction)
+        extractors[text] = [prepare(options, Resources(arguments.weights)) for options in both]
+    rounds = [
+        [
+            [np.mean([cost(way, path) for path in paths], axis=0) for way in both]
+            for both in extractors.values()
         ]
-    costs: dict[str, list[list[np.ndarray]]] = {text: [] for text in extractors}
-    for _ in range(arguments.num_rounds):
-        for text, both in extractors.items():
-            costs[text].append([np.mean([cost(way, p) for p in paths], axis=0) for way in both])
-    rows = [table_row(text, *map(list, zip(*of, strict=True))) for text, of in costs.items()]
+        for _ in range(arguments.num_rounds)
+    ]
+    costs = np.array(rounds).swapaxes(0, 1)
+    rows = [table_row(text, each) for text, each in zip(extractors, costs, strict=True)]
     print(f"{describe_machine()}\n\n{table(HEADER, rows)}")
 
 

@@ -86,15 +86,18 @@ def h5_digest(path: Path) -> str:
 
 def database_digests(path: Path) -> dict[str, str]:
     """Digest keypoints, cameras, raw matches and verified pairs."""
-    queries = {
-        "cameras": "SELECT camera_id, model, width, height, params FROM cameras ORDER BY 1",
-        "keypoints": "SELECT image_id, rows, cols, data FROM keypoints ORDER BY 1",
-        "descriptors": "SELECT image_id, rows, cols, data FROM descriptors ORDER BY 1",
-        "raw": "SELECT pair_id, rows, cols, data FROM matches ORDER BY 1",
-        "verified": "SELECT pair_id, rows, cols, data, config FROM two_view_geometries ORDER BY 1",
+    columns = {
+        "cameras": "camera_id, model, width, height, params FROM cameras",
+        "keypoints": "image_id, rows, cols, data FROM keypoints",
+        "descriptors": "image_id, rows, cols, data FROM descriptors",
+        "raw": "pair_id, rows, cols, data FROM matches",
+        "verified": "pair_id, rows, cols, data, config FROM two_view_geometries",
     }
     with closing(sqlite3.connect(path)) as connection:
-        return {key: digest(*connection.execute(query)) for key, query in queries.items()}
+        return {
+            key: digest(*connection.execute(f"SELECT {text} ORDER BY 1"))
+            for key, text in columns.items()
+        }
 
 
 def models_digest(sparse: Path) -> str:
@@ -122,10 +125,10 @@ def folder_digests(path: Path) -> dict[str, str]:
     }
 
 
-def command(*arguments: object) -> None:
-    """Run the command line."""
+def python(*arguments: object) -> None:
+    """Run Python, mostly the command line."""
     environment = {**os.environ, "COLMAP_AFFRECT_WEIGHTS": str(SHARED / "weights")}
-    line = [sys.executable, "-m", "colmap_affrect", *map(str, arguments)]
+    line = [sys.executable, *map(str, arguments)]
     done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr[-2000:]}")
@@ -137,75 +140,69 @@ def run_digests(work: Path, images: Path, names: list[str], options: list[str]) 
     listed = work / "names.txt"
     listed.write_text("\n".join(names), encoding="utf-8")
     given = ["--image-path", images, "--image-list-path", listed, "--output-path", work / "out"]
-    command("run", "--quiet", *given, *options)
+    python("-m", "colmap_affrect", "run", "--quiet", *given, *options)
     return folder_digests(work / "out")
 
 
 def drop_in_digests(work: Path) -> dict[str, str]:
     """Run the functions with pycolmap's names on four photographs of the courtyard."""
-    work.mkdir(parents=True)
+    (work / "sparse").mkdir(parents=True)
     pairs = work / "pairs.txt"
     pairs.write_text("court_1.jpg court_2.jpg\n", encoding="utf-8")
-    paths = [work / "x.db", COURTYARD / "images", pairs, work / "sparse"]
-    (work / "sparse").mkdir()
-    subprocess.run([sys.executable, "-c", DROP_IN, *map(str, paths)], check=True)
+    python("-c", DROP_IN, work / "x.db", COURTYARD / "images", pairs, work / "sparse")
     return {**database_digests(work / "x.db"), "models": models_digest(work / "sparse")}
 
 
 def interop_digests(work: Path, run: Path) -> dict[str, str]:
     """Export an output folder in both layouts, and import one of them again."""
     work.mkdir(parents=True)
-    found = {}
-    for layout in ("hloc", "dim"):
+    command, found = ("-m", "colmap_affrect"), {}
+    for layout in ("dim", "hloc"):
         paths = [work / f"{kind}-{layout}.h5" for kind in ("features", "matches")]
         files = ["--features-path", paths[0], "--matches-path", paths[1]]
-        command("export-h5", "--quiet", "--output-path", run, *files, "--layout", layout)
-        for path in paths:
-            found[path.stem] = h5_digest(path)
-    files = ["--features-path", work / "features-hloc.h5"]
-    files += ["--matches-path", work / "matches-hloc.h5"]
-    database = work / "imported.db"
-    images = COURTYARD / "images"
-    command("import-h5", "--quiet", "--image-path", images, *files, "--database-path", database)
-    return found | database_digests(database)
+        python(*command, "export-h5", "-q", "--output-path", run, *files, "--layout", layout)
+        found |= {path.stem: h5_digest(path) for path in paths}
+    given = ["--image-path", COURTYARD / "images", *files, "--database-path", work / "imported.db"]
+    python(*command, "import-h5", "-q", *given)
+    return found | database_digests(work / "imported.db")
 
 
-def scenarios(work: Path) -> dict[str, dict[str, str]]:
-    """Run everything and return the digests by name."""
-    court = sorted(path.name for path in (COURTYARD / "images").iterdir())
+Job = tuple[Path, list[str], list[str]]
+
+
+def jobs() -> dict[str, Job]:
+    """Return photographs, names and options of runs by what they are called."""
+    court, images = sorted(path.name for path in COURTYARD.glob("images/*")), COURTYARD / "images"
     depth = ["--depth-path", str(COURTYARD / "depth")]
-    jobs: dict[str, tuple[Path, list[str], list[str]]] = {
-        "courtyard default": (COURTYARD / "images", court, []),
-        "courtyard on-demand": (COURTYARD / "images", court, ["--recipe", "on-demand"]),
-        "courtyard depth-affnet-recommended": (
-            COURTYARD / "images", court[:5], ["--recipe", "depth-affnet-recommended", *depth],
-        ),
+    globally = ["--mapper", "global", "--database-descriptors", "--preset", "colmap"]
+    few = ["--pairs", "retrieval,low-resolution,sequence", "--num-neighbors", "2"]
+    demand, with_depth = ["--recipe", "on-demand"], "depth-affnet-recommended"
+    found: dict[str, Job] = {
+        "courtyard default": (images, court, []),
+        "courtyard on-demand": (images, court, demand),
+        f"courtyard {with_depth}": (images, court[:5], ["--recipe", with_depth, *depth]),
         "courtyard depth-planes, global mapper, descriptors": (
-            COURTYARD / "images", court,
-            ["--recipe", "depth-planes-recommended", *depth, "--mapper", "global",
-             "--database-descriptors", "--preset", "colmap"],
+            images, court, ["--recipe", "depth-planes-recommended", *depth, *globally]
         ),
-        "courtyard retrieval, low resolution": (
-            COURTYARD / "images", court,
-            ["--pairs", "retrieval,low-resolution,sequence", "--num-neighbors", "2"],
-        ),
+        "courtyard retrieval, low resolution": (images, court, few),
     }  # fmt: skip
     if SHARED.is_dir():
         fountain = ["0000.jpg", "0005.jpg", "0010.jpg"]
         kermit = sorted(path.name for path in KERMIT.iterdir())
-        jobs |= {
-            "courtyard affnet-shapes": (COURTYARD / "images", court[:3], AFFNET),
-            "fountain default": (FOUNTAIN, fountain, []),
-            "fountain on-demand": (FOUNTAIN, fountain, ["--recipe", "on-demand"]),
-            "fountain affnet-shapes": (FOUNTAIN, fountain, [*AFFNET, *FEWER]),
-            "kermit default": (KERMIT, kermit, []),
-            "kermit on-demand": (KERMIT, kermit, ["--recipe", "on-demand"]),
-            "kermit affnet-shapes": (KERMIT, kermit[:5], [*AFFNET, *FEWER]),
-        }
+        found["courtyard affnet-shapes"] = (images, court[:3], AFFNET)
+        for name, of in (("fountain", (FOUNTAIN, fountain)), ("kermit", (KERMIT, kermit))):
+            found[f"{name} default"] = (*of, [])
+            found[f"{name} on-demand"] = (*of, demand)
+            found[f"{name} affnet-shapes"] = (of[0], of[1][:5], [*AFFNET, *FEWER])
+    return found
+
+
+def scenarios(work: Path) -> dict[str, dict[str, str]]:
+    """Run everything and return the digests by name."""
     found = {}
-    for number, (name, (images, names, options)) in enumerate(jobs.items()):
+    for number, (name, job) in enumerate(jobs().items()):
         start = time.perf_counter()
-        found[name] = run_digests(work / str(number), images, names, options)
+        found[name] = run_digests(work / str(number), *job)
         sys.stderr.write(f"{name}: {time.perf_counter() - start:.1f} s\n")
     found["drop-in functions"] = drop_in_digests(work / "drop-in")
     found["export and import"] = interop_digests(work / "interop", work / "0" / "out")
@@ -214,9 +211,7 @@ def scenarios(work: Path) -> dict[str, dict[str, str]]:
 
 def main() -> int:
     """Write the digests, and tell which of them differ from others."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("output", type=Path, help="file to write")
     parser.add_argument("--against", type=Path, help="file of another version to compare with")
     options = parser.parse_args()

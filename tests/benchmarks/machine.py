@@ -1,14 +1,21 @@
-"""What the benchmarks share: the machine they ran on, one core, tables."""
+"""What the benchmarks share: their command lines, the machine they ran on, tables."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from statistics import fmean
 
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import installed_versions
+
+
+def parser_of(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser that is described by the first line of a module."""
+    return argparse.ArgumentParser(description=(doc or "").splitlines()[0])
 
 
 def describe_machine() -> str:
@@ -24,7 +31,20 @@ def describe_machine() -> str:
     )
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Format a Markdown table, its first column aligned left."""
     lines = [header, ["---", *["--:"] * (len(header) - 1)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def span(values: Iterable[float | None], digits: int = 0) -> str:
+    """Format mean [min-max], shortened where all values are the same; - without values.
+
+    >>> [span([2, 3, 3, 3]), span([3, 3]), span([0.25, 0.75], 2), span([None])]
+    ['2.8 [2-3]', '3', '0.500 [0.25-0.75]', '-']
+    """
+    known = [value for value in values if value is not None]
+    if not known:
+        return "-"
+    low, high = f"{min(known):.{digits}f}", f"{max(known):.{digits}f}"
+    return low if low == high else f"{fmean(known):.{digits + 1}f} [{low}-{high}]"

@@ -3,18 +3,16 @@
     python tests/benchmarks/many_images.py --output-path out/many --num-images 1000
 
 Renders photographs of a street of different houses from random places, once, seven to the metre,
-and runs the command on them in a process of its own, whose memory is looked at ten times a second.
-Prints a table of its stages, and how many images of the largest model are where they were rendered.
+and runs the command on them. Prints the seconds of its stages, the largest memory of a process, and
+how many images of the largest model are where they were rendered.
 """
 
 from __future__ import annotations
 
-import argparse
-import re
+import json
+import os
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
@@ -22,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import describe_machine, table
+from machine import describe_machine, parser_of, table
 
 from colmap_affrect.colmap.poses import read_poses
 from colmap_affrect.comparison.pose_scores import pose_scores
@@ -122,49 +120,6 @@ def take_photographs(folder: Path, count: int) -> None:
         list(pool.map(take_photograph, missing.keys(), missing.values(), chunksize=8))
 
 
-INTERVAL_S = 0.1
-PROGRESS = re.compile(r"^([\w ()-]+): \d+/\d+ \w+")
-
-
-def resident_mib(process_id: int) -> int:
-    """Return the resident memory of a process and the one that works for it, 0 when both ended."""
-    place = Path(f"/proc/{process_id}")
-    try:
-        status = (place / "status").read_text(encoding="ascii", errors="replace")
-        workers = (place / "task" / str(process_id) / "children").read_text().split()
-    except OSError:
-        return 0
-    own = next((int(s.split()[1]) >> 10 for s in status.splitlines() if s[:5] == "VmRSS"), 0)
-    return own + sum(resident_mib(int(worker)) for worker in workers)
-
-
-def watch(command: Sequence[str]) -> dict[str, list[tuple[float, int]]]:
-    """Run a command; return for each stage of its progress (seconds, resident MiB) at moments.
-
-    Raises:
-        CalledProcessError: when it fails.
-    """
-    start, stages = time.perf_counter(), ["start"]
-    moments: dict[str, list[tuple[float, int]]] = {}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-
-        def look() -> None:
-            while process.poll() is None:
-                now = (time.perf_counter() - start, resident_mib(process.pid))
-                moments.setdefault(stages[-1], []).append(now)
-                time.sleep(INTERVAL_S)
-
-        threading.Thread(target=look, daemon=True).start()
-        for line in process.stderr or ():
-            if found := PROGRESS.match(line):
-                stages.append(found[1])
-            else:
-                print(line, end="", file=sys.stderr)
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, command)
-    return moments
-
-
 def scores(model_path: Path, count: int) -> str:
     """Compare a model with the places that the images were rendered from."""
     views = [view_of(number) for number in range(count)]
@@ -178,28 +133,29 @@ def scores(model_path: Path, count: int) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--output-path", type=Path, required=True)
     parser.add_argument("--num-images", type=int, default=1000)
     parser.add_argument("options", nargs="*", help="of run, after --; default: --pairs retrieval")
     arguments = parser.parse_args()
-    photographs = arguments.output_path / "images"
+    photographs, out = arguments.output_path / "images", arguments.output_path / "run"
     photographs.mkdir(parents=True, exist_ok=True)
     take_photographs(photographs, arguments.num_images)
     parameters = f"{FOCAL_LENGTH_PX},{FOCAL_LENGTH_PX},{IMAGE_SIZE[0] / 2},{IMAGE_SIZE[1] / 2}"
     command = [
         *(sys.executable, "-m", "colmap_affrect", "run", "--overwrite"),
-        *("--image-path", str(photographs), "--output-path", str(arguments.output_path / "run")),
+        *("--image-path", str(photographs), "--output-path", str(out)),
         *("--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", parameters),
         *(arguments.options or ("--pairs", "retrieval")),
     ]
     print(describe_machine())
-    rows = [
-        (name, f"{seen[-1][0] - seen[0][0]:.0f}", f"{max(mib for _, mib in seen)}")
-        for name, seen in watch(command).items()
-    ]
-    print(table(("stage", "seconds", "memory at most (MiB)"), rows))
-    print(scores(arguments.output_path / "run" / "sparse" / "0", arguments.num_images))
+    _, status, usage = os.wait4(subprocess.Popen(command).pid, 0)
+    if status:
+        raise SystemExit(f"the run ended with {os.waitstatus_to_exitcode(status)}")
+    stages = json.loads((out / "report.json").read_text(encoding="utf-8"))["stages"]
+    print(table(("stage", "seconds"), [(each["name"], f"{each['wall_s']:.0f}") for each in stages]))
+    print(f"memory at most: {usage.ru_maxrss / 2**20:.2f} GiB")  # of a process, KiB
+    print(scores(out / "sparse" / "0", arguments.num_images))
 
 
 if __name__ == "__main__":

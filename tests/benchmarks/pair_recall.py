@@ -11,15 +11,14 @@ choosing. Usage:
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from machine import table
+from machine import parser_of, table
 
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair
@@ -34,17 +33,6 @@ from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 HEADER = ("chosen by", "chosen", "recall", "possible", "inliers", "s")
 
 
-def inliers_of_pairs(workspace: Workspace) -> dict[Pair, int]:
-    """Read the inliers of the pairs that verify."""
-    verification = Context(workspace).verification
-    with open_database(workspace.database) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-    found = verified_pairs(workspace.database, verification.min_num_inliers)
-    return {
-        (min(names[a], names[b]), max(names[a], names[b])): count for (a, b), count in found.items()
-    }
-
-
 def ways_to_choose(features: FeatureStore) -> dict[str, Callable[[int], Sequence[Pair]]]:
     """Return the ways to choose pairs such that images have so many neighbours on average."""
     names = sorted(features.names())
@@ -53,32 +41,24 @@ def ways_to_choose(features: FeatureStore) -> dict[str, Callable[[int], Sequence
     def count(pair: Pair) -> int:
         return len(matcher.match(*map(matcher.prepared, pair)).indices)
 
-    def retrieved(num: int) -> list[Pair]:
-        return retrieved_pairs(names, features.read, num, SILENT)
-
-    def low_resolution(num: int) -> list[Pair]:
-        return low_resolution_pairs(names, count, num, SILENT)
-
-    def either(num: int) -> list[Pair]:
-        half = -(-num // 2)
-        return sorted({*retrieved(half), *low_resolution(half)})
-
     return {
-        "retrieval": retrieved,
-        "low-resolution": low_resolution,
-        "either of both": either,
+        "retrieval": lambda num: retrieved_pairs(names, features.read, num, SILENT),
+        "low-resolution": lambda num: low_resolution_pairs(names, count, num, SILENT),
         "sequence": lambda num: sequence_pairs(names, -(-num // 2)),
     }
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("output_path", type=Path, help="folder of a finished run")
     parser.add_argument("--shares", type=float, nargs="+", default=[0.1, 0.2, 0.3])
     arguments = parser.parse_args()
-    workspace = Workspace(arguments.output_path)
-    features, inliers = Context(workspace).features, inliers_of_pairs(workspace)
+    context = Context(Workspace(arguments.output_path))
+    features, database_path = context.features, context.workspace.database
+    names = {image_id: name for name, image_id in image_ids(database_path).items()}
+    verified = verified_pairs(database_path, context.verification.min_num_inliers)
+    inliers = {tuple(sorted((names[a], names[b]))): n for (a, b), n in verified.items()}
     num_images, num_right = len(features.names()), len(inliers)
     num_pairs = num_images * (num_images - 1) // 2
     rows = []

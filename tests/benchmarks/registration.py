@@ -15,28 +15,19 @@ again as long as the options are the same: after a change of code remove that fo
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
+
+from machine import parser_of, span, table
 
 
-@dataclass(frozen=True)
-class Subset:
-    """Some images of one scene.
-
-    Attributes:
-        scene: folder of the scene.
-        step: every step-th image in sorted order is taken.
-        calibrated: whether the runs are given the true intrinsics.
-        first: number of the first image.
-    """
+class Subset(NamedTuple):
+    """Every step-th image of a scene in sorted order, perhaps with the true intrinsics."""
 
     scene: str
     step: int
@@ -44,20 +35,21 @@ class Subset:
     first: int = 0
 
 
+FOUNTAIN, HERZ, TEMPLE = "strecha_fountain_p11", "strecha_herz_jesus_p25", "temple_sparse_ring"
 SUBSETS = {
-    "fountain 0,5,10": Subset("strecha_fountain_p11", 5, True),
-    "herz 0,8,16,24": Subset("strecha_herz_jesus_p25", 8, True),
+    "fountain 0,5,10": Subset(FOUNTAIN, 5, True),
+    "herz 0,8,16,24": Subset(HERZ, 8, True),
     "kermit /2": Subset("kermit", 2, False),
     "sacre_coeur /2": Subset("sacre_coeur", 2, False),
     "saharov /4": Subset("saharov32", 4, True),
-    "temple /2": Subset("temple_sparse_ring", 2, True),
-    "temple all": Subset("temple_sparse_ring", 1, True),
-    "temple 1/2": Subset("temple_sparse_ring", 2, True, 1),
+    "temple /2": Subset(TEMPLE, 2, True),
+    "temple all": Subset(TEMPLE, 1, True),
+    "temple 1/2": Subset(TEMPLE, 2, True, 1),
     "saharov 1/5": Subset("saharov32", 5, True, 1),
     "kermit /3": Subset("kermit", 3, False),
     "sacre_coeur /3": Subset("sacre_coeur", 3, False),
-    "fountain 1,5,9": Subset("strecha_fountain_p11", 4, True, 1),
-    "herz /6": Subset("strecha_herz_jesus_p25", 6, True),
+    "fountain 1,5,9": Subset(FOUNTAIN, 4, True, 1),
+    "herz /6": Subset(HERZ, 6, True),
     "kitchen /2": Subset("kitchen", 2, False),
     "kitchen all": Subset("kitchen", 1, False),
     "et /2": Subset("et", 2, False),
@@ -66,13 +58,10 @@ SUBSETS = {
     "dunes 1/3": Subset("copr_kap", 3, False, 1),
     "nadar all": Subset("nadar", 1, False),
     "sceaux all": Subset("sceaux", 1, False),
-    "herz all": Subset("strecha_herz_jesus_p25", 1, True),
+    "herz all": Subset(HERZ, 1, True),
 }
-SUBSETS |= {
-    f"{name} (unknown)": replace(subset, calibrated=False)
-    for name, subset in SUBSETS.items()
-    if subset.calibrated
-}
+calibrated = {name: subset for name, subset in SUBSETS.items() if subset.calibrated}
+SUBSETS |= {f"{name} (unknown)": s._replace(calibrated=False) for name, s in calibrated.items()}
 
 
 def compare(
@@ -126,57 +115,48 @@ def compare_subset(
 
 def rows_of(name: str, comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each method and seed of a comparison."""
-    return [
-        {
-            "subset": name,
-            "num_images": comparison["images_total"],
-            "method": method,
-            "seed": seed["seed"],
-            "registered": seed["registered"],
-            "correct": seed["scores"] and len(seed["scores"]["correct_names"]),
-            "rotation_error_deg": seed["scores"] and seed["scores"]["median_rotation_error_deg"],
-            "points": seed["points3D"],
-        }
-        for method, result in comparison["methods"].items()
-        for seed in result.get("seeds", ())
-    ]
+    rows = []
+    for method, result in comparison["methods"].items():
+        for seed in result.get("seeds", ()):
+            scores = seed["scores"] or {}
+            rows.append(
+                {
+                    "subset": name,
+                    "num_images": comparison["images_total"],
+                    "method": method,
+                    "seed": seed["seed"],
+                    "registered": seed["registered"],
+                    "correct": len(scores["correct_names"]) if scores else None,
+                    "rotation_error_deg": scores.get("median_rotation_error_deg"),
+                    "points": seed["points3D"],
+                }
+            )
+    return rows
 
 
-def span(values: Iterable[float | None], digits: int = 0) -> str:
-    """Format mean [min-max], shortened where all values are the same; - without values.
-
-    >>> [span([2, 3, 3, 3]), span([3, 3]), span([0.25, 0.75], 2), span([None])]
-    ['2.8 [2-3]', '3', '0.500 [0.25-0.75]', '-']
-    """
-    known = [value for value in values if value is not None]
-    if not known:
-        return "-"
-    low, high = f"{min(known):.{digits}f}", f"{max(known):.{digits}f}"
-    return low if low == high else f"{fmean(known):.{digits + 1}f} [{low}-{high}]"
-
-
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table_of(rows: Sequence[dict[str, Any]]) -> str:
     """Format "correct of registered, rotation error" as a Markdown table of subsets by methods."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = [f"| subset | images | {' | '.join(methods)} |", f"|---|--:|{'--:|' * len(methods)}"]
-    for name in (name for name in SUBSETS if any(row["subset"] == name for row in rows)):
+    lines = []
+    for name in SUBSETS:
+        of_subset = [row for row in rows if row["subset"] == name]
         cells = []
-        for method in methods:
-            runs = [row for row in rows if (row["subset"], row["method"]) == (name, method)]
+        for method in methods if of_subset else ():
+            runs = [row for row in of_subset if row["method"] == method]
             correct, registered = (
                 span(run[key] for run in runs) for key in ("correct", "registered")
             )
             errors = span((run["rotation_error_deg"] for run in runs), 2)
             cells.append(f"{correct} of {registered}, {errors} degrees")
-        num_images = next(row["num_images"] for row in rows if row["subset"] == name)
-        lines.append(f"| {name} | {num_images} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        if of_subset:
+            lines.append([name, str(of_subset[0]["num_images"]), *cells])
+    return table(["subset", "images", *methods], lines)
 
 
 def main() -> None:
     """Run all methods on all subsets."""
     root = Path(__file__).resolve().parents[2]
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--methods", nargs="+", default=["sift", "sift-affine-dsp", "default"])
     parser.add_argument("--subsets", nargs="+", choices=SUBSETS, default=SUBSETS, metavar="NAME")
     parser.add_argument("--seeds", type=int, default=5, help="run the seeds 0 to SEEDS - 1")
@@ -189,19 +169,13 @@ def main() -> None:
     rows = json.loads(output_path.read_text()) if output_path.exists() else []
     weights = ["--weights", arguments.weights] if arguments.weights else []
     for name in arguments.subsets:
-        comparison = compare_subset(
-            name,
-            arguments.scenes_path,
-            arguments.work_path,
-            arguments.methods,
-            arguments.seeds,
-            *weights,
-        )
-        new = rows_of(name, comparison)
+        folders = arguments.scenes_path, arguments.work_path
+        given = arguments.methods, arguments.seeds, *weights
+        new = rows_of(name, compare_subset(name, *folders, *given))
         redone = {(row["subset"], row["method"]) for row in new}
         rows = [row for row in rows if (row["subset"], row["method"]) not in redone] + new
         output_path.write_text(json.dumps(rows, indent=1) + "\n")
-    print(table(rows))
+    print(table_of(rows))
 
 
 if __name__ == "__main__":

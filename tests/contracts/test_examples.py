@@ -1,4 +1,4 @@
-"""The parts of ARCHITECTURE.md, registered as it says, do their work."""
+"""The parts of ARCHITECTURE.md do their work, as entry points of another package."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from contracts.matcher_contract import MatcherContract
+from contracts.contracts import MatcherContract
 from small_scene import NAMES
 from synthetic import texture, write_image
 
+from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
-from colmap_affrect.options import Registry
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
@@ -25,38 +25,36 @@ from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 
 TEXT = (Path(__file__).parents[2] / "ARCHITECTURE.md").read_text(encoding="utf-8")
+PARTS = {"mutual": MATCHERS, "orb": EXTRACTORS, "plain": MAPPERS}
 
 
-def register(
-    registry: Registry[object], name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Write the example of a part to a file, and add the line that the text gives for it."""
-    line = re.search(rf'`"{name}":\s+"([\w.]+):(\w+)"`', TEXT)
-    assert line is not None
-    module = line[1].rpartition(".")[2]
-    path = line[1].replace(".", "/")
-    code = re.search(rf"```python\n(# {path}\.py\n.*?)```", TEXT, re.DOTALL)
-    assert code is not None
-    (folder / f"{module}.py").write_text(code[1], encoding="utf-8")
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setitem(registry.built_in, name, f"{module}:{line[2]}")
-    monkeypatch.delitem(sys.modules, module, raising=False)
+@pytest.fixture(autouse=True)
+def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package on the path, as pip leaves it, with the lines that the text gives for each part."""
+    info = tmp_path / "other_affrect-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-affrect\nVersion: 1.0\n")
+    points = []
+    for name, registry in PARTS.items():
+        line = re.search(rf'`"{name}":\s+"([\w.]+):(\w+)"`', TEXT)
+        assert line is not None
+        package, _, module = line[1].rpartition(".")
+        path = f"{package}.{module}".replace(".", "/")
+        code = re.search(rf"```python\n(# {path}\.py\n.*?)```", TEXT, re.DOTALL)
+        assert code is not None
+        (tmp_path / f"{module}.py").write_text(code[1], encoding="utf-8")
+        points.append(f"[{registry.group}]\n{name} = {module}:{line[2]}\n")
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    (info / "entry_points.txt").write_text("\n".join(points))
+    monkeypatch.syspath_prepend(tmp_path)
 
 
 class TestMutual(MatcherContract):
-    @pytest.fixture(autouse=True)
-    def _registered(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        register(MATCHERS, "mutual", tmp_path, monkeypatch)
-
     def make(self) -> Matcher:
         return MATCHERS.make(MATCHERS.options("mutual"), MatcherContext())
 
 
-def test_new_extractor_and_matcher_are_chosen_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    register(MATCHERS, "mutual", tmp_path, monkeypatch)
-    register(EXTRACTORS, "orb", tmp_path, monkeypatch)
+def test_new_extractor_and_matcher_are_chosen_by_name(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     image = texture((240, 180), 1)
@@ -80,12 +78,16 @@ def test_new_extractor_and_matcher_are_chosen_by_name(
     assert right.mean() > 0.8
 
 
-def test_new_mapper_is_chosen_by_name(
-    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    register(MAPPERS, "plain", tmp_path, monkeypatch)
+def test_new_mapper_is_chosen_by_name(photos: Path, tmp_path: Path) -> None:
     options = RunOptions(
         recipe=load_recipe("unrectified-rootsift"), mapping=MAPPERS.options("plain")
     )
     report = run(photos, tmp_path / "out", options)
     assert report.registered_names == tuple(sorted(NAMES))
+
+
+def test_names_and_options_of_other_packages_are_checked_as_our_own() -> None:
+    with pytest.raises(OptionError, match=r"unknown option 'num' .did you mean 'name'"):
+        load_recipe("default", ["matching.name=mutual", "matching.num=3"])
+    with pytest.raises(OptionError, match=r"unknown matcher 'mutal' .did you mean 'mutual'"):
+        load_recipe("default", ["matching.name=mutal"])

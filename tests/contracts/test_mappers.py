@@ -10,6 +10,7 @@ from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
 from small_scene import INTRINSICS, NAMES
 
 import colmap_affrect
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database
@@ -29,23 +30,20 @@ def task(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> MappingTask:
 def test_mapper_registers_tells_of_it_and_keeps_given_cameras(
     name: str, task: MappingTask, tmp_path: Path
 ) -> None:
-    mapper = MAPPERS.make(MAPPERS.options(name))
     shown: list[int] = []
+    mapper = MAPPERS.make(MAPPERS.options(name))
     (model, *_) = map_database(mapper, task, tmp_path / "sparse", shown.append)
     assert model.registered_names == tuple(sorted(NAMES))
     assert sum(shown) == len(NAMES)
     assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
-    params = colmap_affrect.colmap.pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras
-    assert [camera.params.tolist() for camera in params.values()] == [
-        [float(value) for value in INTRINSICS.split(",")]
-    ]
+    (camera,) = pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras.values()
+    assert camera.params.tolist() == [float(value) for value in INTRINSICS.split(",")]
 
 
 @pytest.mark.parametrize("name", MAPPERS.names())
 def test_mapper_says_where_it_differs_and_takes_native_options(name: str) -> None:
     options = MAPPERS.options({"name": name, "random_seed": 5, "mapper_options": {}})
-    differences = MAPPERS.make(options).differences(NOTHING_KNOWN)
-    assert differences["random_seed"] == 5
+    assert MAPPERS.make(options).differences(NOTHING_KNOWN)["random_seed"] == 5
     colmap = type(options).preset("colmap")
     assert (colmap.preset_name, options.preset_name) == ("colmap", "sparse")
     with pytest.raises(OptionError, match="no such option"):

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contracts.depth_contract import DepthContract
-from contracts.extractor_contract import ExtractorContract
-from contracts.matcher_contract import MatcherContract
-from contracts.rectifier_contract import IMAGES, RectifierContract
+from contracts.contracts import (
+    IMAGES,
+    DepthContract,
+    ExtractorContract,
+    MatcherContract,
+    RectifierContract,
+)
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from random_weights import write_comparing_lightglue, write_random_weights
@@ -21,7 +24,6 @@ from colmap_affrect.features.base import (
     SHAPES,
     FeatureExtractor,
     NetworkContext,
-    ShapeSource,
 )
 from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.shapes import STEP_PX
@@ -59,13 +61,12 @@ LONG = ["aliked", "disk"]
 class TestExtractors(ExtractorContract):
     @pytest.fixture(autouse=True)
     def _case(self, case: str, weights: dict[str, Path]) -> None:
-        self.options, self.network = (
-            EXTRACTORS.options(FEATURES[case]),
-            NetworkContext(weights),
+        self.extractor = EXTRACTORS.make(
+            EXTRACTORS.options(FEATURES[case]), NetworkContext(weights)
         )
 
     def make(self) -> FeatureExtractor:
-        return EXTRACTORS.make(self.options, self.network)
+        return self.extractor
 
 
 MATCHER_CHOICES = {"lightglue": {"name": "lightglue", "trained_for": "sift"}}
@@ -86,7 +87,6 @@ class TestMatchers(MatcherContract):
 
     def make(self) -> Matcher:
         options = MATCHERS.options(MATCHER_CHOICES.get(self.name, self.name))
-        assert options.name == self.name
         return MATCHERS.make(options, MatcherContext(self.comparing))
 
 
@@ -131,51 +131,34 @@ class TestRectifier(RectifierContract):
 UNIT_ERROR = 1e-4
 
 
-@pytest.fixture
-def source(request: pytest.FixtureRequest, weights: dict[str, Path]) -> ShapeSource:
-    return SHAPES.make(SHAPES.options(request.param), NetworkContext(weights), None)
-
-
-every_source = pytest.mark.parametrize("source", SHAPES.names(), indirect=True)
-
-
 def assert_unit_metrics(metrics: np.ndarray) -> None:
     first, second, mixed = np.moveaxis(metrics, -1, 0)
     assert (first > 0).all()
     assert_allclose(first * second - mixed**2, 1.0, atol=UNIT_ERROR, rtol=UNIT_ERROR)
 
 
-@every_source
-def test_grid_has_a_unit_metric_for_every_block_in_its_middle(source: ShapeSource) -> None:
+@pytest.mark.parametrize("name", SHAPES.names())
+def test_shapes_are_unit_metrics_by_block_and_by_sample(
+    name: str, weights: dict[str, Path]
+) -> None:
+    source = SHAPES.make(SHAPES.options(name), NetworkContext(weights), None)
     image = IMAGES["textured"]
-    grid = source.grid(image)
+    grid, samples = source.grid(image), source.samples(image)
     cells = tuple(ceil(length / STEP_PX) for length in image.shape)
     assert grid.textured.shape == cells
     assert grid.metrics.shape == (*cells, 3)
     assert (grid.step_px, grid.origin_px) == (STEP_PX, (STEP_PX - 1) / 2)
     assert grid.textured.any()
     assert_unit_metrics(grid.metrics)
-
-
-@every_source
-def test_samples_lie_in_the_image_and_have_unit_metrics(source: ShapeSource) -> None:
-    image = IMAGES["textured"]
-    samples = source.samples(image)
     assert samples.points.shape == (len(samples.metrics), 2)
     assert len(samples.points) > 10
     assert (samples.points >= 0).all()
-    blocks = STEP_PX * np.ceil(np.array(image.shape[::-1]) / STEP_PX)  # the last ones may stick out
-    assert (samples.points < blocks).all()
+    assert (samples.points < STEP_PX * np.array(cells[::-1])).all()  # the last ones may stick out
     assert_unit_metrics(samples.metrics)
-
-
-@every_source
-def test_flat_images_have_no_texture_and_no_samples(source: ShapeSource) -> None:
-    image = IMAGES["flat"]
-    grid = source.grid(image)
-    assert not grid.textured.any()
-    assert_allclose(grid.metrics, np.broadcast_to([1.0, 1.0, 0.0], grid.metrics.shape))
-    assert len(source.samples(image).points) == 0
+    flat = source.grid(IMAGES["flat"])
+    assert not flat.textured.any()
+    assert_allclose(flat.metrics, np.broadcast_to([1.0, 1.0, 0.0], flat.metrics.shape))
+    assert len(source.samples(IMAGES["flat"]).points) == 0
 
 
 @pytest.mark.parametrize("kind", ["z", "ray", "inverse"])

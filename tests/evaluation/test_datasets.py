@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import posed_photographs as scenes
 import pytest
-from planar_pairs import SIZE, TRUTH, write_extreme_views, write_pair
-from posed_photographs import pose
+from posed_photographs import SIZE, TRUTH, pose, write_extreme_views, write_pair
 from small_scene import FOCAL_PX
 
 from colmap_affrect.colmap.poses import relative_pose

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command import run_in_process_of_its_own
-from planar_pairs import TRUTH, write_extreme_views
-from posed_photographs import write_imc
+from posed_photographs import TRUTH, write_extreme_views, write_imc
 
 from colmap_affrect.errors import EvaluationError, OptionError
 from colmap_affrect.evaluation import evaluate as module

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from room_panoramas import write_panoramas
+from planar_scenes import write_panoramas
 from small_scene import NAMES
 
 import colmap_affrect

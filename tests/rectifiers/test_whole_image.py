@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from contracts.rectifier_contract import photograph_of
+from contracts.contracts import photograph_of
 from numpy.testing import assert_allclose
 from planar_scenes import FixedShapes
 from synthetic import texture

@@ -4,8 +4,7 @@
     CAMPAIGN=10 pytest -m long --dist load tests/robustness/test_campaign.py
 
 The second line makes ten times as many trials by chance. Each trial has a number, which seeds it,
-stands alone, and says what it did when it fails. Kills
-at system calls and full disks: tests/benchmarks/campaign.py.
+stands alone, and says what it did when it fails. Kills and full disks: test_interruption.py.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ import matplotlib.pyplot  # noqa: F401 - before HOME is another, where it would 
 import pytest
 from command import CAMERA, FAST, Call, Ended, run_in_process_of_its_own
 from damaged import damage, execute
-from planar_pairs import write_extreme_views
+from posed_photographs import write_extreme_views
 from results import database_content, differences, results, tree
 
 from colmap_affrect.colmap import pycolmap

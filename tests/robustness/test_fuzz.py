@@ -8,10 +8,10 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from damaged import HARMS
-from synthetic import write_image
 
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import AffrectError
@@ -22,12 +22,56 @@ from colmap_affrect.recipes import load_recipe, recipe_folder, recipe_names
 
 NAMES = ["a.png", "b c.png", "side/č.png", "side/d,e.png", "# f.png"]
 PAIRS = "# pairs\na.png b c.png\nside/č.png\ta.png\na.png,side/d,e.png\n# f.png a.png\n"
+DEPTH = np.arange(1.0, 25.0).reshape(4, 6) ** 1.5
 
 
-def fuzz(path: Path, valid: list[bytes], count: int, read: Callable[[], object]) -> None:
-    """Read a damaged file again and again: some of it is taken, much of it refused."""
-    chance = random.Random(1)
-    refused = 0
+def npy(values: np.ndarray) -> bytes:
+    content = io.BytesIO()
+    np.save(content, values)
+    return content.getvalue()
+
+
+def encoded(suffix: str, values: np.ndarray) -> bytes:
+    return cv2.imencode(suffix, values)[1].tobytes()
+
+
+def pairs(path: Path) -> None:
+    for pair in read_pairs(path, NAMES):
+        assert set(pair) <= set(NAMES)
+
+
+def recipe(path: Path) -> None:
+    load_recipe(str(path))
+
+
+def depth_map(path: Path) -> None:
+    camera = camera_matrix((6, 4))
+    photograph = Photograph(np.zeros((4, 6), np.uint8), "a.jpg", path.with_name("a.jpg"), camera)
+    depth = DepthFiles(DepthFilesOptions(path=str(path.parent))).depth(photograph)
+    assert depth.dtype == np.float32
+    assert not (depth <= 0).any()
+
+
+RECIPES = [(recipe_folder() / f"{name}.toml").read_bytes() for name in recipe_names()]
+
+
+@pytest.mark.usefixtures("capfd")  # what decoders have to say
+@pytest.mark.parametrize(
+    ("name", "read", "valid", "count"),
+    [
+        ("pairs.txt", pairs, [PAIRS.encode()], 1000),
+        ("recipe.toml", recipe, RECIPES, 600),
+        ("a.npy", depth_map, [npy(DEPTH)], 130),
+        ("a.png", depth_map, [encoded(".png", DEPTH.astype(np.uint16))], 130),
+        ("a.tif", depth_map, [encoded(".tif", DEPTH.astype(np.float32))], 130),
+    ],
+)
+def test_damaged_files_are_taken_or_refused(
+    tmp_path: Path, name: str, read: Callable[[Path], None], valid: list[bytes], count: int
+) -> None:
+    chance, path, refused = random.Random(1), tmp_path / name, 0
+    path.write_bytes(valid[0])
+    read(path)
     for _ in range(count):
         content = bytearray(chance.choice(valid))
         for harm in chance.choices(HARMS, k=chance.choice((1, 1, 3))):
@@ -37,52 +81,9 @@ def fuzz(path: Path, valid: list[bytes], count: int, read: Callable[[], object])
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                read()
+                read(path)
         except AffrectError as error:
             refused += bool(str(error))
         except Exception as error:
             raise AssertionError(f"{error!r} for {bytes(content[:500])!r}") from error
-    assert 10 < refused < count
-
-
-def test_lists_of_pairs(tmp_path: Path) -> None:
-    path = tmp_path / "pairs.txt"
-
-    def read() -> None:
-        for pair in read_pairs(path, NAMES):
-            assert set(pair) <= set(NAMES)
-
-    fuzz(path, [PAIRS.encode()], 1000, read)
-
-
-def test_recipe_files(tmp_path: Path) -> None:
-    path = tmp_path / "recipe.toml"
-    valid = [(recipe_folder() / f"{name}.toml").read_bytes() for name in recipe_names()]
-    fuzz(path, valid, 600, lambda: load_recipe(str(path)))
-
-
-def map_bytes(suffix: str, folder: Path) -> bytes:
-    """A valid depth map of 6 x 4 px."""
-    depth, content = np.arange(1.0, 25.0).reshape(4, 6) ** 1.5, io.BytesIO()
-    if suffix == ".png":
-        return write_image(folder / "map.png", depth.astype(np.uint16)).read_bytes()
-    np.save(content, depth)
-    return content.getvalue()
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".png"])
-@pytest.mark.usefixtures("capfd")  # what decoders have to say
-def test_depth_maps(tmp_path: Path, suffix: str) -> None:
-    folder = tmp_path / "maps"
-    folder.mkdir()
-    photograph = Photograph(
-        np.zeros((4, 6), np.uint8), "a.jpg", folder / "a.jpg", camera_matrix((6, 4))
-    )
-    source = DepthFiles(DepthFilesOptions(path=str(folder)))
-
-    def read() -> None:
-        depth = source.depth(photograph)
-        assert depth.dtype == np.float32
-        assert not (depth <= 0).any()
-
-    fuzz(folder / f"a{suffix}", [map_bytes(suffix, tmp_path)], 130, read)
+    assert refused > 10
