@@ -16,7 +16,7 @@ from colmap_affrect.mappers.adjustment import EXIF_SIGMA, MEDIUM, Adjuster, Foca
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.growing import Grower, Joiner, Models
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 
 ZOOMS = 1.0, 1.4, 0.7, 2.0
 """Factors of the usual focal length near which unknown ones begin: all lenses from wide to long."""
@@ -86,6 +86,15 @@ class Search:
             self.grower(graph).finish(mapped.reconstruction)
         spreads = _spreads([model for evidence, model in rivals if evidence > most - MIN_GAIN])
         return [replace(best[0], rival_focals_px=spreads), *best[1:]]
+
+    def with_own_cameras(
+        self, graph: PairGraph, model: pycolmap.Reconstruction
+    ) -> pycolmap.Reconstruction:
+        """Return a model with the cameras of the graph that begins with those of another one."""
+        grower = self.grower(graph)
+        own = grower.placed(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
+        grower.finish(own)
+        return own
 
     def _beyond(self, graph: PairGraph, start: pycolmap.Reconstruction) -> list[MappedModel]:
         near = replace(self, adjuster=self._as_found(start))

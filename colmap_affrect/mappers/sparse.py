@@ -17,6 +17,7 @@ from colmap_affrect.mappers.search import Search
 from colmap_affrect.options import within
 
 SOME_TRACKS = "from some of the tracks"  # the move that makes easy models
+OWN_CAMERAS = "with a camera for each photograph"
 LARGE = 100  # images from which on COLMAP's own pipeline maps
 
 
@@ -113,11 +114,13 @@ class SparseMapper(IncrementalMapper):
         if not task.may_share or len(cameras) == len(task.cameras):
             return self._best(task, graph, native, show)[0]
         sharing = replace(task, cameras=cameras)
-        shared, evidence = self._best(sharing, graph.with_cameras(cameras), native, show)
-        if not shared or not graph.is_explained_by(shared[0].reconstruction):
-            free, most = self._best(task, graph, native, show)
-            if evidence < most - MIN_GAIN:
-                return free
+        shared, most = self._best(sharing, graph.with_cameras(cameras), native, show)
+        if not shared:
+            return self._best(task, graph, native, show)[0]
+        search, best = self._search(task, graph, native, show), shared[0]
+        own = search.with_own_cameras(graph, best.reconstruction)
+        if search.evidence.of(own) > most + MIN_GAIN:
+            return [replace(best, reconstruction=own, moves=(*best.moves, OWN_CAMERAS)), *shared[1:]]
         return shared
 
     def _best(
