@@ -66,7 +66,6 @@ class SeedResult:
     scores: PoseScores | None  # against ground truth; None where there is none
     wall_s: Mapping[str, float]  # seconds of ``verify`` and ``map``
     doubtful: Mapping[str, str] = field(default_factory=dict)  # images that cannot be trusted: why
-    doubts: tuple[str, ...] = ()  # reasons to doubt the model as a whole
 
     @property
     def registered_names(self) -> tuple[str, ...]:
@@ -83,12 +82,6 @@ class SeedResult:
         """Images registered correctly; without ground truth those registered."""
         return self.registered_names if self.scores is None else self.scores.correct_names
 
-    @property
-    def reasons_to_doubt(self) -> dict[str, str]:
-        """Registered images that cannot be trusted, with the reason: their own or the model's."""
-        doubted = self.registered_names if self.doubts else ()
-        return {**dict.fromkeys(doubted, ", ".join(self.doubts)), **self.doubtful}
-
     @model_serializer(mode="wrap")
     def _with_measures(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         measures = {key: measure(self) for key, measure in MEASURES.items()}
@@ -97,7 +90,7 @@ class SeedResult:
 
 MEASURES: dict[str, Callable[[SeedResult], float]] = {
     "registered": lambda seed: len(seed.registered_names),
-    "num_doubtful": lambda seed: len(seed.reasons_to_doubt),
+    "num_doubtful": lambda seed: len(seed.doubtful),
     "num_models": lambda seed: len(seed.model_names),
     "verified_pairs": lambda seed: len(seed.pair_inliers),
     "inliers": lambda seed: sum(seed.pair_inliers.values()),
@@ -166,7 +159,7 @@ class MethodResult:
     @cached_property
     def usually_doubted(self) -> dict[str, str]:
         """Images that cannot be trusted in more than half of the seeds, with a reason."""
-        seeds = [seed.reasons_to_doubt for seed in self.seeds]
+        seeds = [dict(seed.doubtful) for seed in self.seeds]
         names = in_most([list(reasons) for reasons in seeds])
         return {name: next(r[name] for r in seeds if name in r) for name in sorted(names)}
 

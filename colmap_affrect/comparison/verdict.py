@@ -173,11 +173,7 @@ def _doubts_of(method: MethodResult) -> list[str]:
     names = defaultdict(list)
     for name in sorted(in_most([list(seed.doubtful) for seed in method.seeds])):
         names[reasons[name]].append(name)
-    of_model = sorted(in_most([seed.doubts for seed in method.seeds]))
-    return [
-        *(f"{_listed(same)} ({why})" for why, same in names.items()),
-        *(f"the whole model ({why})" for why in of_model),
-    ]
+    return [f"{_listed(same)} ({why})" for why, same in names.items()]
 
 
 def _contradictions(comparison: Comparison) -> list[str]:

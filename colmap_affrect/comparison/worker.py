@@ -193,7 +193,6 @@ class _Method:
             scores=None,
             wall_s=watch.seconds,
             doubtful=largest.doubtful,
-            doubts=largest.doubts,
         )
 
     def _map_recipe(
