@@ -75,7 +75,7 @@ class Evidence:
         ratios = {}
         for image_id, number in partners.items():
             features = np.flatnonzero(number > 1)
-            num = self._cells(image_id, self.graph.keypoints[image_id][features])
+            num = cells(self.graph.cameras[image_id], self.graph.keypoints[image_id][features])
             share = np.isin(points[image_id][features], long).mean() if num else 0.0
             ratios[image_id] = _log_ratio(float(share * num), num, RIGHT_OF_THREE)
         return ratios
@@ -83,13 +83,13 @@ class Evidence:
     def num_cells(self, pair: VerifiedPair) -> int:
         """Return how many cells hold inliers, in that image of a pair which has fewer."""
         both = zip(pair.ids, self.graph.points(pair), strict=True)
-        return min(self._cells(image_id, points) for image_id, points in both)
+        return min(cells(self.graph.cameras[image_id], points) for image_id, points in both)
 
-    def _cells(self, image_id: int, points: NDArray[np.floating]) -> int:
-        """Return how many cells of a grid over an image hold points, (N, 2) px."""
-        camera = self.graph.cameras[image_id]
-        cells = (points / [camera.width, camera.height] * GRID).astype(int)
-        return len(np.unique(np.clip(cells, 0, GRID - 1) @ [1, GRID]))
+
+def cells(camera: pycolmap.Camera, points: NDArray[np.floating]) -> int:
+    """Return how many cells of a grid over an image hold points, (N, 2) px."""
+    numbers = (points / [camera.width, camera.height] * GRID).astype(int)
+    return len(np.unique(np.clip(numbers, 0, GRID - 1) @ [1, GRID]))
 
 
 def pair_evidence(num_agreeing: float, num: float) -> float:

@@ -25,7 +25,7 @@ from colmap_affrect.mappers.adjustment import (
     priors_of,
 )
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.evidence import Evidence, pair_evidence
+from colmap_affrect.mappers.evidence import Evidence, cells, pair_evidence
 from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
     Ids,
@@ -68,6 +68,7 @@ class Measures:
     num_pairs: int
     num_points: int
     num_long: int
+    num_cells: int
     angle_deg: float
     nearest_deg: float
     focal_growth: float
@@ -106,7 +107,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
     turned = _rotation_shares(graph, of_image)
     single = _single(model, graph, pairs, agreement)
     long, angles = num_long_tracks(model), _angles_deg(model)
-    growth = focal_growth(model, task)
+    growth, in_cells = focal_growth(model, task), cells_of(model)
     freed = freed_focals(model, task)
     mirrored = _mirrored(graph)
     support: defaultdict[int, float] = defaultdict(float)
@@ -148,6 +149,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             num_pairs=len(own),
             num_points=image.num_points3D,
             num_long=long[image_id],
+            num_cells=in_cells[image_id],
             angle_deg=wide,
             nearest_deg=nearest,
             focal_growth=rel,
@@ -285,11 +287,14 @@ def focal_growth(
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     sparse = _with_fewer_points(model)
     cost = Adjuster(priors, NOISE_PX, refining, fixed).adjust(sparse, FINAL)
+    share = num_cells(sparse) / max(1, sparse.compute_num_observations())
     found = {}
     for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
         held = Adjuster(priors, NOISE_PX, refining, fixed.union(keys.tolist()))
         least = min(held.adjust(_scaled(sparse, keys, factor), FINAL) for factor in FACTORS)
-        found |= dict.fromkeys(keys.tolist(), (least / max(cost, 1e-9) - 1.0, least - cost))
+        found |= dict.fromkeys(
+            keys.tolist(), (least / max(cost, 1e-9) - 1.0, share * (least - cost))
+        )
     return found
 
 
@@ -308,9 +313,26 @@ def freed_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int,
     held, freed = _with_fewer_points(model), _with_fewer_points(model)
     before = Adjuster(priors, NOISE_PX, refining, frozenset(given)).adjust(held, FINAL)
     gain = before - Adjuster(free, NOISE_PX, refining).adjust(freed, FINAL)
-    if gain < 0.5 * len(given) * np.log(max(2, held.compute_num_observations())):
+    cells = num_cells(held)
+    gain *= cells / max(1, held.compute_num_observations())
+    if gain < 0.5 * len(given) * np.log(max(2, cells)):
         return {}
     return {key: freed.cameras[key].mean_focal_length() for key in given}
+
+
+def num_cells(model: pycolmap.Reconstruction) -> int:
+    """Return how many cells of the images of a model hold observations."""
+    return sum(cells_of(model).values())
+
+
+def cells_of(model: pycolmap.Reconstruction) -> dict[int, int]:
+    """Return how many cells of each registered image hold observations."""
+    found = {}
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        points = np.array([p.xy for p in image.get_observation_points2D()]).reshape(-1, 2)
+        found[image_id] = cells(model.cameras[image.camera_id], points)
+    return found
 
 
 def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

@@ -71,7 +71,9 @@ def turned(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:
         yaw, pitch = np.deg2rad([4.0 * number - 2.0 * len(paths), 5.0 * (number % 3 - 1)])
         rotation, _ = cv2.Rodrigues(np.array([pitch, yaw, 0.02 * number]))
         warp = inner @ rotation @ np.linalg.inv(inner)
-        cv2.imwrite(str(out / f"turned-{path.name}"), cv2.warpPerspective(image, warp, (width, height)))
+        cv2.imwrite(
+            str(out / f"turned-{path.name}"), cv2.warpPerspective(image, warp, (width, height))
+        )
 
 
 def mixed(paths: Sequence[Path], out: Path, others: Sequence[Path]) -> None:
@@ -168,7 +170,9 @@ SIZES = (3, 4, 5, 6, 8, 10)  # photographs of a part
 MAX_CORRECT_ERROR_DEG = 5.0
 
 
-def truth_of(name: str, scenes_path: Path, images: Sequence[str]) -> dict[str, tuple[str, Any] | None]:
+def truth_of(
+    name: str, scenes_path: Path, images: Sequence[str]
+) -> dict[str, tuple[str, Any] | None]:
     """Return scene and pose of each image, None where it has no place; others are not known."""
     some = SETS[name]
     found: dict[str, tuple[str, Any] | None] = {}
@@ -208,7 +212,10 @@ def parts_of(
 
 
 def cameras_of(
-    kind: str, records: Mapping[int, CameraRecord], truth: Mapping[str, Any], rng: np.random.Generator
+    kind: str,
+    records: Mapping[int, CameraRecord],
+    truth: Mapping[str, Any],
+    rng: np.random.Generator,
 ) -> tuple[dict[int, CameraRecord], dict[int, Any]] | None:
     """Return records and cameras of a part with known or with wrong focal lengths."""
     factor = float(rng.choice(WRONG_FACTORS)) if kind == "wrong" else 1.0
@@ -258,7 +265,9 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
                 write_part(small, path, {images[i] for i in part}, told[1])
                 task = MappingTask(path, None, cameras=told[0], may_share=kind == "unknown")
                 start = time.perf_counter()
-                models = MAPPERS.make(MAPPERS.options("sparse")).map(task, Path(folder), number, len_)
+                models = MAPPERS.make(MAPPERS.options("sparse")).map(
+                    task, Path(folder), number, len_
+                )
                 seconds = time.perf_counter() - start
                 if not models:
                     continue
