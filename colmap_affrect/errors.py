@@ -8,7 +8,7 @@ from pathlib import Path
 
 DAMAGE = (
     OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError,
-    OverflowError,
+    OverflowError, EOFError,
 )  # fmt: skip
 """What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or of another
 shape than ours."""

@@ -1,6 +1,5 @@
 """Progress of long stages, a tqdm bar, plain lines or silence, and how long a whole run takes."""
 
-import logging
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -12,8 +11,6 @@ from typing import Self, TextIO
 from tqdm import tqdm
 
 from colmap_affrect.errors import shown
-
-logger = logging.getLogger(__name__)
 
 Advance = Callable[[int], None]  # report that so many more units are done
 NUM_PLAIN_LINES = 10
@@ -32,7 +29,6 @@ class _Stage:
     ahead: int
     done: int = 0
     elapsed_s: float = 0.0
-    is_logged: bool = False  # that the run takes long
 
     @property
     def is_measured(self) -> bool:
@@ -73,29 +69,19 @@ class Forecast:
     def begin(self, name: str, total: int) -> None:
         """A stage begins with so many units."""
         known = self._stages.get(name, _Stage(0.0, 0))
-        if name == "extract":
-            share_old = 1 - total / max(known.ahead, total, 1)
-            self._expect_pairs(round(self._stages["match"].ahead * (1 - share_old**2)))
         if name == "match":
-            self._expect_pairs(total)
+            self._stages["verify"].ahead = total
         self._stages[name] = _Stage(known.cost, total)
         self._may_escalate &= name not in ("cameras", "guide", "map")
         self._current, self._start_s = name, self._clock()
 
-    def _expect_pairs(self, count: int) -> None:
-        self._stages["match"].ahead = self._stages["verify"].ahead = count
-
     def advance(self, count: int) -> str:
-        """So many units of the stage that began last are done; return and log :meth:`text`."""
+        """So many units of the stage that began last are done; return :meth:`text`."""
         stage = self._stages[self._current]
         stage.done += count
         stage.ahead = max(stage.ahead - count, 0)
         stage.elapsed_s = self._clock() - self._start_s
-        text = self.text()
-        if text and not stage.is_logged:
-            stage.is_logged = True
-            logger.info("%s", text)
-        return text
+        return self.text()
 
     def end(self) -> None:
         """The stage that began last is over, whatever it has done."""
@@ -153,7 +139,7 @@ class Progress:
         return new
 
     def with_forecast(self, forecast: Forecast) -> Self:
-        """Return the same that also says how long all stages take, there and in the log."""
+        """Return the same that also says how long all stages take."""
         new = copy(self)
         new._forecast = forecast
         return new
@@ -165,20 +151,15 @@ class Progress:
         if forecast:
             forecast.begin(name, total)
         with self._display(self._title + name, total, unit) as show_more:
-            if show_more is None:
-                yield lambda _: None
-            else:
-                yield lambda count: show_more(count, forecast.advance(count) if forecast else "")
+            yield lambda count: show_more(count, forecast.advance(count) if forecast else "")
         if forecast:
             forecast.end()
 
     @contextmanager
-    def _display(
-        self, name: str, total: int, unit: str
-    ) -> Iterator[Callable[[int, str], None] | None]:
+    def _display(self, name: str, total: int, unit: str) -> Iterator[Callable[[int, str], None]]:
         """Yield what shows how many more units are done, beside a text on the whole run."""
         if self._stream is None or total == 0:
-            yield None
+            yield lambda *_: None
         elif self._stream.isatty():
             with tqdm(total=total, desc=name, unit=unit, file=self._stream) as bar:
                 yield lambda count, left: _update(bar, count, left)

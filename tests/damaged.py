@@ -8,18 +8,19 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 PAGE_BYTES = 4096
 
-# Damage to the bytes of a file; each returns what it did.
+Harm = Callable[[bytearray, random.Random], None]
 
 
-def bits(data: bytearray, chance: random.Random) -> str:
-    places = [chance.randrange(len(data)) for _ in range(chance.choice((1, 4, 32)))]
-    for place in places:
-        data[place] ^= 1 << chance.randrange(8)
-    return f"bits flipped in {len(places)} bytes, the first at {places[0]}"
+def bits(data: bytearray, chance: random.Random) -> None:
+    for _ in range(chance.choice((1, 4, 32))):
+        data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+
+
+def header(data: bytearray, chance: random.Random) -> None:
+    data[chance.randrange(min(100, len(data)))] ^= chance.randrange(1, 256)
 
 
 def _page(data: bytearray, chance: random.Random) -> slice:
@@ -27,49 +28,32 @@ def _page(data: bytearray, chance: random.Random) -> slice:
     return slice(start, min(len(data), start + PAGE_BYTES))
 
 
-def zeros(data: bytearray, chance: random.Random) -> str:
+def zeros(data: bytearray, chance: random.Random) -> None:
     page = _page(data, chance)
     data[page] = bytes(page.stop - page.start)
-    return f"page at {page.start} zeroed"
 
 
-def noise(data: bytearray, chance: random.Random) -> str:
+def noise(data: bytearray, chance: random.Random) -> None:
     page = _page(data, chance)
     data[page] = chance.randbytes(page.stop - page.start)
-    return f"page at {page.start} is noise"
 
 
-def header(data: bytearray, chance: random.Random) -> str:
-    place = chance.randrange(min(100, len(data)))
-    data[place] ^= chance.randrange(1, 256)
-    return f"header changed at {place}"
-
-
-def exchanged(data: bytearray, chance: random.Random) -> str:
+def exchanged(data: bytearray, chance: random.Random) -> None:
     source, target = _page(data, chance), _page(data, chance)
     data[target] = data[source][: target.stop - target.start]
-    return f"page at {source.start} written over that at {target.start}"
 
 
-def spliced(data: bytearray, chance: random.Random) -> str:
+def spliced(data: bytearray, chance: random.Random) -> None:
     start = chance.randrange(len(data))
     data[start : start + chance.choice((0, 1, 4, 40))] = chance.choice(PIECES)
-    return f"bytes at {start} replaced"
 
 
-def cut(data: bytearray, chance: random.Random) -> str:
+def cut(data: bytearray, chance: random.Random) -> None:
     del data[chance.randrange(len(data)) :]
-    return f"cut off at {len(data)}"
 
 
-def emptied(data: bytearray, _: random.Random) -> str:
+def emptied(data: bytearray, _: random.Random) -> None:
     data.clear()
-    return "emptied"
-
-
-def random_bytes(data: bytearray, chance: random.Random) -> str:
-    data[:] = chance.randbytes(len(data))
-    return "all bytes random"
 
 
 PIECES = (
@@ -78,26 +62,26 @@ PIECES = (
 )  # fmt: skip
 """What readers of text and numbers may not expect."""
 
-HARMS: tuple[Callable[[bytearray, random.Random], str], ...] = (
-    bits, zeros, noise, header, exchanged, spliced, cut, emptied, random_bytes,
-)  # fmt: skip
+HARMS: tuple[Harm, ...] = (bits, header, zeros, noise, exchanged, spliced, cut, emptied)
 
 
 def damage(
-    path: Path, chance: random.Random, harms: Sequence[Any] = HARMS, others: Sequence[Path] = ()
+    path: Path, chance: random.Random, harms: Sequence[Harm] = HARMS, others: Sequence[Path] = ()
 ) -> str:
     """Damage a file, or give it the content of another one; return what was done.
 
     Its times stay as they were half of the times: disks fail, too.
     """
     stat, data = path.stat(), bytearray(path.read_bytes())
-    before = bytes(data)
+    before, done = bytes(data), ""
     while data == before:
         if others and chance.randrange(len(harms) + 1) == 0:
             other = chance.choice([other for other in others if other.name != path.name])
             data, done = bytearray(other.read_bytes()), f"content of {other.name}"
         else:
-            done = chance.choice(harms)(data, chance)
+            harm = chance.choice(harms)
+            harm(data, chance)
+            done = harm.__name__
     path.write_bytes(data)
     if keeps_times := chance.random() < 0.5:
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))

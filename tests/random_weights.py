@@ -8,8 +8,6 @@ import torch
 from kornia import feature
 from torch import nn
 
-from colmap_affrect.features.networks import DESCRIPTOR_NETWORKS
-
 
 def randomized(network: nn.Module, seed: int, gain: float = 1.0) -> nn.Module:
     """Give batch normalisations random statistics, so that outputs vary with the patch."""
@@ -23,14 +21,12 @@ def randomized(network: nn.Module, seed: int, gain: float = 1.0) -> nn.Module:
 
 
 def write_random_weights(folder: Path) -> dict[str, Path]:
-    """Write files for AffNet, OriNet, Key.Net, descriptors, whole extractors, by key."""
+    """Write files for AffNet, OriNet, HardNet, whole extractors, by key."""
     torch.manual_seed(0)
     networks = {
         "affnet": randomized(feature.LAFAffNetShapeEstimator(pretrained=False), 1),
         "orinet": randomized(feature.OriNet(pretrained=False), 2, gain=2.0),
-        "keynet": feature.KeyNet(pretrained=False),
-        "hardnet": randomized(DESCRIPTOR_NETWORKS["hardnet"](), 3),
-        "tfeat": DESCRIPTOR_NETWORKS["tfeat"](),
+        "hardnet": randomized(feature.HardNet(pretrained=False), 3),
         "aliked-n16": randomized(feature.ALIKED(), 4),
         "xfeat": randomized(feature.XFeat().net, 5),
     }

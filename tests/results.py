@@ -1,14 +1,15 @@
-"""What a run left in its output folder, and runs that are ended while they are at work."""
+"""What runs leave in folders, and runs that are ended while they are at work."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import random
 import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,31 +55,53 @@ def hdf5_content(path: Path) -> dict[str, tuple[str, bytes]]:
 
 
 def database_content(path: Path) -> dict[str, Any]:
-    """Keypoints by image, matches and inlier matches by pair."""
+    """Keypoints by image, numbers of raw matches and inlier matches by pair."""
     names = {image_id: name for name, image_id in image_ids(path).items()}
+
+    def pair(pair_id: int) -> tuple[str, ...]:
+        return tuple(names[i] for i in pycolmap.pair_id_to_image_pair(pair_id))
+
     with open_database(path) as database:
-        pair_ids, geometries = database.read_two_view_geometries()
+        raw = zip(*database.read_all_matches(), strict=True)
+        geometries = zip(*database.read_two_view_geometries(), strict=True)
         return {
             "keypoints": {names[i]: database.read_keypoints(i).tobytes() for i in names},
-            "raw matches": {
-                tuple(names[i] for i in pycolmap.pair_id_to_image_pair(pair_id)): len(rows)
-                for pair_id, rows in zip(*database.read_all_matches(), strict=True)
-            },
-            "inliers": {
-                tuple(names[i] for i in pycolmap.pair_id_to_image_pair(pair_id)): (
-                    geometry.inlier_matches.tolist()
-                )
-                for pair_id, geometry in zip(pair_ids, geometries, strict=True)
-            },
+            "raw matches": {pair(key): len(rows) for key, rows in raw},
+            "inliers": {pair(key): found.inlier_matches.tolist() for key, found in geometries},
         }
 
 
 def model_names(workspace: Workspace) -> list[list[str]]:
     """Names of the registered images of every model in sparse/."""
     models = [pycolmap.Reconstruction(path) for path in sorted(workspace.sparse.glob("[0-9]*"))]
+    return [sorted(model.images[i].name for i in model.reg_image_ids()) for model in models]
+
+
+def tree(folder: Path, *without: Path, times: bool = True) -> dict[str, tuple[object, ...]]:
+    """What is in a folder, by its path there: files by digest and time; links are not followed."""
+    found: dict[str, tuple[object, ...]] = {}
+    for path in folder.rglob("*"):
+        if any(path.is_relative_to(other) for other in without):
+            continue
+        key = str(path.relative_to(folder))
+        if path.is_symlink():
+            found[key] = ("link", str(path.readlink()))
+        elif path.is_file():
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            found[key] = (digest, path.stat().st_mtime_ns) if times else (digest,)
+        else:
+            found[key] = ("folder",)
+    return found
+
+
+def differences(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:
+    """What was made, changed or removed between two looks at a folder."""
+    said = {(False, True): "made", (True, False): "removed", (True, True): "changed"}
+    keys = sorted(before.keys() | after.keys())
     return [
-        sorted(model.images[image_id].name for image_id in model.reg_image_ids())
-        for model in models
+        f"{said[key in before, key in after]} {key!r}"
+        for key in keys
+        if before.get(key) != after.get(key)
     ]
 
 
@@ -114,30 +137,20 @@ def run_undisturbed(photos: Path, out: Path, options: Sequence[object]) -> Undis
     return Undisturbed(out, results(out), worked_s)
 
 
-def log_size(out: Path) -> int:
-    """Bytes that are in the log of an output folder."""
-    log = Workspace(out).log
-    return log.stat().st_size if log.exists() else 0
-
-
 def wait_until_at_work(process: subprocess.Popen[str], out: Path) -> None:
-    """Wait until a run has written into the log."""
-    before = log_size(out)
-    while log_size(out) == before and process.poll() is None:
+    """Wait until a run has written into its log."""
+    log = Workspace(out).log
+
+    def size() -> int:
+        return log.stat().st_size if log.exists() else 0
+
+    before = size()
+    while size() == before and process.poll() is None:
         time.sleep(0.005)
 
 
-def state(folder: Path, *, without: Path | None = None) -> dict[str, tuple[bytes, int]]:
-    """Content and time of a folder and all in it, perhaps but for one of its folders."""
-    return {
-        str(path): (path.read_bytes() if path.is_file() else b"", path.lstat().st_mtime_ns)
-        for path in [folder, *folder.rglob("*")]
-        if without is None or not path.is_relative_to(without)
-    }
-
-
 def end_after(delay_s: float, number: signal.Signals, arguments: Sequence[str], out: Path) -> bool:
-    """Start a run and send it a signal; tell whether it was still at work then."""
+    """Start a run and send it a signal; return whether it was still at work then."""
     with start(*arguments) as process:
         wait_until_at_work(process, out)
         time.sleep(delay_s)
@@ -155,17 +168,15 @@ def assert_readable(out: Path) -> None:
     workspace.recorded()
     for path in (workspace.features, workspace.matches):
         if path.exists() and not journal_of(path).exists():
-            with h5py.File(path, "r") as file:
-                file.visititems(lambda *_: None)
+            hdf5_content(path)
     if workspace.database.exists():
-        with open_database(workspace.database) as database:
-            database.read_all_images()
+        image_ids(workspace.database)
 
 
 def end_again_and_again(
     photos: Path,
     out: Path,
-    options: Sequence[str],
+    options: Sequence[object],
     worked_s: float,
     signals: Sequence[signal.Signals],
     chance: random.Random,

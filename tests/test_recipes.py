@@ -58,7 +58,7 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
     extraction, features = recipe.extraction, recipe.extraction.features
     assert extraction.rectifier.name == rectifier
     assert (features.name, features.descriptor) == ("affnet-hardnet", "hardnet")
-    assert (features.detector, features.contrast_threshold) == ("dog", 0.04)
+    assert features.contrast_threshold == 0.04
     assert features.max_num_features == features.max_num_rectified_features == 1_000_000
     assert (recipe.matching.max_ratio, recipe.matching.ratio_both_ways) == (0.85, False)
     if isinstance(extraction.rectifier, CoverOptions):
@@ -81,28 +81,13 @@ def test_levels_build_on_the_lowest_one_with_their_features() -> None:
     assert load_recipe("on-demand").extraction.levels[3].base == 0
 
 
-TRAINED_FOR = "dog-affnet-hardnet-lightglue"
-
-
-@pytest.mark.parametrize(
-    ("recipe", "setting", "advice"),
-    [
-        ("default", "matching.name=lightglue",
-         "'aliked' takes features of aliked, not of rootsift; use --recipe aliked-lightglue, or "
-         "--set matching.trained_for=sift"),
-        (TRAINED_FOR, "matching.trained_for=keynet-affnet-hardnet",
-         "takes features of keynet-affnet-hardnet, not of dog-affnet-hardnet; use --recipe "
-         "dog-affnet-hardnet-lightglue --set features.detector=keynet --set "
-         "matching.trained_for=keynet-affnet-hardnet, or --set "
-         "matching.trained_for=dog-affnet-hardnet"),
-    ],
-)  # fmt: skip
-def test_matcher_must_be_trained_for_detector_and_descriptor(
-    recipe: str, setting: str, advice: str
-) -> None:
+def test_matcher_must_be_trained_for_the_features() -> None:
     with pytest.raises(OptionError) as error:
-        load_recipe(recipe, [setting])
-    assert str(error.value).endswith(advice)
+        load_recipe("default", ["matching.name=lightglue"])
+    assert str(error.value).endswith(
+        "'aliked' takes features of aliked, not of rootsift; use --recipe aliked-lightglue, or "
+        "--set matching.trained_for=sift"
+    )
 
 
 def test_matching_of_a_level_must_take_its_features() -> None:
@@ -114,7 +99,7 @@ def test_matching_of_a_level_must_take_its_features() -> None:
 def test_choosing_a_profile_drops_the_options_of_the_other_one() -> None:
     recipe = load_recipe("asift-recommended", ["features.name=rootsift"])
     assert recipe.extraction.features == SiftOptions(max_num_rectified_features=32768)
-    recipe = load_recipe("unrectified", ["features.dtype=bfloat16", "features.name=rootsift"])
+    recipe = load_recipe("unrectified", ["features.affine_shape=false", "features.name=rootsift"])
     assert recipe.extraction.features.contrast_threshold == 0.04
 
 

@@ -57,7 +57,7 @@ def test_masks_leave_out_borders_and_captions(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("script", "options"), [("on_slurm", []), ("on_kubernetes", ["--image=i"])]
+    ("script", "options"), [("on_slurm", []), ("on_kubernetes", ["--image=i", "--claim=c"])]
 )
 def test_cluster_is_started_and_its_address_handed_on(
     tmp_path: Path, script: str, options: list[str]

@@ -67,7 +67,7 @@ RESULTS = (
 """Of commands that leave results in an output folder."""
 
 CONVERTED_PATH = _path(
-    "--output-path", "PATH", "folder for the photographs", required=True, dest="converted_path"
+    "--output-path", "PATH", "new folder for the photographs", required=True, dest="converted_path"
 )
 IMAGE_PATH = _path("--image-path", "PATH",
     "folder of the photographs, searched with its sub-folders", required=True)  # fmt: skip
@@ -93,7 +93,7 @@ CAMERAS = (
     _value("--camera-params", "A,B,...",
         "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5"),
     _path("--cameras-path", "FILE",
-        "known cameras: folder or cameras.txt of a COLMAP model of these images, or a CSV file "
+        "known cameras: folder of a COLMAP model of these images, or a CSV file "
         "with the columns name and any of focal_px, focal_mm with sensor_width_mm or "
         "plate_width_mm (of what the whole image shows), model, params, cx, cy, camera (images "
         "with one label share a camera)"),
@@ -153,7 +153,7 @@ SCHEDULER = _value("--scheduler", "ADDRESS",
 DEPTH = (
     OneOf(
         _path("--depth-path", "FOLDER",
-            "depth maps named as the images: a/b.jpg has a/b.npy, .npz, .png or .tif"),
+            "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
         _value("--depth-model", "NAME",
             "monocular depth network: name or local folder for Hugging Face transformers"),
     ),
@@ -239,8 +239,6 @@ EVALUATION = (
         "by name or path; NAME=RECIPE:section.option=value changes options "
         "(default: unrectified-rootsift,default)",
         nargs="+", default=["unrectified-rootsift", "default"]),
-    _value("--baseline", "NAME",
-        "the recipe that the others are tested against, pair by pair"),
     _value("--max-num-keypoints", "N",
         "equal budget: match only the strongest N features of each image, warps included",
         type=int),
@@ -259,9 +257,6 @@ IMPORT_FORMAT = (
     _choice("--layout", ["auto", "hloc", "dim"],
         "of the files; dim is deep-image-matching's (default: auto, as matches are stored)",
         default="auto"),
-    _choice("--pixel-origin", ["center", "corner"],
-        "where (0, 0) is in the first pixel (default: center, as both programs have it)",
-        default="center"),
     _flag("--skip-verification", "no two-view geometries"),
 )  # fmt: skip
 EXPORT_SOURCE = OneOf(
@@ -273,7 +268,6 @@ EXPORT_SOURCE = OneOf(
 EXPORT_FORMAT = (
     _choice("--layout", ["hloc", "dim"],
         "of the files; dim is deep-image-matching's (default: hloc)", default="hloc"),
-    _flag("--half", "float16, which rounds coordinates to 1 px and more"),
 )  # fmt: skip
 
 OLD_DATABASE = (
@@ -289,9 +283,8 @@ EXPORT = (
     _path("--output-path", "FOLDER", "folder for the files; nothing in it is overwritten",
         required=True, dest="target_path"),
     _value("--format", "A,B,...",
-        "ply (points), text (COLMAP's), nvm, bundler, undistorted (photographs and model, for "
-        "dense reconstruction), nerfstudio (the same with transforms.json, for Gaussian splatting "
-        "too), "
+        "ply (points), text (COLMAP's), undistorted (photographs and model, for dense "
+        "reconstruction), nerfstudio (the same with transforms.json, for Gaussian splatting too), "
         "cameras (CSV), geojson (of a model that align put on earth) (default: ply,text,cameras)",
         type=_words, default=("ply", "text", "cameras")),
     _path("--image-path", "PATH",

@@ -156,9 +156,9 @@ def map(options: argparse.Namespace) -> int:
 
 def compare(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.compare import compare
+    from colmap_affrect.comparison.method_run import CompareOptions
     from colmap_affrect.comparison.methods import parse_methods
     from colmap_affrect.comparison.tables import summary, to_json
-    from colmap_affrect.comparison.task import CompareOptions
 
     depth = given.depth_settings(options)
     methods = options.methods and parse_methods(options.methods, depth)
@@ -194,7 +194,6 @@ def evaluate(options: argparse.Namespace) -> int:
         options.output_path,
         EvaluateOptions(
             recipes=parse_methods(options.recipes, given.depth_settings(options)),
-            baseline=options.baseline,
             max_num_keypoints=options.max_num_keypoints,
             random_seed=options.random_seed,
             scores=ScoreOptions.from_mapping(changed, "--protocol-options"),
@@ -233,7 +232,6 @@ def import_h5(options: argparse.Namespace) -> None:
         options.database_path,
         cameras=given.built(options, "cameras", CameraOptions),
         layout=options.layout,
-        pixel_origin=options.pixel_origin,
         skip_verification=options.skip_verification,
         random_seed=options.random_seed,
         progress=given.progress(options),
@@ -250,7 +248,6 @@ def export_h5(options: argparse.Namespace) -> None:
         output_path=options.workspace_path,
         database_path=options.database_path,
         layout=options.layout,
-        half=options.half,
         progress=given.progress(options),
     )
     show(report.summary())

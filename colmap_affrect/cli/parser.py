@@ -18,10 +18,7 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "run --image-path photos --output-path out",
-    "run --image-path photos --output-path out --camera-mode single",
-    "run --image-path photos --output-path out --recipe on-demand",
-    "run --image-path photos --output-path out --recipe depth-planes-recommended \\\n"
-    "      --depth-path depth",
+    "run --image-path photos --output-path out --recipe on-demand --camera-mode single",
     "run --image-path all-photos --output-path out --extend finished/sparse/0",
     "run --config out/config.toml --image-path other-photos --output-path out2",
     "extract --image-path photos --output-path out",
@@ -32,25 +29,20 @@ EXAMPLES = (
     "guide --output-path out",
     "map --output-path out",
     "map --output-path out --from-database any.db --image-path photos",
-    "compare --image-path photos --output-path out",
     "compare --image-path photos --output-path out --methods sift,default --seeds 0",
     "evaluate evd --dataset-path EVD --output-path out \\\n"
     "      --recipes unrectified-rootsift,default,on-demand",
     "convert --image-path scans --output-path photos",
     "inspect photos/a.jpg --output-path out",
-    "recipes",
     "recipes on-demand",
-    "weights",
-    "weights list on-demand-learned",
     "weights fetch affnet orinet hardnet --weights folder",
     "doctor out",
-    "doctor database.db --image-path photos",
     "import-h5 --image-path photos --features-path features.h5 \\\n"
     "      --matches-path matches.h5 --database-path new.db",
     "export-h5 --database-path any.db --features-path features.h5 \\\n"
     "      --matches-path matches.h5",
     "export-database out old.db --colmap 3.8",
-    "export --model-path out/sparse/0 --output-path for-others --format ply,bundler",
+    "export --model-path out/sparse/0 --output-path for-others --format ply,text",
     "export --model-path out/sparse/0 --output-path for-others --format nerfstudio \\\n"
     "      --image-path photos",
     "align --model-path out/sparse/0 --output-path metric --gps out/database.db",
@@ -79,12 +71,8 @@ class Parser(argparse.ArgumentParser):
         """Raise OptionError, which ends with exit code 2."""
         raise OptionError(f"{message}; see {self.prog} --help")
 
-
-class CommandParser(Parser):
-    """Names the option that may have been meant."""
-
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse, and refuse what is not known here, where the options of the command are."""
+        """Parse; what is unknown is refused with the option that may have been meant."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             name = next((word for word in unknown if word.startswith("-")), unknown[0])
@@ -103,9 +91,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"colmap-affrect {__version__}")
-    subparsers = parser.add_subparsers(
-        dest="command", required=True, metavar="COMMAND", parser_class=CommandParser
-    )
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (function, summary, options) in COMMANDS.items():
         command = subparsers.add_parser(
             name,

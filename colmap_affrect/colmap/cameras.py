@@ -1,7 +1,6 @@
-"""Cameras: what the user gives, and what is known of them and from where.
+"""Cameras: what the user gives by options, table or model, and who knows each focal length.
 
-They are given by options, in a COLMAP model, or in a table by image name. COLMAP's database has one
-flag for a focal length, that somebody knows it; ``cameras.json`` beside it says who.
+COLMAP's database only has a flag that somebody does; ``cameras.json`` beside it says who.
 """
 
 import math
@@ -20,7 +19,7 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.tables import read_lines, read_table
+from colmap_affrect.project.tables import read_table
 
 Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
 """By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
@@ -37,23 +36,14 @@ MAX_LINES = 5  # groups of cameras that are logged
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """One camera of the database.
+    """One camera of the database."""
 
-    Attributes:
-        names: of its images, sorted.
-        source: of the focal length.
-        focal_px: in px of the stored file; the mean of two.
-        why: what was decided and for what reason, one clause.
-        size: (width, height) of its images in px.
-        given: what of the intrinsics is the user's, to be left as it is.
-    """
-
-    names: tuple[str, ...]
-    source: Source
-    focal_px: float
-    why: str = ""
-    size: tuple[int, int] = (0, 0)
-    given: tuple[Given, ...] = ()
+    names: tuple[str, ...]  # of its images, sorted
+    source: Source  # of the focal length
+    focal_px: float  # in px of the stored file; the mean of two
+    why: str = ""  # what was decided and for what reason, one clause
+    size: tuple[int, int] = (0, 0)  # (width, height) of its images in px
+    given: tuple[Given, ...] = ()  # what of the intrinsics is the user's, to be left as it is
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that a model ended with."""
@@ -94,23 +84,19 @@ def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> Non
 
 
 def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
-    """Return a line for cameras of one source and story, at most a few; none for those without."""
+    """Return a line for the cameras of each source and reason, at most a few."""
     groups = defaultdict(list)
     for record in records:
         if record.why:
-            groups[record.source, record.why].append(record)
-    lines = [_line(same) for same in groups.values()]
+            groups[f"{record.source}: {record.why}"].append(record)
+    lines = []
+    for what, same in groups.items():
+        names = [name for record in same for name in record.names]
+        ends = sorted({round(record.focal_px) for record in same})
+        focal = " to ".join(map(str, dict.fromkeys((ends[0], ends[-1]))))
+        lines.append(f"{such_as(names)}: focal length {focal} px, {what}")
     more = len(lines) - MAX_LINES
     return lines if more <= 1 else [*lines[:MAX_LINES], f"and {more} more, see report.json"]
-
-
-def _line(records: Sequence[CameraRecord]) -> str:
-    """Say what was decided for cameras of one source and story."""
-    names = [name for record in records for name in record.names]
-    first = records[0]
-    focals = sorted({round(record.focal_px) for record in records})
-    focal = f"{focals[0]}" if len(focals) == 1 else f"{focals[0]} to {focals[-1]}"
-    return f"{such_as(names)}: focal length {focal} px, {first.source}: {first.why}"
 
 
 WIDTHS = ("sensor_width_mm", "plate_width_mm")
@@ -206,8 +192,6 @@ def _require_params(given: GivenCamera, where: str) -> None:
 
 def _read_model(path: Path) -> dict[str, GivenCamera]:
     folder = path if path.is_dir() else path.parent
-    if (folder / "cameras.txt").is_file() and path.name != "cameras.bin":
-        return _read_text_model(folder)
     model = read_given_model(folder, "--cameras-path ")
     cameras = {
         key: GivenCamera(
@@ -215,45 +199,11 @@ def _read_model(path: Path) -> dict[str, GivenCamera]:
             tuple(camera.params.tolist()),
             size=(camera.width, camera.height),
             label=f"model/{key}",
-            where=f"{folder / 'cameras.bin'}, camera {key}",
+            where=f"--cameras-path {folder}, camera {key}",
         )
         for key, camera in model.cameras.items()
     }
     return {image.name: cameras[image.camera_id] for image in model.images.values()}
-
-
-def _read_text_model(folder: Path) -> dict[str, GivenCamera]:
-    path, listed = folder / "cameras.txt", folder / "images.txt"
-    cameras = {}
-    for number, line in enumerate(read_lines(path, f"--cameras-path {path}"), start=1):
-        words = line.split()
-        if not words or line.startswith("#"):
-            continue
-        where = f"--cameras-path {path}, line {number}"
-        try:
-            key, size = words[0], (int(words[2]), int(words[3]))
-        except (IndexError, ValueError) as error:
-            raise OptionError(f"{where}: not CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from error
-        _require_model(words[1], where)
-        values = _numbers(" ".join(words[4:]), where)
-        given = GivenCamera(words[1], values, size=size, label=f"model/{key}", where=where)
-        _require_params(given, where)
-        cameras[key] = given
-    if len(cameras) == 1 and not listed.exists():
-        return {"": next(iter(cameras.values()))}
-    # Every other line lists the points of an image, which may be none.
-    lines = enumerate(read_lines(listed, f"--cameras-path {listed}"), start=1)
-    found = {}
-    for number, line in [item for item in lines if not item[1].startswith("#")][::2]:
-        words = line.split(maxsplit=9)
-        if not words:
-            continue
-        if len(words) != 10 or words[8] not in cameras:
-            raise OptionError(
-                f"--cameras-path {listed}, line {number}: not an image of a camera in {path.name}"
-            )
-        found[words[9]] = cameras[words[8]]
-    return found
 
 
 def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
@@ -314,7 +264,7 @@ def _refuse_contradictions(row: Mapping[str, str], where: str) -> None:
 
 
 def _number(row: Mapping[str, str], column: str, where: str) -> float:
-    """Return a number, which is positive unless it is a coordinate; 0 where there is none."""
+    """Return a number, positive unless it is a coordinate; 0 where there is none."""
     if column not in row:
         return 0.0
     values = _numbers(row[column], f"{where}: {column}")

@@ -17,10 +17,9 @@ def run_cancellable(
     call: Callable[[pycolmap.CancellationToken], Result],
     token: pycolmap.CancellationToken | None = None,
 ) -> Result:
-    """Run ``call`` in a thread; on Ctrl-C cancel it, and leave it if it does not end soon.
+    """Run ``call`` with a token in a thread; on Ctrl-C cancel it, and leave it if it goes on.
 
-    First, memory that this process has freed goes back to the system. ``call`` takes the token that
-    pycolmap's call must be given; the caller may have one too, to cancel by.
+    First, memory that this process has freed goes back to the system.
     """
     return_freed_memory()
     known = token or pycolmap.CancellationToken()

@@ -1,7 +1,6 @@
-"""What can be wrong in a COLMAP database and what to do about it, found without COLMAP.
+"""What can be wrong in a COLMAP database of any version, and what to do about it.
 
-Rows that COLMAP does not expect end the process inside COLMAP, so the tables are read by SQLite
-itself, of databases of all versions of COLMAP.
+Rows that COLMAP does not expect end the process inside COLMAP, so SQLite reads the tables.
 """
 
 import sqlite3
@@ -25,8 +24,8 @@ from colmap_affrect.colmap.tables import (
     read_tables,
     rows_of,
 )
-from colmap_affrect.colmap.useless_keypoints import MAX_SIDE_PX, useless
 from colmap_affrect.errors import DatabaseError, such_as
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.project.outputs import leads_outside
@@ -64,10 +63,10 @@ CHECKS: dict[str, Check] = {
         "extract these images again into a new database"),
     "keypoints-not-finite": ("error",
         "images with keypoints that are not finite numbers, or are where no image reaches",
-        "extract these images again; 'map --from-database' leaves these keypoints out"),
-    "keypoints-at-one-place": ("warning",
+        "extract and match these images again"),
+    "keypoints-at-one-place": ("error",
         "images with most keypoints at one place, at which COLMAP may never end",
-        "extract these images again; 'map --from-database' leaves these keypoints out"),
+        "extract and match these images again"),
     "keypoints-outside": ("warning", "images with keypoints outside of them",
         "see that they were found in the images as stored: not rotated, not resized"),
     "match-data": ("error",
@@ -84,7 +83,8 @@ CHECKS: dict[str, Check] = {
 FATAL_FOR_IMAGES = frozenset({"bad-name", "no-parent", "bad-camera", "camera-panorama"})
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 
-FATAL = FATAL_FOR_IMAGES | {"keypoint-data", "match-data", "matrix-data"}
+USELESS_KEYPOINTS = frozenset({"keypoints-not-finite", "keypoints-at-one-place"})
+FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "matrix-data"}
 """The same of keypoints and matches."""
 
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
@@ -102,46 +102,39 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 length is a prior, and the number of parameters that follow, float64."""
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
+MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
+OUTSIDE_TOLERANCE_PX = 1.0  # keypoints of images shrunk for detection may lie outside
+MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
 
 
-def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
-    """Refuse a damaged database, or one with problems that would end the process inside COLMAP.
-
-    It is only read; ``kinds`` of problems are keys of ``CHECKS``, and DatabaseError has one line.
-    Returns all other problems.
-    """
+def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
+    """Refuse a damaged database, or one with some ``kinds`` of problems; DatabaseError."""
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         _, what, advice = CHECKS[kind]
         items = such_as(problems[kind])
         raise DatabaseError(f"{path}: {what} ({items}); {advice.format(path=path)}")
-    return problems
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
     """Check a database, which is only read; DatabaseError if damaged."""
-    with open_read_only(path) as connection:
-        return _check(connection, path)
-
-
-def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems]:
     found: Problems = defaultdict(list)
-    try:
-        connection.text_factory = lambda data: data.decode("utf-8", "replace")
-        (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-        if verdict != "ok":
-            raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
-        tables = read_tables(connection)
-        _check_names(connection, found)
-        _check_cameras(tables, found)
-        _check_links(connection, found)
-        _check_matrices(connection, found)
-        _check_cameras_of_pairs(connection, found)
-        _check_images(tables, found)
-        _check_keypoints(connection, tables, found)
-        _check_pairs(connection, tables, found)
-    except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
-        raise DatabaseError(f"{path}: damaged ({error})") from error
+    with open_read_only(path) as connection:
+        try:
+            connection.text_factory = lambda data: data.decode("utf-8", "replace")
+            (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            if verdict != "ok":
+                raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
+            tables = read_tables(connection)
+            _check_cameras(tables, found)
+            _check_images(connection, tables, found)
+            _check_links(connection, found)
+            _check_matrices(connection, found)
+            _check_cameras_of_pairs(connection, found)
+            _check_keypoints(connection, tables, found)
+            _check_pairs(connection, tables, found)
+        except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
+            raise DatabaseError(f"{path}: damaged ({error})") from error
     return tables, dict(found)
 
 
@@ -185,11 +178,16 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
             found["bad-camera"].append(f"{label}: {camera.width} x {camera.height} px")
 
 
-def _check_names(connection: sqlite3.Connection, found: Problems) -> None:
+def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
         name = raw.decode("utf-8", "replace")
         if not name or "\0" in name or name.encode() != raw:
             found["bad-name"].append(f"image {image_id}: {name!r}")
+    for image_id, name in tables.names.items():
+        if tables.camera_ids[image_id] not in tables.cameras:
+            found["no-parent"].append(name)
+        if tables.num_frames and image_id not in tables.frame_images:
+            found["no-frame"].append(name)
 
 
 def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
@@ -225,21 +223,13 @@ def _check_cameras_of_pairs(connection: sqlite3.Connection, found: Problems) -> 
         for pair_id, blob in rows_of(connection, f"pair_id {name}", "two_view_geometries"):
             if blob is None:
                 continue
-            header = blob[: CAMERA_OF_PAIR.size] if isinstance(blob, bytes) else b""
-            if len(header) == CAMERA_OF_PAIR.size:
-                _, model, *_, count = CAMERA_OF_PAIR.unpack(header)
+            size = CAMERA_OF_PAIR.size
+            if isinstance(blob, bytes) and len(blob) >= size:
+                _, model, *_, count = CAMERA_OF_PAIR.unpack(blob[:size])
                 like = camera_like(model)
-                if like and count == len(like.params) == (len(blob) - len(header)) / 8:
+                if like and count == len(like.params) == (len(blob) - size) / 8:
                     continue
             found["matrix-data"].append(f"{name} of pair_id {pair_id}")
-
-
-def _check_images(tables: Tables, found: Problems) -> None:
-    for image_id, name in tables.names.items():
-        if tables.camera_ids[image_id] not in tables.cameras:
-            found["no-parent"].append(name)
-        if tables.num_frames and image_id not in tables.frame_images:
-            found["no-frame"].append(name)
 
 
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
@@ -257,8 +247,30 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             found["keypoint-data"].append(name)
         elif count:
             camera = tables.cameras.get(tables.camera_ids[image_id])
-            for kind in useless(keypoints, (camera.width, camera.height) if camera else None):
+            size = (camera.width, camera.height) if camera else None
+            for kind in keypoint_problems(keypoints, size):
                 found[kind].append(name)
+
+
+def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:
+    """Return which kinds of problems some of (N, 2 or more) keypoints have, in COLMAP's px.
+
+    ``size`` is the (width, height) of the image, None if not known.
+    """
+    finite = np.asarray((np.abs(keypoints) <= MAX_SIDE_PX).all(axis=1))
+    points, found = keypoints[finite, :2], list[str]()
+    if not finite.all():
+        found.append("keypoints-not-finite")
+    if size is not None:
+        beyond = np.maximum(-points, points - np.asarray(size, np.float32))
+        if (beyond > OUTSIDE_TOLERANCE_PX).any():
+            found.append("keypoints-outside")
+    if len(points) >= MIN_AT_ONE_PLACE:  # what more than half have is the median
+        median = np.partition(points, len(points) // 2, axis=0)[len(points) // 2]
+        num_there = int((points == median).all(axis=1).sum())
+        if num_there >= max(MIN_AT_ONE_PLACE, len(keypoints) // 2 + 1):
+            found.append("keypoints-at-one-place")
+    return found
 
 
 def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:
@@ -272,7 +284,7 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
 def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
         for pair_id, rows, columns, blob in rows_of(connection, "pair_id rows cols data", table):
-            label = f"{tables.pair_label(pair_id)} ({what})"
+            label = f"{' - '.join(tables.pair_names(pair_id))} ({what})"
             images = pair_images(pair_id)
             indices = _array(blob, rows, columns, np.dtype("<u4"))
             is_known = images[0] != images[1] and tables.names.keys() >= set(images)

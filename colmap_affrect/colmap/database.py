@@ -1,7 +1,6 @@
 """The COLMAP database: what it holds, and keypoints and matches into it.
 
-Everything is checked before it is written: pycolmap stores wrong dtypes silently, and an
-index out of range would later end the Python process.
+Everything is checked before it is written: an index out of range would later end the process.
 """
 
 import errno
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import (
     MEASUREMENT_SIGMAS,
     colmap_from_pixel,
@@ -92,7 +91,7 @@ def require_database_space(path: Path, num_new: int) -> None:
 
 
 def image_ids(path: Path) -> dict[str, int]:
-    """Return name to image id; an empty database is made if the file is missing."""
+    """Return the image ids by name; an empty database is made if the file is missing."""
     with open_database(path) as database:
         return {image.name: image.image_id for image in database.read_all_images()}
 
@@ -106,11 +105,7 @@ def all_cameras(path: Path) -> list[pycolmap.Camera]:
 def nearest_positions(
     path: Path, num_neighbors: int, max_distance_m: float
 ) -> list[tuple[str, str]]:
-    """Return the pairs of images that were taken near to each other, by COLMAP's pose priors.
-
-    Heights are ignored, as in COLMAP's spatial matcher: those of GPS are rough. Distances are in
-    the unit of the priors if they are Cartesian. Raises DatabaseError, see :func:`spatial_pairs`.
-    """
+    """Return the pairs of images near to each other by pose priors; heights of GPS are rough."""
     options = pycolmap.SpatialPairingOptions(
         max_num_neighbors=num_neighbors, max_distance=max_distance_m, ignore_z=True
     )
@@ -196,8 +191,7 @@ def lack_matches(database: pycolmap.Database, image_ids: NDArray[np.integer]) ->
 def colmap_keypoints(lafs: Floats) -> Singles:
     """Turn (N, 2, 3) frames into COLMAP's 6 columns x, y, a11, a12, a21, a22.
 
-    The centre moves to COLMAP's corner origin; the shape maps the unit circle to one
-    sigma, so the magnification of the measurement ellipse is divided out.
+    The centre moves to COLMAP's corner origin; the shape maps the unit circle to one sigma.
     """
     centers = colmap_from_pixel(lafs[:, :, 2].astype(np.float32))
     shapes = (lafs[:, :, :2] / MEASUREMENT_SIGMAS).astype(np.float32).reshape(-1, 4)
@@ -214,9 +208,9 @@ def has_keypoints(database: pycolmap.Database, image_id: int, count: int) -> boo
 def write_keypoints(
     database: pycolmap.Database, image_id: int, lafs: Floats, level_ends: Sequence[int] = ()
 ) -> None:
-    """Write the (N, 2, 3) frames of an image, in the place of fewer that it may have had before.
+    """Write the (N, 2, 3) frames of an image.
 
-    Those were as many as one of ``level_ends``, before escalation appended others; DatabaseError
+    Fewer that it has, as many as one of ``level_ends`` of escalation, are replaced; DatabaseError
     for another number.
     """
     if has_keypoints(database, image_id, len(lafs)):
@@ -240,12 +234,11 @@ DESCRIPTOR_NORM = 512
 SIGNED_SHIFT = 0.30  # added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0
 
 
-def colmap_descriptors(descriptors: Floats) -> Bytes:
-    """Encode (N, 128) unit descriptors as (N, 128) uint8 rows of length 512, as COLMAP's SIFT.
+def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: Floats) -> None:
+    """Write (N, 128) unit descriptors as uint8 rows of length 512, as COLMAP's SIFT has them.
 
-    Descriptors without negative elements, as RootSIFT, keep their angles. Others are shifted to
-    positive values first, which makes all angles smaller and hardly changes their order.
-    DatabaseError for another size than 128, which COLMAP's SIFT matchers refuse.
+    Signed ones are shifted to positive values first, which makes all angles smaller and hardly
+    changes their order. DatabaseError for another size than 128.
     """
     if descriptors.shape[1] != DESCRIPTOR_SIZE:
         raise DatabaseError(
@@ -256,15 +249,9 @@ def colmap_descriptors(descriptors: Floats) -> Bytes:
     positive = np.maximum(descriptors.astype(np.float64) + shift, 0.0)
     lengths = np.linalg.norm(positive, axis=1, keepdims=True)
     scaled = DESCRIPTOR_NORM * positive / np.maximum(lengths, np.finfo(np.float64).tiny)
-    return np.asarray(np.minimum(np.rint(scaled), 255), dtype=np.uint8)
-
-
-def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: Floats) -> None:
-    """Write (N, 128) unit descriptors of an image that has none, see :func:`colmap_descriptors`."""
-    rows = pycolmap.FeatureDescriptors(
-        type=pycolmap.FeatureExtractorType.SIFT, data=colmap_descriptors(descriptors)
-    )
-    database.write_descriptors(image_id, rows)
+    rows = np.asarray(np.minimum(np.rint(scaled), 255), dtype=np.uint8)
+    sift = pycolmap.FeatureExtractorType.SIFT
+    database.write_descriptors(image_id, pycolmap.FeatureDescriptors(type=sift, data=rows))
 
 
 def replace_matches(

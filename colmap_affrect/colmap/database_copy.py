@@ -1,10 +1,5 @@
-"""Copies of COLMAP databases, made without opening the original through COLMAP.
+"""Copies of COLMAP databases, made by SQLite: COLMAP migrates a database as soon as it opens it."""
 
-COLMAP migrates a database in place as soon as it opens it, even for reading. So a user's database
-is read and copied by SQLite itself, and COLMAP opens only the copy.
-"""
-
-import logging
 import sqlite3
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -18,11 +13,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database, write_frame
 from colmap_affrect.colmap.tables import DAMAGED, columns_of, open_read_only
-from colmap_affrect.colmap.useless_keypoints import KINDS, leave_out_useless
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.outputs import remove_database
-
-logger = logging.getLogger(__name__)
 
 
 def schema_version(path: Path) -> int:
@@ -55,8 +47,7 @@ def refuse_newer(path: Path) -> int:
 def copy_as_it_is(source: Path, target: Path) -> None:
     """Copy a database as it is now, including its write-ahead log, with the schema that it has.
 
-    Raises OptionError when there is none, DatabaseError unless it is an intact one of a COLMAP that
-    is not newer than pycolmap.
+    DatabaseError unless it is an intact one of a COLMAP that is not newer than pycolmap.
     """
     refuse_newer(source)
     try:
@@ -71,42 +62,34 @@ Change = Callable[[pycolmap.Database], None]
 
 def copy_database(
     source: Path, target: Path, refused: Collection[str] = (), change: Change | None = None
-) -> str:
+) -> None:
     """Copy a database as it is now, including its write-ahead log.
 
-    The copy, which appears as a whole, has the schema of the installed pycolmap, which leaves
-    positions (GPS) of COLMAP before 3.10 behind: they become pose priors. ``change`` is done to it
-    first. Raises DatabaseError, beside :func:`copy_as_it_is`, when the target exists, and for
-    ``refused`` kinds of problems: databases of anybody are checked before COLMAP sees the copy.
-    Returns which of their keypoints are left out, if any, which is also logged.
+    The copy, which appears as a whole, has the schema of the installed pycolmap, and what
+    ``change`` does to it. Positions (GPS) of COLMAP before 3.10 become pose priors. Raises
+    DatabaseError, beside :func:`copy_as_it_is`, when the target exists, and for ``refused`` kinds
+    of problems: databases of anybody are checked before COLMAP sees the copy.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
-    problems = refuse_unusable(source, refused) if refused else {}
-    has_useless = "keypoint-data" in refused and not problems.keys().isdisjoint(KINDS)
+    if refused:
+        refuse_unusable(source, refused)
     new = target.with_name(target.name + ".new")
     remove_database(new)
     try:
         copy_as_it_is(source, new)
         positions = _old_positions(new)
         with open_database(new) as database:  # COLMAP migrates it
-            left_out = leave_out_useless(database) if has_useless else ""
-            if left_out:
-                logger.warning("%s: %s", source, left_out)
             _add_positions(database, positions)
             if change:
                 change(database)
         new.replace(target)
-        return left_out
     finally:
         remove_database(new)
 
 
 def _old_positions(path: Path) -> dict[int, tuple[float, float, float]]:
-    """Return the positions that COLMAP before 3.10 kept with images, by image id.
-
-    Beside a rotation there is the translation of a pose instead; scripts wrote zeros for none.
-    """
+    """Return the positions that COLMAP before 3.10 kept with images, by image id."""
     with open_read_only(path) as connection:
         if "prior_tx" not in columns_of(connection, "images"):
             return {}
@@ -137,16 +120,10 @@ def _add_positions(
             database.write_pose_prior(prior)
 
 
-def copy_with_frames(source: Path, target: Path) -> str:
-    """Copy a database with all its content, as :func:`copy_database`; every image gets a frame."""
-    return copy_database(source, target, FATAL, _add_frames)
-
-
 def copy_without_features(source: Path, target: Path) -> None:
-    """Copy cameras, rigs, frames, images and pose priors of a database, as :func:`copy_database`.
+    """Copy cameras, rigs, frames, images and pose priors of a database; every image gets a frame.
 
-    Ids stay the same. Images without a frame get one: frames came with COLMAP 3.12, and mapping
-    refuses a database in which only some images have one.
+    Ids stay the same.
     """
 
     def change(database: pycolmap.Database) -> None:
@@ -154,12 +131,13 @@ def copy_without_features(source: Path, target: Path) -> None:
         database.clear_descriptors()
         database.clear_matches()
         database.clear_two_view_geometries()
-        _add_frames(database)
+        add_frames(database)
 
     copy_database(source, target, FATAL_FOR_IMAGES, change)
 
 
-def _add_frames(database: pycolmap.Database) -> None:
+def add_frames(database: pycolmap.Database) -> None:
+    """Give every image a frame: mapping refuses a database in which only some have one."""
     rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
     for image in database.read_all_images():
         if not image.has_frame_id():

@@ -1,17 +1,15 @@
 """Files of COLMAP models: walked through, compared with their digests, read and written.
 
-pycolmap's reader never ends, takes all memory or ends the process where a count in a file is wrong,
-and takes numbers that are not finite. So every record is followed to the end of its file first;
-that records name cameras, images and points that are there is left to pycolmap, which says so.
-Models of ours have a digest of their files beside them.
+pycolmap's reader never ends, takes all memory or ends the process where a count in a file is wrong.
+So every record is followed to the end of its file first. Models of ours have a digest of their
+files beside them.
 """
 
 import hashlib
 import json
-import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -86,14 +84,10 @@ def _require(is_right: bool | np.bool_, otherwise: str) -> None:
         raise ValueError(otherwise)
 
 
-def _require_finite(values: Iterable[float]) -> None:
-    _require(all(map(math.isfinite, values)), "numbers that are not finite")
-
-
 def _pose(reader: _Reader) -> None:
     """Step over a pose: a quaternion and a translation."""
     pose = reader.take("7d")
-    _require_finite(pose)
+    _require(np.isfinite(pose).all(), "numbers that are not finite")
     _require(any(pose[:4]), "a pose without rotation")
 
 
@@ -111,7 +105,8 @@ def _camera(reader: _Reader) -> None:
     like = camera_like(model)
     if like is None:
         raise ValueError("a camera is of no model of COLMAP")
-    _require_finite(reader.take(f"{len(like.params)}d"))
+    params = reader.take(f"{len(like.params)}d")
+    _require(np.isfinite(params).all(), "numbers that are not finite")
     _require(all(0 < side <= MAX_SIDE_PX for side in size), "a camera is of no size in pixels")
 
 
@@ -249,7 +244,7 @@ def file_digests(folder: Path) -> dict[str, str]:
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model into a new folder; pycolmap does not say when the disk is full."""
+    """Write a model into a new folder."""
     folder.mkdir()
     model.write(folder)
     _require_written(folder)
@@ -259,6 +254,14 @@ def read_written_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a model that pycolmap has just written."""
     _require_written(folder)
     return pycolmap.Reconstruction(folder)
+
+
+def _require_written(folder: Path) -> None:
+    """Refuse a model of which a part is missing: pycolmap does not say when the disk is full."""
+    try:
+        registered_names(folder)
+    except StoreError as error:
+        raise cannot_write(folder, error) from error
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
@@ -284,13 +287,6 @@ def read_given_model(
             raise
         why = f"not a COLMAP model; {wanted} ({reason(error)})"
         raise error_class(f"{option}{folder}: {why}") from error
-
-
-def _require_written(folder: Path) -> None:
-    try:
-        registered_names(folder)
-    except StoreError as error:
-        raise cannot_write(folder, error) from error
 
 
 def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:

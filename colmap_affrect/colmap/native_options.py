@@ -1,11 +1,8 @@
-"""pycolmap's own options, by dotted keys and plain values.
+"""pycolmap's own options, by dotted keys (``mapper.init_min_tri_angle``) and plain values.
 
-``mapper.init_min_tri_angle`` is the option of that name in the section ``mapper``. In this form
-users pass options on to COLMAP, a report says where a run differs from COLMAP's defaults, and
-another process gets its options. Lists, sets and arrays cannot be given so and are left out.
+Lists, sets and arrays are left out.
 """
 
-import difflib
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import reduce
@@ -15,7 +12,7 @@ from typing import Any
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.options import flat
+from colmap_affrect.options import flat, suggestion
 
 Plain = bool | int | float | str
 
@@ -42,19 +39,16 @@ def set_values(options: Any, values: Mapping[str, Plain]) -> None:
 
 
 def resolve(options: Any, given: Mapping[str, Any], flag: str) -> dict[str, Plain]:
-    """Check values against the type of pycolmap's and return them by full dotted key.
+    """Set values, which may be text, in ``options``; return them by full dotted key.
 
-    ``options``, of the class that the values are for, are changed. Of keys sections may be left out
-    where a name exists once. Values may be text: ``true`` or ``false`` for truth values,
-    a name for enumerations. OptionError begins with ``flag``, how a user gives them, and
-    names a key that is unknown or ambiguous, or whose value is of a wrong type.
+    Of keys sections may be left out where a name exists once. OptionError, which begins with
+    ``flag``, names a key that is unknown or ambiguous, or whose value is of a wrong type.
     """
     known = flat_values(options)
     resolved: dict[str, Plain] = {}
     for text, value in given.items():
         key = _full_key(text, known, flag)
-        reason = OWNED.get(_name(key))
-        if reason:
+        if reason := OWNED.get(_name(key)):
             raise OptionError(f"{flag} {text}: cannot be changed here; {reason}")
         resolved[key] = _converted(value, known[key], f"{flag} {text}")
         try:
@@ -72,13 +66,9 @@ def _plain_values(options: Any) -> dict[str, Plain]:
             plain[key] = value
         elif isinstance(value, Path):
             plain[key] = str(value)
-        elif _is_enumeration(value):
+        elif hasattr(type(value), "__members__"):  # an enumeration
             plain[key] = value.name
     return plain
-
-
-def _is_enumeration(value: Any) -> bool:
-    return hasattr(type(value), "__members__")
 
 
 def _name(key: str) -> str:
@@ -93,9 +83,7 @@ def _full_key(text: str, known: Mapping[str, Any], flag: str) -> str:
         return found[0]
     if found:
         raise OptionError(f"{flag} {text}: exists in several sections; give {' or '.join(found)}")
-    meant = {_name(key): key for key in known} | {key: key for key in known}
-    close = difflib.get_close_matches(text, meant, n=1)
-    hint = f" (did you mean '{meant[close[0]]}'?)" if close else ""
+    hint = suggestion(text, [*known, *map(_name, known)])
     raise OptionError(f"{flag} {text}: pycolmap has no such option{hint}")
 
 
@@ -111,8 +99,8 @@ EXPECTED: dict[type, tuple[str, Any]] = {
 
 def _converted(value: Any, example: Any, where: str) -> Plain:
     """Turn a value, which may be text, into the type of an example."""
-    if _is_enumeration(example):
-        name, names = getattr(value, "name", value), type(example).__members__
+    if names := getattr(type(example), "__members__", None):
+        name = getattr(value, "name", value)
         if isinstance(name, str) and name.upper() in names:
             return name.upper()
         raise OptionError(f"{where}={value}: expected one of {', '.join(names)}")

@@ -1,7 +1,4 @@
-"""Databases of COLMAP 3.8, which COLMAP up to 3.13 reads; those of COLMAP 4 make it stop.
-
-Their tables hold no rigs, frames or types of descriptors, and positions are columns of the images.
-"""
+"""Databases of COLMAP 3.8, which COLMAP up to 3.13 reads; they hold no rigs and frames."""
 
 import sqlite3
 from collections.abc import Sequence
@@ -79,9 +76,8 @@ geometries of configuration 9, calibrated with rigs, as 2, calibrated."""
 def export_database(source: Path, target: Path) -> list[str]:
     """Write a database as COLMAP 3.8 makes them; ids stay, and the source is only read.
 
-    Returns what COLMAP 3.8 has no place for and is left out, a line each. DatabaseError when the
-    source cannot be used or has a camera model that COLMAP 3.8 does not know, OptionError when the
-    target exists.
+    Returns what is left out, a line each. DatabaseError when the source cannot be used or has a
+    camera model that COLMAP 3.8 does not know, OptionError when the target exists.
     """
     photographs = Workspace(source.parent).photographs()
     with new_results(target, photographs=photographs, names=read_names(source)) as (old,):
@@ -89,7 +85,12 @@ def export_database(source: Path, target: Path) -> list[str]:
         copy_database(source, new, FATAL)
         require_space(target, new.stat().st_size)
         with open_database(new) as database:
-            _refuse_new_models(database, source)
+            for camera in database.read_all_cameras():
+                if int(camera.model) > LAST_MODEL:
+                    raise DatabaseError(
+                        f"{source}: camera {camera.camera_id} is of model {camera.model.name}, "
+                        "which COLMAP 3.8 does not know; extract with another --camera-model"
+                    )
             priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
             notes = _left_out(database)
         if any(prior.coordinate_system == METRIC for prior in priors):
@@ -103,15 +104,6 @@ def export_database(source: Path, target: Path) -> list[str]:
         except sqlite3.Error as error:
             raise cannot_write(target, error) from error
     return notes
-
-
-def _refuse_new_models(database: pycolmap.Database, source: Path) -> None:
-    for camera in database.read_all_cameras():
-        if int(camera.model) > LAST_MODEL:
-            raise DatabaseError(
-                f"{source}: camera {camera.camera_id} is of model {camera.model.name}, which "
-                "COLMAP 3.8 does not know; extract with another --camera-model"
-            )
 
 
 def _write_positions(connection: sqlite3.Connection, priors: Sequence[pycolmap.PosePrior]) -> None:

@@ -1,13 +1,13 @@
 """What a command left in a database, to tell what others have changed in it since.
 
 ``database.db.seal`` holds size and times of the file, and digests of all rows by image, camera and
-pair. A database that has these times still is not read. While a command works the seal is called
-``database.db.seal-open``: ``open_database`` removes it when anything is written, so a database
-without a seal was left by a process that was killed.
+pair; a file with these times is not read. While a command works it is ``database.db.seal-open``,
+which ``open_database`` removes when anything is written: a killed process leaves none.
 """
 
 import hashlib
 import io
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,10 +114,7 @@ def end_work(path: Path, *, reads: bool = True) -> None:
 
 
 def changes(path: Path) -> dict[str, Change]:
-    """Return what has changed by part, nothing where no command had sealed the database.
-
-    Raises DatabaseError where it cannot be read.
-    """
+    """Return what has changed by part, nothing where no command had sealed the database."""
     now, found = read_parts(path), dict[str, Change]()
     before = _parts_in(seal_of(path))
     for part, rows in now.items() if before else ():
@@ -169,20 +166,21 @@ def _stamp(path: Path) -> list[int]:
 
 
 def _write(seal: Path, parts: Parts, stamp: list[int]) -> None:
-    content = io.BytesIO()
-    arrays: dict[str, Any] = {STAMP: np.array(stamp, np.int64), **parts}
-    np.savez(content, **arrays)
+    content, arrays = io.BytesIO(), {STAMP: np.array(stamp, np.int64), **parts}
+    np.savez(content, **arrays)  # type: ignore[arg-type]
     replace_bytes(seal, content.getvalue())
 
 
 def _stamp_in(seal: Path) -> list[int]:
-    """Return the stamp in a seal; empty where there is none, or it cannot be read."""
-    with suppress(*UNREADABLE), np.load(seal, allow_pickle=False) as arrays:
-        return [int(number) for number in arrays[STAMP]]
-    return []
+    return [int(number) for number in _arrays_in(seal, (STAMP,)).get(STAMP, ())]
 
 
 def _parts_in(seal: Path) -> Parts:
+    return _arrays_in(seal, QUERIES)
+
+
+def _arrays_in(seal: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Return arrays of a seal; none where there is no seal, or it cannot be read."""
     with suppress(*UNREADABLE), np.load(seal, allow_pickle=False) as arrays:
-        return {part: arrays[part] for part in QUERIES}
+        return {name: arrays[name] for name in names}
     return {}

@@ -1,12 +1,12 @@
 """What a COLMAP database of any version holds, read by SQLite: COLMAP migrates what it opens."""
 
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from colmap_affrect.errors import DatabaseError, OptionError
 
@@ -21,8 +21,7 @@ SENSOR_CAMERA = 0
 def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a COLMAP database so that nothing can change it.
 
-    Without a write-ahead log or a journal nobody is writing to it, and it is opened as immutable:
-    SQLite then makes no files beside it, so that its folder may be read-only.
+    Without a write-ahead log or a journal as immutable: SQLite makes no files beside it then.
     """
     if not path.is_file():
         raise OptionError(f"{path}: no such file; give a COLMAP database")
@@ -48,8 +47,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
         raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error
 
 
-@dataclass(frozen=True)
-class Camera:
+class Camera(NamedTuple):
     """A row of the table of cameras; the size is in px, the model a number of COLMAP's."""
 
     width: int
@@ -71,17 +69,10 @@ class Tables:
     matches: dict[int, int]  # number of raw matches by pair id
     geometries: dict[int, tuple[int, int]]  # number of inliers and configuration by pair id
 
-    def pair_label(self, pair_id: int) -> str:
-        """Return the names of a pair for a message."""
-        return " - ".join(self.pair_names(pair_id))
-
     def pair_names(self, pair_id: int) -> tuple[str, str]:
         """Return the names of a pair, the image with the smaller id first."""
-        first, second = map(self._label, pair_images(pair_id))
+        first, second = (self.names.get(i, f"image {i}") for i in pair_images(pair_id))
         return first, second
-
-    def _label(self, image_id: int) -> str:
-        return self.names.get(image_id, f"image {image_id}")
 
     def summary(self) -> str:
         """Return the numbers of what there is."""
@@ -106,10 +97,7 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
     images = list(rows("image_id name camera_id", "images"))
     cameras = rows("camera_id width height model params", "cameras")
     return Tables(
-        cameras={
-            int(key): Camera(int(width), int(height), int(model), params)
-            for key, width, height, model, params in cameras
-        },
+        cameras={int(key): Camera(*map(int, row), params) for key, *row, params in cameras},
         names={int(key): str(name) for key, name, _ in images},
         camera_ids={int(key): int(camera_id) for key, _, camera_id in images},
         frame_images={
@@ -135,18 +123,6 @@ def rows_of(connection: sqlite3.Connection, columns: str, table: str) -> Iterabl
     present = ", ".join(name if name in known | {"rowid"} else "0" for name in columns.split())
     # All names are those of COLMAP's tables, written down in this package.
     return connection.execute(f"SELECT {present} FROM {table}")  # noqa: S608
-
-
-def delete_rows(path: Path, rows: Mapping[str, Iterable[int]]) -> None:
-    """Delete rows of the tables that are named, all at once; COLMAP must not have them open."""
-    try:
-        with closing(sqlite3.connect(path)) as connection, connection:
-            for table, keys in rows.items():
-                # Names of tables are those of COLMAP, written down in this package.
-                statement = f"DELETE FROM {table} WHERE rowid = ?"  # noqa: S608
-                connection.executemany(statement, ((int(key),) for key in keys))
-    except DAMAGED as error:
-        raise DatabaseError(f"{path}: cannot be changed ({error})") from error
 
 
 def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:

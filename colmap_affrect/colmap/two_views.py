@@ -1,6 +1,6 @@
 """Two-view geometries of a COLMAP database as plain arrays, and how significant they are.
 
-All points here are in COLMAP's pixels, the corner of the image being (0, 0).
+All points are in COLMAP's pixels: (0, 0) is the corner of the image.
 """
 
 import math
@@ -45,8 +45,7 @@ def epipolar_pair(
 ) -> EpipolarModel | None:
     """Return the epipolar geometry of a pair and all keypoints; None where it has none.
 
-    Where both cameras are known it holds in pixels without distortion. Keypoints are twice
-    (N, 2 or more), as in the database.
+    Of calibrated pairs it holds in pixels without distortion. Keypoints are twice (N, 2 or more).
     """
     points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
     essential, fundamental = geometry.E, geometry.F
@@ -75,11 +74,7 @@ def undistorted(camera: pycolmap.Camera, points: Array) -> Array:
 
 
 def _keypoint_shapes(keypoints: Floats) -> Array | None:
-    """Return the (N, 2, 2) linear parts of a database's keypoints, up to a factor.
-
-    Of 6 columns (x, y, a11, a12, a21, a22) they are affine; of 4 (x, y, scale, orientation in
-    radians, as COLMAP's SIFT writes them) similarities; of 2 there are none: None.
-    """
+    """Return the (N, 2, 2) linear parts of keypoints of 6 or 4 columns, up to a factor."""
     keypoints = np.asarray(keypoints, np.float64)
     if keypoints.shape[1] == 6:
         return np.asarray(keypoints[:, 2:].reshape(-1, 2, 2), np.float64)
@@ -120,11 +115,10 @@ def homography_of(
     tolerance_px: float,
     min_off_plane: int,
 ) -> Array | None:
-    """Return the homography of a pair whose epipolar geometry is arbitrary or hardly determined.
+    """Return the homography of a pair whose epipolar geometry is arbitrary or poorly determined.
 
     That is one of :data:`PLANAR`, or whose homography explains all but fewer than
-    ``min_off_plane`` of its inliers, up to ``tolerance_px`` in image 2: epipolar lines hold on the
-    plane, but turn freely off it. Keypoints are twice (N, 2 or more), as in the database.
+    ``min_off_plane`` of its inliers, up to ``tolerance_px`` in image 2.
     """
     homography = homography_matrix(geometry)
     if homography is None:
@@ -145,9 +139,8 @@ def significance(
 ) -> float:
     """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
 
-    It is infinite for a geometry that there is nothing to test in (a watermark). ``keypoints`` are
-    those of the raw matches, from which COLMAP estimated the geometry: twice (M, 2, 4 or 6), with
-    columns as in the database; without shapes, in 2 columns, positions count alone.
+    It is infinite for a watermark, which cannot be tested. ``keypoints`` are those of the raw
+    matches: twice (M, 2, 4 or 6); of 2 columns positions count alone.
     """
     with np.errstate(all="ignore"):  # points that a camera cannot undistort are no inliers
         model = pair_model(geometry, cameras, keypoints)
@@ -165,10 +158,7 @@ def significance(
 
 
 def telling_shapes(keypoints: Floats) -> Points | None:
-    """Return the shapes of keypoints; None if they tell nothing.
-
-    That is without any, of circles, if all are alike, or only differ from view to view.
-    """
+    """Return the shapes of keypoints; None without any, if all are alike, or only views differ."""
     shapes = _keypoint_shapes(keypoints)
     if shapes is None or not len(shapes):
         return None

@@ -1,8 +1,4 @@
-"""Geometric verification of raw matches by pycolmap, and how significant what it finds is.
-
-Significance is of inliers, and of what their local affine frames say
-(:mod:`colmap_affrect.geometry.epipolar`).
-"""
+"""Geometric verification of raw matches by pycolmap, and its significance."""
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -49,10 +45,10 @@ class VerificationOptions(PresetOptions):
     min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.0
     """Share of the raw matches; those that are wrong say little about the others."""
     min_significance: Annotated[float, within(0.0, 1e9)] = 5.0
-    """Beside enough inliers, a pair must look so good that chance would need 10 to the power of
-    this many pairs to have one like it: by the number of its inliers among so many raw matches,
-    and by the share of them whose local affine frames agree with the geometry. With 5, all pairs of
-    450 unrelated photographs have about one. 0 accepts what COLMAP accepts."""
+    """Chance would need 10 to the power of this many pairs to have one that looks as good: by the
+    number of its inliers among so many raw matches, and by the share of them whose local affine
+    frames agree with the geometry. With 5, all pairs of 450 unrelated photographs have about one. 0
+    accepts what COLMAP accepts."""
     max_num_trials: Annotated[int, within(1, 100_000_000)] = 10000
     ransac_min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.10
     random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
@@ -109,8 +105,8 @@ def estimate_geometry(
 ) -> pycolmap.TwoViewGeometry:
     """Return the two-view geometry of (M, 2) raw matches; an empty one if it is rejected.
 
-    The side of the smaller id comes first, as COLMAP has them. ``extracted_px`` is the longest side
-    that photographs were shrunk to before extraction, if any.
+    The side of the smaller id comes first. ``extracted_px`` is the longest side that photographs
+    were shrunk to before extraction, if any.
     """
     cameras = (sides[0].camera, sides[1].camera)
     matched = (sides[0].keypoints[matches[:, 0]], sides[1].keypoints[matches[:, 1]])
@@ -142,9 +138,8 @@ def _planar_geometry(
 ) -> pycolmap.TwoViewGeometry:
     """Return the homography of the inliers of an epipolar geometry, with all matches it explains.
 
-    Epipolar lines hold wrong matches by chance that a homography does not, so that of few matches
-    on a plane the one can be significant and the other not. Among all raw matches it would not be
-    found: fours of them are hardly ever all right.
+    Of few matches on a plane it can be significant where epipolar lines, which also hold wrong
+    matches by chance, are not.
     """
     rows = np.asarray(geometry.inlier_matches, np.int64)[:, 0]
     found: Any = pycolmap.estimate_homography_matrix(
@@ -182,6 +177,7 @@ def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
 
 
 _Task = tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]  # ids, images, raw matches
+_Done = tuple[tuple[int, int], pycolmap.TwoViewGeometry]
 
 
 def verify(
@@ -193,11 +189,9 @@ def verify(
 ) -> None:
     """Estimate the two-view geometry of every matched pair that has none yet.
 
-    Of ``pairs`` of image ids only, if they are given, each with the lower id first.
-
-    As ``pycolmap.geometric_verification``, but a geometry is written when it has been judged:
-    whatever ends this, no pair is left that counts as verified and was not. ``advance`` is called
-    with the number of pairs that are done.
+    Of ``pairs`` of image ids only, if they are given, each with the lower id first. A geometry is
+    written when it has been judged: whatever ends this, no pair counts as verified that was not.
+    ``advance`` is called with the number of pairs that are done.
     """
     todo = unverified_pairs(path)
     if pairs is not None:
@@ -218,12 +212,12 @@ def verify(
         ):
             _say_that_shapes_are_missing(path)
 
-        def estimate(task: _Task) -> tuple[tuple[int, int], pycolmap.TwoViewGeometry]:
+        def estimate(task: _Task) -> _Done:
             ids, sides, matches = task
             size_px = of_pair(extracted_px, ids)
             return ids, estimate_geometry(sides, matches, options, size_px)
 
-        done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]] = []
+        done: list[_Done] = []
         tasks = (
             ((one, two), (side(one), side(two)), database.read_matches(one, two))
             for one, two in map(tuple, todo)
@@ -241,16 +235,13 @@ def verify(
 def _say_that_shapes_are_missing(path: Path) -> None:
     """Say it once of each database."""
     logger.info(
-        "%s: keypoints have no shapes; pairs need more inliers to count as verified, and sides "
-        "that look alike are not told apart",
-        path,
-    )
+        "%s: keypoints have no shapes; pairs need more inliers, and sides that look alike are not "
+        "told apart", path,
+    )  # fmt: skip
 
 
 def _write(
-    database: pycolmap.Database,
-    done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]],
-    advance: Callable[[int], None] | None,
+    database: pycolmap.Database, done: list[_Done], advance: Callable[[int], None] | None
 ) -> None:
     with pycolmap.DatabaseTransaction(database):
         for ids, geometry in done:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
+from colmap_affrect.comparison.pose_scores import MAX_CORRECT_ERROR_DEG
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.tables import (
     Column,
@@ -46,12 +46,12 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
     """
     columns = columns_of(comparison)
     names, folder = comparison.image_names, Path(comparison.image_path)
-    graphs = [column.method.pair_inliers for column in columns]
+    graphs = [column.method.seeds[0].pair_inliers for column in columns]
     cards = cards_of(columns, comparison)
     index = {name: number for number, name in enumerate(names)}
     layout = view_graph.lay_out(names, graphs)
-    paths = comparison.model_paths(output_path)
-    views = read_scene({column.name: paths[column.name] for column in columns})
+    paths = {c.name: comparison.model_path(c.method, output_path) for c in columns}
+    views = read_scene(paths)
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
     content = {
         "comparison": comparison,
@@ -68,7 +68,6 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
         "thumbnails": thumbnails(folder, names, progress),
         "image_index": index,
         "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
-        "auc_thresholds_deg": AUC_THRESHOLDS_DEG,
         "settings": flat(comparison.settings),
         "method_options": {c.name: flat(c.method.options) for c in columns},
         "layout": layout,

@@ -49,12 +49,6 @@ class PoseScores:
         """Of the pairs of registered images; None without pairs."""
         return median(r for r, _ in self.pair_errors_deg.values()) if self.pair_errors_deg else None
 
-    @computed_field  # type: ignore[prop-decorator]
-    @property
-    def median_direction_error_deg(self) -> float | None:
-        """Of the translations of the pairs of registered images; None without pairs."""
-        return median(d for _, d in self.pair_errors_deg.values()) if self.pair_errors_deg else None
-
 
 def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
     """Compute the errors of the relative poses of all pairs of images that both have."""
@@ -109,9 +103,9 @@ def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
         true_centres,
         pycolmap.RANSACOptions(max_error=MAX_ALIGNMENT_ERROR * extent, random_seed=0),
     )
-    aligned = robust["tgt_from_src"] if robust else pycolmap.estimate_sim3d(centres, true_centres)
-    if aligned is None:
+    if not robust:
         return {}
+    aligned = robust["tgt_from_src"]
     moved = centres @ aligned.matrix()[:, :3].T + aligned.matrix()[:, 3]
     return dict(zip(names, np.linalg.norm(moved - true_centres, axis=1).tolist(), strict=True))
 

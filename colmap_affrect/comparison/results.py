@@ -73,36 +73,59 @@ class SeedResult:
         return self.model_names[0] if self.model_names else ()
 
     @property
-    def mean_observations(self) -> float:
-        """Observed points per registered image."""
-        return self.num_points3D * self.mean_track_length / max(1, len(self.registered_names))
-
-    @property
     def correct_names(self) -> tuple[str, ...]:
         """Images registered correctly; without ground truth those registered."""
         return self.registered_names if self.scores is None else self.scores.correct_names
 
     @model_serializer(mode="wrap")
     def _with_measures(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        measures = {key: measure(self) for key, measure in MEASURES.items()}
-        return {"seed": self.seed, **measures, **plain(self)}
+        return {"seed": self.seed, **{k: m.of(self) for k, m in MEASURES.items()}, **plain(self)}
 
 
-MEASURES: dict[str, Callable[[SeedResult], float]] = {
-    "registered": lambda seed: len(seed.registered_names),
-    "num_doubtful": lambda seed: len(seed.doubtful),
-    "num_models": lambda seed: len(seed.model_names),
-    "verified_pairs": lambda seed: len(seed.pair_inliers),
-    "inliers": lambda seed: sum(seed.pair_inliers.values()),
-    "points3D": lambda seed: seed.num_points3D,
-    "mean_track_length": lambda seed: seed.mean_track_length,
-    "mean_observations": lambda seed: seed.mean_observations,
-    "mean_reprojection_error_px": lambda seed: seed.mean_reprojection_error_px,
-}
+@dataclass(frozen=True)
+class Measure:
+    """A number of every seed, and how tables write it."""
+
+    of: Callable[[SeedResult], float | None]  # None where a seed has no such number
+    title: str  # of its line
+    digits: int  # decimals, where not all values are whole
+    better: Callable[[Iterable[float]], float] | None = None  # which mean is best, if any
+    column: str = ""  # title of its column in the terminal; empty: not shown there
+
+
+def _of_model(name: str) -> Callable[[SeedResult], float | None]:
+    return lambda seed: getattr(seed, name) if seed.model_names else None
+
+
+MEASURES = {
+    "registered": Measure(
+        lambda seed: len(seed.registered_names), "Registered, of {images}", 1, max, "registered"
+    ),
+    "correct": Measure(
+        lambda seed: len(seed.correct_names) if seed.scores else None,
+        "Registered correctly, of {images}", 1, max, "correct",
+    ),
+    "num_doubtful": Measure(lambda seed: len(seed.doubtful), "Doubtful", 1, min),
+    "num_models": Measure(lambda seed: len(seed.model_names), "Models", 1),
+    "verified_pairs": Measure(
+        lambda seed: len(seed.pair_inliers), "Verified pairs, of {pairs}", 1, None, "verified"
+    ),
+    "points3D": Measure(_of_model("num_points3D"), "3D points", 0, max, "points"),
+    "mean_track_length": Measure(
+        _of_model("mean_track_length"), "Images per 3D point", 2, None, "track"
+    ),
+    "mean_reprojection_error_px": Measure(
+        _of_model("mean_reprojection_error_px"), "Reprojection error, px", 2, None, "px"
+    ),
+    "median_rotation_error_deg": Measure(
+        lambda seed: seed.scores and seed.scores.median_rotation_error_deg,
+        "Median rotation error, °", 2, min,
+    ),
+    "auc_5": Measure(
+        lambda seed: seed.scores and seed.scores.auc["5"], "AUC of relative poses at 5°", 3, max
+    ),
+}  # fmt: skip
 """Numbers of every seed, by their names in JSON."""
-
-OF_MODEL = {"points3D", "mean_track_length", "mean_observations", "mean_reprojection_error_px"}
-"""Of these, what a seed without a model has none of."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +137,6 @@ class MethodResult:
     failed: str = ""  # why it failed as a whole; empty if it did not
     wall_s: Mapping[str, float] = field(default_factory=dict)  # of stages before all seeds
     peak_memory_bytes: int = 0
-    # images whose poses contradict each other from seed to seed
-    unstable_names: tuple[str, ...] = ()
     # by another method, images that both register with the first seed in contradicting poses
     disagreements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     num_keypoints: Mapping[str, int] = field(default_factory=dict)  # of images that could be read
@@ -125,6 +146,12 @@ class MethodResult:
     folder: str = ""  # of its results, relative to the folder of the comparison
     seeds: tuple[SeedResult, ...] = ()  # in the order asked for; empty if the method failed
 
+    def span(self, measure: str) -> Span | None:
+        """Return one of ``MEASURES`` over the seeds that have it; None without any."""
+        values = [MEASURES[measure].of(seed) for seed in self.seeds]
+        known = [value for value in values if value is not None]
+        return Span.of(known) if known else None
+
     @property
     def registered(self) -> Span:
         """Images in the largest model."""
@@ -133,13 +160,7 @@ class MethodResult:
     @property
     def correct(self) -> Span | None:
         """Images registered correctly; None without ground truth."""
-        scores = [seed.scores for seed in self.seeds if seed.scores is not None]
-        return Span.of(len(item.correct_names) for item in scores) if scores else None
-
-    @property
-    def pair_inliers(self) -> Mapping[Pair, int]:
-        """Verified pairs of the first seed."""
-        return self.seeds[0].pair_inliers
+        return self.span("correct")
 
     @property
     def shown_seed(self) -> SeedResult | None:
@@ -175,11 +196,6 @@ class MethodResult:
         """Seconds from photographs to one model."""
         return sum(self.stage_seconds.values())
 
-    def span(self, measure: str) -> Span | None:
-        """Return one of ``MEASURES`` over the seeds; those of models None without any."""
-        seeds = [s for s in self.seeds if s.model_names or measure not in OF_MODEL]
-        return Span.of(MEASURES[measure](seed) for seed in seeds) if seeds else None
-
     @model_serializer(mode="wrap")
     def _with_spans(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = plain(self)
@@ -188,7 +204,6 @@ class MethodResult:
         del values["failed"]
         return {
             **{key: self.span(key) for key in MEASURES},
-            "correct": self.correct,
             "registered_names": {str(s.seed): s.registered_names for s in self.seeds},
             "total_s": self.total_s,
             **values,
@@ -222,24 +237,24 @@ class Comparison:
         """The methods that did not fail."""
         return tuple(method for method in self.methods if not method.failed)
 
-    def model_paths(self, output_path: Path) -> dict[str, Path | None]:
-        """Return the folder of the first model of each finished method; None for none."""
-        shown = {method.name: method.shown_seed for method in self.finished}
-        return {name: output_path / s.model_path if s else None for name, s in shown.items()}
+    def model_path(self, method: MethodResult, output_path: Path) -> Path | None:
+        """Return the folder of the first model of a method; None for none."""
+        seed = method.shown_seed
+        return output_path / seed.model_path if seed else None
 
     @property
     def only_registered_by(self) -> dict[str, str]:
         """Image name to the one method that usually registers it."""
-        by_image: dict[str, list[str]] = {name: [] for name in self.image_names}
-        for method in self.finished:
-            for name in method.usually_registered:
-                by_image[name].append(method.name)
-        return {name: methods[0] for name, methods in by_image.items() if len(methods) == 1}
+        methods = {
+            name: [method.name for method in self.finished if name in method.usually_registered]
+            for name in self.image_names
+        }
+        return {name: found[0] for name, found in methods.items() if len(found) == 1}
 
     @cached_property
     def registered_by_none(self) -> tuple[str, ...]:
         """Images that no method usually registers."""
-        registered = {name for method in self.finished for name in method.usually_registered}
+        registered = frozenset().union(*(method.usually_registered for method in self.finished))
         return tuple(name for name in self.image_names if name not in registered)
 
     @property

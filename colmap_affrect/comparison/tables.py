@@ -4,15 +4,13 @@ import itertools
 import json
 import string
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from statistics import fmean
 
 from pydantic import TypeAdapter
 
-from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, PoseScores
-from colmap_affrect.comparison.results import MEASURES, OF_MODEL, Comparison, MethodResult, Span
+from colmap_affrect.comparison.results import MEASURES, Comparison, Measure, MethodResult, Span
 from colmap_affrect.comparison.verdict import ranked, verdict
 from colmap_affrect.project.record import STAGES
 
@@ -22,12 +20,14 @@ METHOD_COLORS = (
 """Of the marks of methods; white text on them is readable."""
 
 MAIN_ROWS = {
-    "registered", "correct", "models", "verified_pairs", "points3D", "mean_track_length", "total_s",
+    "registered", "correct", "num_models", "verified_pairs", "points3D", "mean_track_length",
+    "total_s",
 }  # fmt: skip
 """Rows that decide; the others are folded away."""
 
 BYTES_PER_MB = 1_000_000
 NOTHING = "-"  # where there is no number
+WIDTH = 88  # of the verdict in the terminal
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ class Row:
     title: str
     cells: list[str]
     best: tuple[bool, ...]
+    column: str  # its title in the terminal; empty: not shown there
 
     @property
     def is_main(self) -> bool:
@@ -66,84 +67,44 @@ class Row:
         return self.key in MAIN_ROWS
 
 
-Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
-Values = Callable[[MethodResult], Iterable[float | None]]  # of one method, None for no number
-Figure = tuple[str, str, int, Better, Values]
-"""Key and title of a line, decimals, what is best, and its values, of which it shows the span."""
-
-
 def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]:
     """Return the table of methods, without the lines that say nothing of any of them."""
     methods = [column.method for column in columns]
-    rows = [_row(figure, methods) for figure in _figures(comparison, methods)]
+    counts = {"images": len(comparison.image_names), "pairs": f"{comparison.num_pairs:,}"}
+    stages = {stage for method in methods for stage in method.stage_seconds}
+    rows = [
+        _row(key, measure, [method.span(key) for method in methods], counts)
+        for key, measure in MEASURES.items()
+        if key != "num_models"
+    ]
     splits = [_splits(method) for method in methods]
-    rows.insert(2, Row("models", "Images in each model", splits, (False,) * len(splits)))
+    no_best = (False,) * len(splits)
+    rows.insert(2, Row("num_models", "Images in each model", splits, no_best, ""))
+    costs = {
+        f"{stage}_s": (f"Seconds to {stage}", 1, [m.stage_seconds.get(stage) for m in methods], "")
+        for stage in sorted(stages, key=STAGES.index)
+    }
+    costs["total_s"] = ("Seconds in all", 1, [method.total_s for method in methods], "seconds")
+    memory = [method.peak_memory_bytes / BYTES_PER_MB for method in methods]
+    costs["peak_memory_bytes"] = ("Peak memory, MB", 0, list(memory), "MB")
+    for key, (title, digits, values, column) in costs.items():
+        spans = [None if value is None else Span.of([value]) for value in values]
+        rows.append(_row(key, Measure(lambda _: None, title, digits, min, column), spans, counts))
     return [row for row in rows if any(cell != NOTHING for cell in row.cells)]
 
 
-def _figures(comparison: Comparison, methods: Sequence[MethodResult]) -> list[Figure]:
-    given = len(comparison.image_names)
-    stages = {stage for method in methods for stage in method.stage_seconds}
-
-    def measured(key: str) -> Values:
-        return lambda method: [
-            MEASURES[key](s) for s in method.seeds if s.model_names or key not in OF_MODEL
-        ]
-
-    def scored(value: Callable[[PoseScores], float | None]) -> Values:
-        return lambda method: [value(seed.scores) for seed in method.seeds if seed.scores]
-
-    def area(limit: float) -> Figure:
-        title, value = f"AUC of relative poses at {limit:g}°", scored(lambda s: s.auc[f"{limit:g}"])
-        return f"auc_{limit:g}", title, 3, max, value
-
-    def median(key: str, title: str, digits: int) -> Figure:
-        return key, f"Median {title}", digits, min, scored(lambda scores: getattr(scores, key))
-
-    def seconds(stage: str) -> Figure:
-        key, title = f"{stage}_s", f"Seconds to {stage}"
-        return key, title, 1, min, lambda method: [method.stage_seconds.get(stage)]
-
-    def keypoints(method: MethodResult) -> Iterable[float]:
-        return [fmean(method.num_keypoints.values())] if method.num_keypoints else []
-
-    return [
-        ("registered", f"Registered, of {given}", 1, max, measured("registered")),
-        ("correct", f"Registered correctly, of {given}", 1, max,
-         scored(lambda scores: len(scores.correct_names))),
-        ("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}", 1, None,
-         measured("verified_pairs")),
-        ("points3D", "3D points", 0, max, measured("points3D")),
-        ("mean_track_length", "Images per 3D point", 2, None, measured("mean_track_length")),
-        ("num_keypoints", "Keypoints per image", 0, None, keypoints),
-        ("inliers", "Inliers in all pairs", 0, None, measured("inliers")),
-        ("mean_observations", "3D points seen by an image", 0, None, measured("mean_observations")),
-        ("mean_reprojection_error_px", "Reprojection error, px", 2, None,
-         measured("mean_reprojection_error_px")),
-        *map(area, AUC_THRESHOLDS_DEG),
-        median("median_rotation_error_deg", "rotation error, °", 2),
-        median("median_direction_error_deg", "error of translation direction, °", 2),
-        median("median_position_error", "position error, units of the ground truth", 4),
-        *map(seconds, sorted(stages, key=STAGES.index)),
-        ("total_s", "Seconds in all", 1, min, lambda method: [method.total_s]),
-        ("peak_memory_bytes", "Peak memory, MB", 0, min,
-         lambda method: [method.peak_memory_bytes / BYTES_PER_MB]),
-    ]  # fmt: skip
-
-
-def _row(figure: Figure, methods: Sequence[MethodResult]) -> Row:
+def _row(
+    key: str, measure: Measure, spans: Sequence[Span | None], counts: dict[str, object]
+) -> Row:
     """Write means and, in brackets, ranges with as many decimals in all cells as any needs."""
-    key, title, digits, better, values = figure
-    numbers = [[v for v in values(method) if v is not None] for method in methods]
-    spans = [Span.of(of_method) if of_method else None for of_method in numbers]
-    known = [span for span in spans if span]
+    digits, known = measure.digits, [span for span in spans if span]
     means = {round(span.mean, digits) for span in known}
-    best = better(means) if better and len(means) > 1 else None
+    best = measure.better(means) if measure.better and len(means) > 1 else None
     digits_of_mean = digits_of((span.mean for span in known), digits)
     digits_of_ends = digits_of((end for span in known for end in (span.min, span.max)), digits)
     cells = [span_text(span, digits_of_mean, digits_of_ends) for span in spans]
-    is_best = [span is not None and round(span.mean, digits) == best for span in spans]
-    return Row(key, title, cells, tuple(is_best))
+    is_best = tuple(span is not None and round(span.mean, digits) == best for span in spans)
+    return Row(key, measure.title.format(**counts), cells, is_best, measure.column)
 
 
 def digits_of(values: Iterable[float], digits: int) -> int:
@@ -173,20 +134,10 @@ def _splits(method: MethodResult) -> str:
     return "; ".join(f"seed {seed.seed}: {split}" for seed, split in pairs)
 
 
-WIDTH = 88
-
-SHOWN = {
-    "registered": "registered", "correct": "correct", "verified_pairs": "verified",
-    "points3D": "points", "mean_track_length": "track", "mean_reprojection_error_px": "px",
-    "total_s": "seconds", "peak_memory_bytes": "MB",
-}  # fmt: skip
-"""Lines of the table of methods that the terminal shows, as columns, and their short titles."""
-
-
 def summary(comparison: Comparison) -> str:
     """Return the verdict under a table of methods."""
     columns = columns_of(comparison)
-    rows = [row for row in summary_rows(columns, comparison) if row.key in SHOWN]
+    rows = [row for row in summary_rows(columns, comparison) if row.column]
     cells = {
         column.name: [
             f"{row.cells[index]}{f' of {len(comparison.image_names)}' * (row.key == 'registered')}"
@@ -195,7 +146,7 @@ def summary(comparison: Comparison) -> str:
         for index, column in enumerate(columns)
     }
     table = [[method.name, *cells.get(method.name, ["failed"])] for method in comparison.methods]
-    lines = [aligned([["method", *(SHOWN[row.key] for row in rows)], *table])]
+    lines = [aligned([["method", *(row.column for row in rows)], *table])]
     only = comparison.only_registered_by if len(comparison.finished) > 1 else {}
     lines += [""] * bool(only)
     lines += [f"only {method} registers {name}" for name, method in only.items()]

@@ -5,7 +5,7 @@ Gains are counted in photographs registered, or registered correctly where there
 
 import itertools
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span, in_most
 
@@ -18,12 +18,65 @@ registered in most seeds that was not before."""
 
 MIN_IMAGES = 3  # fewer are a pair, not a reconstruction
 MAX_NAMES = 6
-MIN_WHOLE_SECONDS = 10
 
 
 def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return the paragraphs, the most important one first."""
     return (headline(comparison), *changes(comparison), *cautions(comparison))
+
+
+def ranked(methods: Iterable[MethodResult]) -> list[MethodResult]:
+    """Put the method with most photographs first, of equals the fastest."""
+    return sorted(methods, key=lambda method: (-_count(method).mean, method.total_s))
+
+
+def headline(comparison: Comparison) -> str:
+    """Say first of all whether anything was gained."""
+    finished, total = comparison.finished, len(comparison.image_names)
+    if not finished:
+        return "No method finished."
+    best, reference = ranked(finished)[0], _reference(comparison)
+    most = max(method.registered.max for method in finished)
+    if most < MIN_IMAGES <= total:
+        return (
+            f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
+            "photographs."
+        )
+    registers = "correctly registers" if comparison.has_ground_truth else "registers"
+    gain = f"{best.name} {registers} {_number(_count(best))} of {total} photographs"
+    if reference is None:
+        return (
+            f"{gain}, no method more. COLMAP's SIFT was not run, so nothing can be said about a "
+            "gain."
+        )
+    if len(finished) == 1:
+        return f"{gain}; no other method finished."
+    others = _number(_count(reference))
+    if not _is_gain(best, reference):
+        return (
+            f"No benefit on this set: no method {registers} more photographs than "
+            f"{reference.name}, which {registers} {others} of {total}."
+        )
+    gain += f", {reference.name} {others}."
+    if not _is_rectified(best):
+        return f"{gain} Rectification is not needed for that."
+    as_good = [m.name for m in finished if not _is_rectified(m) and not _is_gain(best, m)]
+    verb = "does" if len(as_good) == 1 else "do"
+    without = f" {_listed(as_good)} {verb} as well without rectification." if as_good else ""
+    return f"{gain}{without}"
+
+
+def changes(comparison: Comparison) -> list[str]:
+    """Say for every method what it gains and loses against SIFT, and at what cost.
+
+    Rectified methods are set against our own features without warps too.
+    """
+    finished, reference = comparison.finished, _reference(comparison)
+    pairs = [(method, reference) for method in finished if reference and method is not reference]
+    recipes = [method for method in finished if "rectifier" in method.options]
+    plain = [method for method in recipes if not _is_rectified(method)]
+    pairs += [(m, other) for other, m in itertools.product(plain, recipes) if _is_rectified(m)]
+    return [_change_text(*pair) for pair in pairs]
 
 
 def cautions(comparison: Comparison) -> tuple[str, ...]:
@@ -42,21 +95,30 @@ def cautions(comparison: Comparison) -> tuple[str, ...]:
         *(f"{method.name} failed: {method.failed}" for method in comparison.methods
           if method.failed),
         *_doubts(comparison),
-        *(f"Doubtful: in {method.name} the poses of {_listed(method.unstable_names)} contradict "
-          "each other from seed to seed." for method in finished if method.unstable_names),
         *_contradictions(comparison),
         absent and f"Not compared for want of weights: {absent}",
     ]  # fmt: skip
     return tuple(text for text in texts if text)
 
 
-def ranked(methods: Iterable[MethodResult]) -> list[MethodResult]:
-    """Put the method with most photographs first, of equals the fastest."""
-    return sorted(methods, key=lambda method: (-_count(method).mean, method.total_s))
+def wrong_poses(comparison: Comparison) -> list[str]:
+    """Say which methods register photographs that ground truth contradicts."""
+    return [
+        f"{method.name} registers {_number(method.registered)} photographs, of which only "
+        f"{_number(method.correct)} agree with the ground truth."
+        for method in comparison.finished
+        if method.correct and method.correct.mean < method.registered.mean
+    ]
 
 
-def is_gain(method: MethodResult, reference: MethodResult) -> bool:
-    """Tell whether a method registers more photographs than another, or as many more often."""
+def _reference(comparison: Comparison) -> MethodResult | None:
+    """Return the method that gains are measured against, None if no SIFT has finished."""
+    finished = {method.name: method for method in comparison.finished}
+    return next((finished[name] for name in REFERENCES if name in finished), None)
+
+
+def _is_gain(method: MethodResult, reference: MethodResult) -> bool:
+    """Return whether a method registers more photographs than another, or as many more often."""
     more = len(method.usually_correct) - len(reference.usually_correct)
     return more > 0 or (more == 0 and _mean_gain(method, reference) >= MIN_MEAN_GAIN)
 
@@ -65,66 +127,11 @@ def _mean_gain(method: MethodResult, reference: MethodResult) -> float:
     return _count(method).mean - _count(reference).mean
 
 
-def reference_of(comparison: Comparison) -> MethodResult | None:
-    """Return the method that gains are measured against, None if no SIFT has finished."""
-    finished = {method.name: method for method in comparison.finished}
-    return next((finished[name] for name in REFERENCES if name in finished), None)
-
-
-def is_rectified(method: MethodResult) -> bool:
-    """Tell whether a method is a recipe that warps photographs."""
+def _is_rectified(method: MethodResult) -> bool:
+    """Return whether a method is a recipe that warps photographs."""
     options = method.options
     is_plain = options.get("rectifier", {}).get("name") == "identity"
     return "rectifier" in options and not (is_plain and not options.get("escalation"))
-
-
-def headline(comparison: Comparison) -> str:
-    """Say first of all whether anything was gained."""
-    finished, total = comparison.finished, len(comparison.image_names)
-    if not finished:
-        return "No method finished."
-    best, reference = ranked(finished)[0], reference_of(comparison)
-    most = max(method.registered.max for method in finished)
-    if most < MIN_IMAGES <= total:
-        return (
-            f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
-            "photographs."
-        )
-    registers = "correctly registers" if comparison.has_ground_truth else "registers"
-    gain = f"{best.name} {registers} {_number(_count(best))} of {total} photographs"
-    if reference is None:
-        return (
-            f"{gain}, no method more. COLMAP's SIFT was not run, so nothing can be said about a "
-            "gain."
-        )
-    if len(finished) == 1:
-        return f"{gain}; no other method finished."
-    others = _number(_count(reference))
-    if not is_gain(best, reference):
-        return (
-            f"No benefit on this set: no method {registers} more photographs than "
-            f"{reference.name}, which {registers} {others} of {total}."
-        )
-    gain += f", {reference.name} {others}."
-    if not is_rectified(best):
-        return f"{gain} Rectification is not needed for that."
-    as_good = [m.name for m in finished if not is_rectified(m) and not is_gain(best, m)]
-    verb = "does" if len(as_good) == 1 else "do"
-    without = f" {_listed(as_good)} {verb} as well without rectification." if as_good else ""
-    return f"{gain}{without}"
-
-
-def changes(comparison: Comparison) -> list[str]:
-    """Say for every method what it gains and loses against SIFT, and at what cost.
-
-    Rectified methods are set against our own features without warps too.
-    """
-    finished, reference = comparison.finished, reference_of(comparison)
-    pairs = [(method, reference) for method in finished if reference and method is not reference]
-    recipes = [method for method in finished if "rectifier" in method.options]
-    plain = [method for method in recipes if not is_rectified(method)]
-    pairs += [(m, other) for other, m in itertools.product(plain, recipes) if is_rectified(m)]
-    return [_change_text(*pair) for pair in pairs]
 
 
 def _change_text(method: MethodResult, reference: MethodResult) -> str:
@@ -140,40 +147,24 @@ def _change_text(method: MethodResult, reference: MethodResult) -> str:
     if reference.total_s:
         ratio = f"{method.total_s / reference.total_s:.1f}"
         speed = "about the same time" if ratio == "1.0" else f"{ratio} times the time"
-        times = f"{_seconds(method.total_s)} s against {_seconds(reference.total_s)} s"
-        parts.append(f"in {speed} ({times})")
+        parts.append(f"in {speed} ({method.total_s:.1f} s against {reference.total_s:.1f} s)")
     return f"{method.name} against {reference.name}: {', '.join(parts)}."
 
 
-def wrong_poses(comparison: Comparison) -> list[str]:
-    """Say which methods register photographs that ground truth contradicts."""
-    return [
-        f"{method.name} registers {_number(method.registered)} photographs, of which only "
-        f"{_number(method.correct)} agree with the ground truth."
-        for method in comparison.finished
-        if method.correct and method.correct.mean < method.registered.mean
-    ]
-
-
 def _doubts(comparison: Comparison) -> list[str]:
-    """Name what cannot be trusted in the models of most seeds, whatever ground truth says.
+    """Name what cannot be trusted in the models of most seeds, and in which methods.
 
-    Methods in which the same is doubtful are named together.
+    Each reason stands once, with all photographs that it is true of.
     """
     methods = defaultdict(list)
     for method in comparison.finished:
-        for text in _doubts_of(method):
-            methods[text].append(method.name)
+        reasons = {name: why for seed in method.seeds for name, why in seed.doubtful.items()}
+        names = defaultdict(list)
+        for name in sorted(in_most([list(seed.doubtful) for seed in method.seeds])):
+            names[reasons[name]].append(name)
+        for why, same in names.items():
+            methods[f"{_listed(same)} ({why})"].append(method.name)
     return [f"Doubtful in {_listed(names)}: {text}." for text, names in methods.items()]
-
-
-def _doubts_of(method: MethodResult) -> list[str]:
-    """Return each reason once, with all photographs that it is true of."""
-    reasons = {name: why for seed in method.seeds for name, why in seed.doubtful.items()}
-    names = defaultdict(list)
-    for name in sorted(in_most([list(seed.doubtful) for seed in method.seeds])):
-        names[reasons[name]].append(name)
-    return [f"{_listed(same)} ({why})" for why, same in names.items()]
 
 
 def _contradictions(comparison: Comparison) -> list[str]:
@@ -210,17 +201,13 @@ def _number(span: Span) -> str:
     return f"{span.mean:.1f} on average ({span.min:g} to {span.max:g})"
 
 
-def _seconds(value: float) -> str:
-    return f"{value:.1f}" if value < MIN_WHOLE_SECONDS else f"{value:.0f}"
-
-
 def _listed(names: Iterable[str]) -> str:
     """Join names, the first few of many.
 
     >>> _listed(["a", "b", "c"]), _listed(map(str, range(9)))
     ('a, b and c', '0, 1, 2, 3, 4, 5 and 3 more')
     """
-    shown: Sequence[str] = list(names)
-    if len(shown) > MAX_NAMES + 1:
-        return f"{', '.join(shown[:MAX_NAMES])} and {len(shown) - MAX_NAMES} more"
-    return " and ".join(filter(None, [", ".join(shown[:-1]), shown[-1]]))
+    listed = list(names)
+    if len(listed) > MAX_NAMES + 1:
+        return f"{', '.join(listed[:MAX_NAMES])} and {len(listed) - MAX_NAMES} more"
+    return " and ".join(filter(None, [", ".join(listed[:-1]), listed[-1]]))

@@ -5,26 +5,22 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_files
-from colmap_affrect.colmap.database import geometry_digest
-from colmap_affrect.colmap.database_copy import copy_as_it_is, newest_schema_version, refuse_newer
+from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import SUMMARY, registered_names
 from colmap_affrect.doctor.findings import Diagnosis
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.mappers.summaries import model_folders, read_summary
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.project.atomic_files import NEW_SUFFIX
-from colmap_affrect.project.record import COPY_STAGES, STAGES
+from colmap_affrect.project.record import STAGES
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 
 Read = TypeVar("Read")
 
-LEFTOVERS = ("*.new", "*.partial", f"*{NEW_SUFFIX}")
 MAX_ITEMS_SHOWN = 5
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
@@ -105,12 +101,9 @@ class _Examination:
 
     def examine(self, image_path: Path | None) -> None:
         """Read every file as runs do."""
-        for left in sorted(p for kind in LEFTOVERS for p in self.path.glob(kind)):
-            remove = f"remove it: rm -r {shlex.quote(str(left))}"
-            self.diagnosis.add("note", left, "left behind by a run that was killed", remove)
         database, context = self.workspace.database, Context(self.workspace)
         record = self._read(self.workspace.config, self._record)
-        done = self._stages(record, context) if record is not None else []
+        done = self._stages(record) if record is not None else []
         self._read(self.workspace.cameras, lambda: read_camera_records(self.workspace.cameras))
         for store in (context.features, context.matches, context.guided) if done else ():
             self._read(store.path, store.check_all)
@@ -155,43 +148,19 @@ class _Examination:
         _ = context.guiding, context.mapping
         return record
 
-    def _stages(self, record: Mapping[str, Any], context: Context) -> list[str]:
+    def _stages(self, record: Mapping[str, Any]) -> list[str]:
         """Return the stages on record."""
         done = [stage for stage in STAGES if stage in record.get("begun", [])]
-        wanted = COPY_STAGES if "copy" in done else STAGES[1:]
-        optional = {"guide"}  # map does that when needed
-        if "extract" in done and not context.extraction.escalation:
-            optional.add("escalate")
-        self.diagnosis.checked.append(
-            f"{self.path}: stages on record: {', '.join(done) or 'none'}; recipe "
-            f"{record.get('recipe', '')}"
-        )
-        following = [stage for stage in wanted if stage not in {*done, *optional}]
-        if following and not self.workspace.users_database:
-            command = f"run 'colmap-affrect {following[0]} --output-path {self.quoted}', or "
-            advice = f"{command if done else ''}{SAME_RUN}"
-            self.diagnosis.add("note", self.path, f"not run yet: {', '.join(following)}", advice)
+        stages, recipe = ", ".join(done) or "none", record.get("recipe", "")
+        self.diagnosis.checked.append(f"{self.path}: stages on record: {stages}; recipe {recipe}")
         return done
 
     def _models(self) -> None:
-        """Read the models, and compare what they were made from with the database."""
-        sparse, remake = (
-            self.workspace.sparse,
-            f"run 'colmap-affrect map --output-path {self.quoted}",
-        )
-        inputs = self._read(sparse, self.workspace.models_made_from)
-        if inputs == "":
-            self.diagnosis.add("warning", sparse, "mapping did not finish", f"{remake}'")
+        """Read the models."""
+        sparse = self.workspace.sparse
         sizes = [self._read(f, partial(self._num_images, f)) for f in model_folders(sparse)]
         listed = ", ".join(str(size) for size in sizes if size) or "no"
         self.diagnosis.checked.append(f"{sparse}: models of {listed} images")
-        if inputs:
-            with TemporaryDirectory() as temporary:  # COLMAP would change the original
-                copy = Path(temporary) / "database.db"
-                copy_as_it_is(self.workspace.database, copy)
-                if not inputs.startswith(geometry_digest(copy)):
-                    what = "the models were made before pairs were verified anew"
-                    self.diagnosis.add("warning", sparse, what, f"{remake}'")
 
     def _num_images(self, folder: Path) -> int:
         """Return how many images a model has; StoreError if it is damaged."""

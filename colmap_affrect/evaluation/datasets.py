@@ -2,8 +2,8 @@
 
 import json
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -14,7 +14,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
-from colmap_affrect.errors import AffrectError, EvaluationError, OptionError, such_as
+from colmap_affrect.errors import AffrectError, EvaluationError, OptionError, damage, such_as
 from colmap_affrect.evaluation.data import Dataset, EvaluationImage, EvaluationPair
 from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
 from colmap_affrect.geometry.arrays import Array
@@ -31,10 +31,6 @@ Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
 CALIBRATION_PREFIX = "calibration_"
-UNREADABLE = (
-    OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, EOFError,
-)  # fmt: skip
-"""What reading a damaged text, JSON, npy or HDF5 file, or a camera of it, may raise."""
 ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
 
 
@@ -142,7 +138,7 @@ def read_views(folder: Path) -> Views:
     """Read ``images.txt`` and ``cameras.txt``; EvaluationError when that cannot be done."""
     cameras, views = {}, {}
     posed = [line for line in _lines(folder / "images.txt") if stem(line) != line]  # not points
-    with _reading(folder):
+    with _damaged(folder):
         for line in _lines(folder / "cameras.txt"):
             key, model, width, height, *words = line.split()
             params = finite_numbers(words, (-1,), f"{folder / 'cameras.txt'}: camera {key}")
@@ -166,24 +162,16 @@ def stem(name: str) -> str:
     return path.with_suffix("").as_posix() if is_image else name
 
 
+def _damaged(path: Path) -> AbstractContextManager[None]:
+    """Make one EvaluationError of whatever a damaged file leads to."""
+    return damage(path, "see docs/own-evaluation-set.md for the format", EvaluationError)
+
+
 def _lines(path: Path) -> list[str]:
     """Return the lines of a text file that are not empty or comments."""
-    with _reading(path):
+    with _damaged(path):
         lines = map(str.strip, path.read_text(encoding="utf-8-sig").splitlines())
         return [line for line in lines if line and not line.startswith("#")]
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Make one EvaluationError of whatever a damaged file leads to."""
-    try:
-        yield
-    except OptionError as error:
-        raise EvaluationError(str(error)) from error
-    except UNREADABLE as error:
-        raise EvaluationError(
-            f"{path}: cannot be read ({error!r}); see docs/own-evaluation-set.md for the format"
-        ) from error
 
 
 def _imc_scene(lists_path: Path) -> Dataset:
@@ -196,7 +184,7 @@ def _imc_scene(lists_path: Path) -> Dataset:
     for limit in range(10):
         path = lists_path / f"keys-th-0.{limit}.npy"
         if limit or path.exists():
-            with _reading(path):
+            with _damaged(path):
                 keys = np.load(path, allow_pickle=False).ravel().tolist()
                 bins |= {_split(str(key), views): f"0.{limit}" for key in keys}
     return _posed_pairs(scene, root / "images", views, bins, lambda *names: bins[names])
@@ -214,7 +202,7 @@ def _split(key: str, known: Views) -> Names:
 
 def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
     """Read the camera and cam_from_world of an image; EvaluationError says what is wrong."""
-    with _reading(path), h5py.File(path) as file:
+    with _damaged(path), h5py.File(path) as file:
         given = {key: np.squeeze(file[key][()]) for key in ("K", "R", "T")}
     camera = pinhole(finite_numbers(given["K"], (3, 3), f"{path}: K"), f"{path}: K")
     translation = finite_numbers(given["T"], (3,), f"{path}: T")
@@ -252,7 +240,7 @@ def load_pairs(folder: Path) -> Dataset:
     A pair whose images or truth cannot be used is returned with its problem.
     """
     path = folder / "pairs.json"
-    with _reading(path):
+    with _damaged(path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
         entries = [_entry(each, f"{path}: pairs[{k}]") for k, each in enumerate(content["pairs"])]
         offset_px = ORIGIN_PX[content.get("pixel_origin", "center")]
@@ -263,11 +251,16 @@ def load_pairs(folder: Path) -> Dataset:
 
 
 def _entry(values: Any, where: str) -> _Entry:
-    entry = _Entry.from_mapping(values, where)
+    try:
+        entry = _Entry.from_mapping(values, where)
+    except OptionError as error:
+        raise EvaluationError(str(error)) from error
     if leads_outside(entry.image1) or leads_outside(entry.image2):
-        raise OptionError(f"{where}: images must be paths of images in the folder")
+        raise EvaluationError(f"{where}: images must be paths of images in the folder")
     if (entry.homography, entry.correspondences, entry.relative_pose).count(None) != 2:
-        raise OptionError(f"{where}: needs homography, correspondences or relative_pose, and one")
+        raise EvaluationError(
+            f"{where}: needs homography, correspondences or relative_pose, and one"
+        )
     return entry.changed(name=entry.name or f"{stem(entry.image1)} {stem(entry.image2)}")
 
 
@@ -301,7 +294,7 @@ def _truth(
     if isinstance(numbers, str):
         if leads_outside(numbers):
             raise EvaluationError(f"{numbers}: must be a file in the folder of the pairs")
-        with _reading(folder / numbers):
+        with _damaged(folder / numbers):
             numbers = np.loadtxt(folder / numbers, ndmin=2)
     if entry.homography is not None:
         center = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]])

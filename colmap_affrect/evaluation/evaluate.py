@@ -10,26 +10,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
-
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import EvaluationError, OptionError, such_as
 from colmap_affrect.evaluation import datasets, truths
 from colmap_affrect.evaluation.data import Dataset, PairResult, ScoreOptions
-from colmap_affrect.evaluation.plots import write_plot
-from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, Solved, published
+from colmap_affrect.evaluation.results import (
+    SECONDS,
+    Evaluation,
+    RecipeResult,
+    published,
+    write_plot,
+)
 from colmap_affrect.evaluation.runner import RecipeRun
-from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Resources
-
-NUM_RESAMPLES = 2000  # of the bootstrap
-MAX_ENUMERATED = 14  # up to so many differences all signs are tried, above that random ones
-NUM_RANDOM_SIGNS = 9999
 
 
 @dataclass(frozen=True)
@@ -55,18 +53,14 @@ class EvaluateOptions:
     """Everything an evaluation depends on beside protocol, dataset and output folder."""
 
     recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")  # also by name
-    baseline: str | None = None  # label of the recipe that the others are tested against
     max_num_keypoints: int | None = None  # of each image the strongest are matched; None: all
-    random_seed: int = 0  # of the estimators and the statistics
+    random_seed: int = 0  # of the estimators
     scores: ScoreOptions = field(default_factory=ScoreOptions)
     resources: Resources = field(default_factory=Resources)
 
     def methods(self) -> tuple[Method, ...]:
         """Return the recipes as methods; OptionError for options that nothing can be made of."""
         methods = parse_methods(self.recipes)
-        labels = [method.label for method in methods]
-        if self.baseline is not None and self.baseline not in labels:
-            raise OptionError(f"--baseline {self.baseline}: is not among {', '.join(labels)}")
         if self.max_num_keypoints is not None and self.max_num_keypoints < 1:
             raise OptionError(f"--max-num-keypoints {self.max_num_keypoints}: must be at least 1")
         if self.random_seed < 0:
@@ -95,13 +89,13 @@ def evaluate(
     if protocol not in PROTOCOLS:
         raise OptionError(f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}")
     chosen, options = PROTOCOLS[protocol], options or EvaluateOptions()
-    methods, seed = options.methods(), options.random_seed
+    methods = options.methods()
     if not dataset_path.is_dir():
         raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
     Workspace(output_path).require_own(dataset_path)
     settings = {
         "scores": options.scores.to_mapping(),
-        "random_seed": seed,
+        "random_seed": options.random_seed,
         "max_num_keypoints": options.max_num_keypoints,
     }
     inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
@@ -114,15 +108,13 @@ def evaluate(
         given = dataset.pairs, output_path, inputs, settings, options.resources
         runs = [RecipeRun(method, *given, overwrite=overwrite) for method in methods]
         results = {run.label: run.results(progress) for run in runs}
-        baseline = results.get(options.baseline or "")
         evaluation = Evaluation(
             protocol=protocol,
             error_title=chosen.error_title,
             dataset_path=inputs["dataset_path"],
             settings=settings,
-            baseline=options.baseline or "",
             notes=(*dataset.notes, *([note] if problems else [])),
-            recipes=tuple(_summed(r, results[r.label], chosen, baseline, seed) for r in runs),
+            recipes=tuple(_summed(run, results[run.label], chosen) for run in runs),
             published=published(protocol),
             versions=installed_versions(),
         )
@@ -131,13 +123,7 @@ def evaluate(
     return evaluation
 
 
-def _summed(
-    run: RecipeRun,
-    results: Sequence[PairResult],
-    protocol: Protocol,
-    baseline: Sequence[PairResult] | None,
-    seed: int,
-) -> RecipeResult:
+def _summed(run: RecipeRun, results: Sequence[PairResult], protocol: Protocol) -> RecipeResult:
     extracted = sorted(
         run.extracted.values(), key=lambda record: (record["image"], record["level"])
     )
@@ -145,48 +131,15 @@ def _summed(
     extract_s = sum(record["seconds"] for record in extracted)
     timed = [result.seconds_by_step for result in results if result.seconds_by_step]
     steps = {s: sum(each[s] for each in timed) / max(1, len(timed)) for s in ("match", "estimate")}
-    solved = np.array([result.solved for result in results])
-    p_value = None
-    if baseline is not None and baseline is not results:
-        p_value = paired_test(solved, np.array([result.solved for result in baseline]), seed)
-    by_category: dict[str, list[float]] = {}
-    for result in results:
-        by_category.setdefault(result.category, []).append(result.solved)
     total_s = extract_s + sum(result.seconds for result in results)
     return RecipeResult(
         name=run.label,
         description=run.recipe.summary,
         summary={**protocol.columns(results), SECONDS: total_s},
-        solved=Solved(float(solved.mean()), bootstrap_interval(solved, seed)),
-        solved_by_category={name: fmean(shares) for name, shares in by_category.items() if name},
-        p_value=p_value,
+        solved=fmean(result.solved for result in results),
         num_images=num_images,
         seconds_per_step={"extract": extract_s / max(1, num_images), **steps},
         failures=run.failures,
         warnings={r["image"]: r["warning"] for r in extracted if r["warning"]},
         pairs=tuple(results),
     )
-
-
-def bootstrap_interval(values: Array, seed: int) -> tuple[float, float]:
-    """Return the percentile bootstrap interval (95 %) of the mean of (N,) values."""
-    picks = np.random.default_rng(seed).integers(len(values), size=(NUM_RESAMPLES, len(values)))
-    means, tail = np.sort(values[picks].mean(axis=1)), NUM_RESAMPLES // 40
-    return float(means[tail]), float(means[-1 - tail])
-
-
-def paired_test(first: Array, second: Array, seed: int) -> float:
-    """Return the two-sided p-value of a difference of two methods, by (N,) values pair by pair.
-
-    Sign-flip permutation test of the mean: if the methods did not differ, each difference would
-    have either sign with equal chance. Of zeros and ones it is the exact sign test. The seed is
-    that of the random signs, where there are too many differences to try all.
-    """
-    differences = (first - second)[first != second]
-    count = len(differences)
-    if count <= MAX_ENUMERATED:
-        signs = 1.0 - 2.0 * (np.arange(2**count)[:, None] >> np.arange(count) & 1)
-    else:
-        signs = np.random.default_rng(seed).choice((-1.0, 1.0), (NUM_RANDOM_SIGNS + 1, count))
-        signs[0] = 1.0  # those that were observed count too
-    return float((np.abs(signs @ differences) >= abs(differences.sum()) - 1e-9).mean())

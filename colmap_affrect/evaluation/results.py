@@ -1,5 +1,6 @@
-"""What an evaluation found: as JSON for programs, as tables for people."""
+"""What an evaluation found: as JSON for programs, as tables and a plot for people."""
 
+import io
 import json
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
@@ -8,13 +9,17 @@ from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from pydantic import Field, TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
 from colmap_affrect.evaluation.data import Number, PairResult
 from colmap_affrect.evaluation.truths import GROUP
+from colmap_affrect.project.atomic_files import replace_bytes
 
 DATA = Path(__file__).with_name("published.toml")
+ERROR_LIMITS = (0.1, 100.0)  # of the plot
 SECONDS = "seconds"  # the column of all time that a recipe took
 
 
@@ -38,23 +43,13 @@ def published(protocol: str) -> list[PublishedRow]:
 
 
 @dataclass(frozen=True)
-class Solved:
-    """Mean of the pairs' ``solved``, and its bootstrap interval (95 %)."""
-
-    mean: float
-    interval: tuple[float, float]
-
-
-@dataclass(frozen=True)
 class RecipeResult:
     """What one recipe reached."""
 
     name: str  # its label
     description: str
     summary: Mapping[str, Number]  # columns of the protocol's table, and seconds of all steps
-    solved: Solved
-    solved_by_category: Mapping[str, float]  # means of the pairs that have a category
-    p_value: float | None  # of the paired test of ``solved`` against the baseline
+    solved: float  # mean of the pairs' ``solved``
     num_images: int  # that have features
     seconds_per_step: Mapping[str, float]  # ``extract`` an image, ``match``, ``estimate`` a pair
     failures: Mapping[str, str]  # images that cannot be used, with the reason
@@ -70,7 +65,6 @@ class Evaluation:
     error_title: Annotated[str, Field(alias="error")]  # what errors are, with the unit
     dataset_path: str
     settings: Mapping[str, Any]  # everything that decides scores
-    baseline: str  # label of the recipe that the others are tested against; empty for none
     notes: tuple[str, ...]  # what is missing in the dataset
     recipes: tuple[RecipeResult, ...]
     published: list[PublishedRow]  # of the same protocol
@@ -92,7 +86,7 @@ class Evaluation:
             del groups[""]
         rows = [(recipe.name, recipe.summary) for recipe in self.recipes]
         rows += [(f"paper: {row.method} ({row.table})", row.values) for row in self.published]
-        means = [(recipe.name, self._means(recipe)) for recipe in self.recipes]
+        means = [(recipe.name, _means(recipe)) for recipe in self.recipes]
         parts = [
             f"{self.protocol}: {len(self.recipes[0].pairs)} pairs",
             *(_table(title, columns, rows) for title, columns in groups.items()),
@@ -101,20 +95,17 @@ class Evaluation:
         ]
         return "\n\n".join(filter(None, parts))
 
-    def _means(self, recipe: RecipeResult) -> dict[str, str]:
-        """Return how many pairs count as solved, what chance may have to do with it, and costs."""
-        low, high = recipe.solved.interval
-        cells = {"solved": f"{recipe.solved.mean:.2f}", "95 %": f"{low:.2f}-{high:.2f}"}
-        if self.baseline:
-            known = recipe.p_value is not None
-            cells[f"p against {self.baseline}"] = f"{recipe.p_value:.3f}" if known else "-"
-        cells["failed"] = str(sum(bool(pair.failure) for pair in recipe.pairs))
-        counts = [(fmean(p.num_keypoints), p.num_matches, p.num_inliers) for p in recipe.pairs]
-        for name, column in zip(
-            ("keypoints", "matches", "inliers"), zip(*counts, strict=True), strict=True
-        ):
-            cells[name] = f"{fmean(column):.0f}"
-        return cells | {f"{step} [s]": f"{s:.2f}" for step, s in recipe.seconds_per_step.items()}
+
+def _means(recipe: RecipeResult) -> dict[str, str]:
+    """Return how many pairs count as solved, how many failed, and costs."""
+    failed = sum(bool(pair.failure) for pair in recipe.pairs)
+    cells = {"solved": f"{recipe.solved:.2f}", "failed": str(failed)}
+    counts = [(fmean(p.num_keypoints), p.num_matches, p.num_inliers) for p in recipe.pairs]
+    for name, column in zip(
+        ("keypoints", "matches", "inliers"), zip(*counts, strict=True), strict=True
+    ):
+        cells[name] = f"{fmean(column):.0f}"
+    return cells | {f"{step} [s]": f"{s:.2f}" for step, s in recipe.seconds_per_step.items()}
 
 
 def _table(
@@ -134,3 +125,24 @@ def _table(
             cells = (cell(values.get(column, ""), column) for column in columns)
             lines.append([name, *cells])
     return aligned(lines)
+
+
+def write_plot(evaluation: Evaluation, path: Path) -> None:
+    """Draw the number of pairs of each recipe over the threshold of the error, as PNG.
+
+    The axes are those of the paper's figure.
+    """
+    figure = Figure(figsize=(8.0, 5.0), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes, (low, high) = figure.add_subplot(), ERROR_LIMITS
+    for recipe in evaluation.recipes:
+        errors = sorted(max(pair.error, low) for pair in recipe.pairs if pair.error < high)
+        counts = [0, *range(1, len(errors) + 1), len(errors)]
+        axes.step([low, *errors, high], counts, where="post", label=recipe.name, linewidth=2)
+    axes.set(xscale="log", xlim=ERROR_LIMITS, ylim=(0, None))
+    axes.set(xlabel=f"threshold of the {evaluation.error_title}")
+    axes.set(ylabel=f"pairs with a smaller error, of {len(evaluation.recipes[0].pairs)}")
+    figure.legend(fontsize=7, loc="outside lower center", ncols=2, frameon=False)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    replace_bytes(path, stream.getvalue())

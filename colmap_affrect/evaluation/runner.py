@@ -169,7 +169,7 @@ class RecipeRun:
     def _extract(self, image: data.EvaluationImage, level: int) -> bool:
         """Extract what an image lacks up to a level; tell whether it can be used."""
         name, store = image.name, self._store
-        num_levels = len(store.level_ends(name)) if store.complete([name]) else 0
+        num_levels = len(store.level_ends(name)) if name in store.names() else 0
         for missing in range(num_levels, level + 1):
             start = time.perf_counter()
             try:

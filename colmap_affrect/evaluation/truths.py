@@ -36,8 +36,7 @@ Size = tuple[int, int]  # (width, height) in px
 GROUP = ": "  # separates the name of a table from that of its column in the names of columns
 CONFIDENCE = 0.9999  # at which estimators may end before all iterations
 NUM_ESTIMATES = 5  # orders of the matches, of which the one of median error counts
-MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
-"""Of poses six: five leave several essential matrices, none of which another match supports."""
+MIN_POSE_MATCHES = 6  # five leave several essential matrices, none of which another supports
 MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices
 CORRECT_PX = 3.0
 """Matches are correct up to this transfer error in image 2, or Sampson distance from a pose."""
@@ -56,8 +55,8 @@ def estimate_matrix(
     ``find`` and ``method`` are OpenCV's; the seed is of the order of the matches, as OpenCV draws
     the same samples every time.
     """
-    count, least = len(points[0]), MIN_FUNDAMENTAL_MATCHES
-    if count < (MIN_HOMOGRAPHY_MATCHES if find is cv2.findHomography else least):
+    count = len(points[0])
+    if count < (4 if find is cv2.findHomography else 8):
         return None, 0
     order = np.random.default_rng(seed).permutation(count)
     first, second = (np.asarray(side, dtype=np.float64)[order] for side in points)
@@ -265,7 +264,7 @@ def wxbs_score(distances_px: Array) -> float:
 
 
 def correspondence_columns(results: Results) -> dict[str, float]:
-    """Return the mean score of results, at least one."""
+    """Return the mean score."""
     return {"WxBS score": fmean(result.solved for result in results)}
 
 

@@ -1,4 +1,4 @@
-"""Features ``affnet-hardnet``: a detector, AffNet, OriNet and a learned descriptor.
+"""Features ``affnet-hardnet``: DoG, AffNet, OriNet and a learned descriptor.
 
 The chain of the paper (Sec. 3): an upright patch round each keypoint gives its affine shape (of the
 same area), the patch of that shape its orientation, the patch of both its descriptor.
@@ -7,65 +7,48 @@ same area), the patch of that shape its orientation, the patch of both its descr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from colmap_affrect.data import GrayImage, LocalFeatures, View, in_mask, union
+from colmap_affrect.data import GrayImage, LocalFeatures, View, union
 from colmap_affrect.features.base import NetworkContext
-from colmap_affrect.features.sift import DogOptions, detect_dog, is_searchable
-from colmap_affrect.geometry.affine import determinants, lafs_from_keypoints, rotation
+from colmap_affrect.features.sift import DogOptions, detect_dog
+from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Singles
-from colmap_affrect.geometry.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.shapes import frames_from_affnet
-from colmap_affrect.options import within
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-MIN_DETECTABLE_PX = 32  # kornia finds nothing within 15 px of a border; Key.Net fails on less
-KEYNET_RADIUS_PX = 22.0  # of kornia's frames of Key.Net on the image itself
-
 MAX_TILT = 20.0  # more is degenerate; AffNet's shapes on photographs stay under 6 (Graffiti).
-MIN_RESPONSE = 1e-10
-"""kornia fills up to the number asked for with frames of response 0 at the origin. Its Hessian
-finds rounding errors of 1e-13 in flat images; a blob of one gray level has 1e-6."""
+PATCH_SIGMAS = 12.0  # half width of a patch in units of the feature's sigma, as in the paper
+BATCH_SIZE = 256  # patches that go through a network at once
 BATCH_MULTIPLE = 64
 """Batches are padded to multiples of this many patches: other sizes change the last bits of the
 results on a CPU, so that an image alone would differ from one among others."""
 
 
 class AffNetHardNetOptions(DogOptions):
-    """Features ``affnet-hardnet``: detector, AffNet, OriNet and a learned descriptor."""
+    """Features ``affnet-hardnet``: DoG, AffNet, OriNet and a learned descriptor."""
 
     name: Literal["affnet-hardnet"] = "affnet-hardnet"
-    detector: Literal["dog", "keynet", "hessian"] = "dog"
-    """``dog`` (OpenCV, as in the paper), ``keynet`` or ``hessian``."""
-    descriptor: Literal["hardnet", "hardnet8", "hynet", "sosnet", "tfeat", "mkd", "hardtfeat"] = (
-        "hardnet"
-    )
+    descriptor: Literal["hardnet", "hardtfeat"] = "hardnet"
     affine_shape: bool = True
     """Estimate affine shapes by AffNet; otherwise measurement regions are circles."""
-    patch_sigmas: Annotated[float, within(1.0, 100.0)] = 12.0
-    """Half width of a patch in units of the feature's sigma (12 as in the paper, for DoG)."""
-    batch_size: Annotated[int, within(1, 1_000_000)] = 256
-    """Patches that go through a network at once."""
-    dtype: Literal["float32", "float16", "bfloat16"] = "float32"
-    """Arithmetic of the networks: ``float32``, or ``float16`` and ``bfloat16`` where the device
-    is faster with them."""
 
     @property
     def kind(self) -> str:
-        """Detector and descriptor; where shapes are circles descriptors are of the same kind."""
-        return f"{self.detector}-affnet-{self.descriptor}"
+        """The same where shapes are circles: descriptors are."""
+        return f"dog-affnet-{self.descriptor}"
 
     @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights that the networks read."""
         shape = ("affnet",) if self.affine_shape else ()
-        detector = ("keynet",) if self.detector == "keynet" else ()
-        return (*shape, "orinet", self.descriptor, *detector)
+        return (*shape, "orinet", self.descriptor)
 
 
 class AffNetHardNet:
@@ -87,40 +70,11 @@ class AffNetHardNet:
         self.orinet = networks.load_orinet(weights["orinet"], device)
         name = options.descriptor
         self.descriptor = networks.load_descriptor(name, weights[name], device)
-        self.detector = None  # OpenCV's
-        if options.detector != "dog":
-            self.detector = networks.load_detector(
-                options.detector, options.max_num_features, weights, device
-            )
 
     def detect(self, view: View) -> LocalFeatures:
-        """Detect keypoints, by falling response: upright circles of 6 sigma, descriptors (N, 0).
-
-        For ``keynet`` and ``hessian`` kornia's frames count as those of 6 sigma.
-        """
+        """Detect keypoints, by falling response: upright circles of 6 sigma, descriptors (N, 0)."""
         image, mask = view
-        if self.detector is None:
-            return detect_dog(image, self.options, mask)
-        if min(image.shape) < MIN_DETECTABLE_PX or not is_searchable(image, mask):
-            return LocalFeatures.empty()
-        import torch
-
-        allowed = np.ones(image.shape, dtype=bool) if mask is None else mask > 0
-        with torch.inference_mode():
-            lafs, strengths = self.detector(
-                torch.from_numpy(_unit_range(image)).to(self.device)[None, None],
-                torch.from_numpy(allowed).to(self.device)[None, None],
-            )
-        frames = lafs[0].cpu().numpy().astype(np.float64)
-        responses = strengths[0].cpu().numpy()
-        seen = responses > MIN_RESPONSE
-        frames, responses = frames[seen], responses[seen]
-        centers, radii_px = frames[:, :, 2], np.sqrt(determinants(frames[:, :, :2]))
-        if self.options.detector == "keynet":
-            centers = _centers_from_keynet(centers, radii_px)
-        circles = lafs_from_keypoints(centers, radii_px, np.zeros(len(radii_px)))
-        found = LocalFeatures(circles, responses, np.zeros((len(responses), 0), np.float32))
-        return found.select(in_mask(allowed, centers))
+        return detect_dog(image, self.options, mask)
 
     def describe(
         self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
@@ -154,7 +108,7 @@ class AffNetHardNet:
         self, sample: Callable[[Array], Tensor], found: LocalFeatures
     ) -> tuple[Array, Singles]:
         """Return (N, 2, 2) shapes of determinant 1, and (N, 128) descriptors of any length."""
-        half_widths_px = self.options.patch_sigmas / MEASUREMENT_SIGMAS * found.scales
+        half_widths_px = PATCH_SIGMAS / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
         if self.affine_shapes is not None:
             upright = sample(_frames(shapes, half_widths_px, found.keypoints))
@@ -170,15 +124,10 @@ class AffNetHardNet:
         import torch
         from torch.nn.functional import pad
 
-        from colmap_affrect.features.networks import arithmetic
-
-        size = self.options.batch_size
         outputs = []
-        with arithmetic(self.options.dtype, self.device):
-            for begin in range(0, len(patches), size):
-                batch = patches[begin : begin + size]
-                filled = pad(batch, (0, 0, 0, 0, 0, 0, 0, -len(batch) % BATCH_MULTIPLE))
-                outputs.append(network(filled)[: len(batch)].float())
+        for batch in torch.split(patches, BATCH_SIZE):
+            filled = pad(batch, (0, 0, 0, 0, 0, 0, 0, -len(batch) % BATCH_MULTIPLE))
+            outputs.append(network(filled)[: len(batch)].float())
         return np.asarray(torch.cat(outputs).cpu().numpy())
 
 
@@ -225,13 +174,3 @@ def _frames(shapes: Array, radii_px: Array, centers: Array) -> Array:
 def _unit_range(image: GrayImage) -> Singles:
     """Return an (H, W) image as float32 in [0, 1]."""
     return image.astype(np.float32) / np.float32(255)
-
-
-def _centers_from_keynet(centers: Array, radii_px: Array) -> Array:
-    """Correct the centres that kornia's multi-resolution detector reports.
-
-    A pixel of a level f times coarser than the image is reported at f times its coordinates,
-    which holds for corner coordinates only: in pixel-centre ones (f - 1) / 2 is missing.
-    """
-    factors = radii_px / KEYNET_RADIUS_PX
-    return centers + HALF_PIXEL * (factors - 1.0)[:, None]

@@ -41,8 +41,6 @@ class LearnedOptions(FeatureOptions):
     has_shapes: ClassVar[bool] = False
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of one view, by response, as their authors match them."""
-    dtype: Literal["float32", "float16", "bfloat16"] = "float32"
-    """Arithmetic of the network on a GPU; on a CPU it is ``float32``."""
 
     @property
     def weights(self) -> tuple[str, ...]:
@@ -91,7 +89,6 @@ class LearnedFeatures(FeatureExtractor):
         from colmap_affrect.features.networks import load_extractor, resolve_device
 
         self.options, self.device = options, resolve_device(context.device)
-        self.dtype = "float32" if self.device.type == "cpu" else options.dtype
         (key,) = options.weights
         path, threshold = context.weights[key], options.score_threshold
         self.network: Any = load_extractor(key, threshold, path, context.device)
@@ -106,10 +103,8 @@ class LearnedFeatures(FeatureExtractor):
             return LocalFeatures.empty(self.descriptor_size)
         import torch
 
-        from colmap_affrect.features.networks import arithmetic
-
         allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
-        with torch.inference_mode(), arithmetic(self.dtype, self.device):
+        with torch.inference_mode():
             places, scores, describe = self._run(_pixels(image).to(self.device))
             best = _best(places, scores, allowed, self.options.max_num_features)
             found = places[best], scores[best], describe(best)

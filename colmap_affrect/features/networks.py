@@ -7,14 +7,12 @@ of its network, all of them and no others, in their shapes.
 import re
 from collections import OrderedDict
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
 from kornia import feature
-from kornia.feature.mkd import Whitening
 from torch import Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 from torch.nn.utils.fusion import fuse_conv_bn_eval
@@ -24,12 +22,10 @@ from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
-from colmap_affrect.geometry.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
+from colmap_affrect.geometry.conventions import HALF_PIXEL
 from colmap_affrect.images.warping import halved
 
 Network = TypeVar("Network", bound=nn.Module)
-
-DESCRIPTOR_SIZE = 128  # width of all descriptors
 
 
 def resolve_device(name: str) -> torch.device:
@@ -52,13 +48,6 @@ def resolve_device(name: str) -> torch.device:
     if (device.index or 0) >= count:
         raise DeviceError(f"--device {name}: the last one is cuda:{count - 1}; use that")
     return device
-
-
-def arithmetic(dtype: str, device: torch.device) -> AbstractContextManager[object]:
-    """Return a context in which networks compute with numbers of a type, ``float32`` for one."""
-    if dtype == "float32":
-        return nullcontext()
-    return torch.autocast(device.type, getattr(torch, dtype))
 
 
 def load_affnet(path: Path, device: str) -> nn.Sequential:
@@ -93,21 +82,14 @@ def load_orinet(path: Path, device: str) -> feature.OriNet:
     return _ready(network, device)
 
 
-def load_detector(name: str, count: int, weights: Mapping[str, Path], device: str) -> nn.Module:
-    """Build ``keynet`` or ``hessian``, which finds so many features of (1, 1, H, W) in [0, 1]."""
-    if name == "hessian":
-        return feature.ScaleSpaceDetector(count, MEASUREMENT_SIGMAS).to(resolve_device(device))
-    keynet = _loaded(feature.KeyNet(pretrained=False), weights["keynet"], "Key.Net")
-    return feature.MultiResolutionDetector(_ready(keynet, device), count)
-
-
 def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
     """Build a network from (B, 1, 32, 32) patches in [0, 1] to (B, 128) rows of any length."""
-    if name == "mkd":
-        return _ready(_load_mkd(path), device)
-    network: nn.Module = _loaded(DESCRIPTOR_NETWORKS[name](), path, name)
-    if isinstance(network, feature.HardNet | feature.HardNet8):
-        network.features = folded(network.features)
+    if name == "hardtfeat":
+        # The file also holds a SIFT that helped in its training.
+        state = {k: v for k, v in load_state_dict(path).items() if not k.startswith("SIFT.")}
+        return _ready(_with_state(hardtfeat(), state, path, name), device)
+    network = _loaded(feature.HardNet(pretrained=False), path, name)
+    network.features = folded(network.features)
     return _ready(network, device)
 
 
@@ -135,19 +117,8 @@ def hardtfeat() -> OnPatches:
     features = nn.Sequential(
         nn.Conv2d(1, 32, 7), nn.MaxPool2d(2), nn.Tanh(), nn.Conv2d(32, 64, 6), nn.Tanh()
     )
-    classifier = nn.Sequential(nn.Dropout(0.1), nn.Conv2d(64, DESCRIPTOR_SIZE, 8), nn.Tanh())
+    classifier = nn.Sequential(nn.Dropout(0.1), nn.Conv2d(64, 128, 8), nn.Tanh())
     return OnPatches(OrderedDict(features=features, classifier=classifier))
-
-
-DESCRIPTOR_NETWORKS: dict[str, Any] = {
-    "hardnet": lambda: feature.HardNet(pretrained=False),
-    "hardnet8": lambda: feature.HardNet8(pretrained=False),
-    "hynet": lambda: feature.HyNet(pretrained=False),
-    "sosnet": lambda: feature.SOSNet(pretrained=False),
-    "tfeat": lambda: feature.TFeat(pretrained=False),
-    "hardtfeat": hardtfeat,
-}
-"""Constructors of all descriptors but ``mkd``, which has no learned layers."""
 
 
 def standardized(patches: Tensor) -> Tensor:
@@ -169,28 +140,9 @@ def folded(layers: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*kept)
 
 
-def _load_mkd(path: Path) -> nn.Module:
-    """Build MKD (Mukundan et al. 2019) with its whitening by attenuated PCA, learned on Liberty."""
-    kernels = feature.MKDDescriptor(PATCH_SIZE_PX, whitening=None)  # type: ignore[arg-type]
-    width = kernels.odims
-    try:
-        pca = load_state_dict(path)["liberty"]["pca"]
-        mean, vectors, values = (pca[key].float() for key in ("mean", "eigvecs", "eigvals"))
-        fits = mean.numel() == len(vectors) == width and vectors.shape[1] == values.numel()
-    except (AttributeError, IndexError, KeyError, TypeError) as error:
-        raise unusable(path, "not the whitening of mkd (no 'pca' of 'liberty')") from error
-    if not fits or values.numel() < DESCRIPTOR_SIZE:
-        raise unusable(path, f"not the whitening of mkd (for a width of {len(vectors)})")
-    model = {"mean": mean.flatten(), "eigvecs": vectors, "eigvals": values.flatten()}
-    return nn.Sequential(kernels, Whitening("pcawt", {"pca": model}, width, DESCRIPTOR_SIZE))
-
-
 def _loaded(network: Network, path: Path, name: str) -> Network:
     """Give a network the parameters in a file; WeightsError when they are not exactly its own."""
-    state = load_state_dict(path)
-    if name == "hardtfeat":  # the file also holds a SIFT that helped in its training
-        state = {key: value for key, value in state.items() if not key.startswith("SIFT.")}
-    return _with_state(network, state, path, name)
+    return _with_state(network, load_state_dict(path), path, name)
 
 
 COUNTER = "num_batches_tracked"  # of batch normalisations; older files have none

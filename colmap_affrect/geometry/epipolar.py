@@ -1,9 +1,8 @@
 """Epipolar geometries and homographies: what they say of matches, and of their local affine frames.
 
 A match of two frames must carry the direction of the epipolar line in image 1 to the one in image 2
-(Barath, Hajder, Matas: epipolar geometry from affine correspondences); under a homography frames
-must turn as it does. All points are (N, 2) px of any one convention, the one of the fundamental
-matrix F with ``x2^T F x1 = 0``; shapes are the (N, 2, 2) linear parts of frames, in the same axes.
+(Barath, Hajder, Matas). All points are (N, 2) px of the convention of the fundamental matrix F with
+``x2^T F x1 = 0``; shapes are the (N, 2, 2) linear parts of frames, in the same axes.
 """
 
 from dataclasses import dataclass
@@ -62,8 +61,7 @@ def common_sign(cosines: Floats) -> float:
 class EpipolarModel:
     """What an epipolar geometry says of matches of features ``rows1`` with features ``rows2``."""
 
-    has_sign: ClassVar[bool] = True
-    """All cosines may have the other sign."""
+    has_sign: ClassVar[bool] = True  # all cosines may have the other sign
     fundamental: Points
     points: tuple[Points, Points]
     sample_size: int = 7

@@ -11,17 +11,13 @@ from colmap_affrect.geometry.two_views import homogeneous
 Size = tuple[int, int]
 
 FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
-"""Tried for a turned camera, in longer sides: fine where a rotation bends lines most. From ten on a
-rotation is a shift, as between two crops of one photograph."""
+"""Tried for a turned camera, in longer sides. From ten on a rotation is a shift."""
 
 MAX_NUM_POINTS = 500  # enough to measure a share to two per cent
 MIN_DEPTH = 1e-3  # of a turned ray of length 1; what is behind lands far outside of the image
 DISPLACEMENT_PX = np.array([13.0, 7.0])  # so moved, keypoints meet others by chance only
 MIN_FREE_SHARE = 0.1  # where keypoints are so dense that chance leaves less, nothing can be told
-NUM_STARTS = 30
-"""Rotations of two matches each; least squares begin with the best. The strip that two views have
-in common determines their rotation badly, and where things repeat, a quarter of its matches may be
-wrong, which then have more weight than the strip."""
+NUM_STARTS = 30  # rotations of two matches each; least squares begin with the best
 MAX_ITERATIONS = 3  # least squares are repeated without outliers
 
 

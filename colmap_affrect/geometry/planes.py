@@ -16,13 +16,10 @@ from colmap_affrect.geometry.conventions import grid_origin
 WINDOW_RADIUS = 2
 WINDOW_SIGMA_PX = 0.8  # Gaussian weights of the 5 x 5 window of a plane (the authors' values)
 
+# share of the window's weight that known neighbours need; a mere line of pixels has 0.499
 MIN_WEIGHT_FRAC = 0.5
-"""Share of the window's weight that known neighbours need. A line of pixels holds 0.499 and
-cannot carry a plane, a corner of the map 0.562."""
-
 MAX_SLANT_COS = np.cos(np.deg2rad(85.0))  # steeper neighbours are on another surface
-
-SPIRAL_STEP = 3.6
+SPIRAL_STEP = 3.6  # of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars)
 
 
 def shrink_depth(depth: Floats, max_size_px: int) -> tuple[Floats, Array]:
@@ -44,11 +41,9 @@ def shrink_depth(depth: Floats, max_size_px: int) -> tuple[Floats, Array]:
 def normals_from_depth(depth: Floats, camera_matrix: Floats) -> Array:
     """Fit a plane to the 5 x 5 window of each pixel of a depth map and return its normal.
 
-    Along a plane 1/z is an affine function of the pixel. It is fitted to the window by least
-    squares with Gaussian weights; errors are thus taken along the ray, where depth has them,
-    and the normal always faces the camera. Neighbours behind a depth discontinuity have weight
-    0: those whose 1/z differs from the centre's by more than a plane seen at 85 degrees would
-    make it, which is |dr| / cos 85 deg times the centre's for rays that differ by dr.
+    Along a plane 1/z is an affine function of the pixel, fitted by least squares with Gaussian
+    weights. Neighbours whose 1/z differs from the centre's by more than a plane seen at 85 degrees
+    would make it, |dr| / cos 85 deg times for rays that differ by dr, have weight 0.
 
     From (h, w) depth and (3, 3) intrinsics in pixel-centre px of the depth map to (h, w, 3) unit
     normals, NaN where the pixel or too much of its window is unknown.
@@ -94,8 +89,7 @@ def _weighted_line(moments: Array) -> tuple[Array, Array, Array]:
 def spiral_points(num_points: int) -> Array:
     """Return (N, 3) points spread evenly over the unit sphere, along a spiral about z.
 
-    Heights are equidistant, neighbours on the spiral 3.6 / sqrt(N) apart (Saff & Kuijlaars,
-    "Distributing many points on a sphere", 1997; with both ends half a step off the poles).
+    Heights are equidistant (Saff & Kuijlaars 1997, both ends half a step off the poles).
     """
     heights = 1.0 - (2.0 * np.arange(num_points) + 1.0) / num_points
     radii = np.sqrt(1.0 - heights**2)
@@ -123,10 +117,9 @@ def cluster_normals(
 ) -> PlaneClusters:
     """Choose directions that most (h, w, 3) normals share, then give each normal to the nearest.
 
-    Candidates are the :func:`spiral_points` of the whole sphere: normals that face a camera of
-    wide angle fill more than half of it, and candidates without normals get no votes. After
-    each choice the direction moves to the mean of its normals, those then within the bin are
-    taken away, and the others vote again (the authors counted once).
+    Candidates are the :func:`spiral_points` of the whole sphere. After each choice the direction
+    moves to the mean of its normals, those then within the bin are taken away, and the others vote
+    again (the authors counted once).
 
     Normals (unit, NaN where unknown) at most ``bin_angle_rad`` from a direction belong to it, which
     needs ``min_votes_frac`` of all h w pixels.

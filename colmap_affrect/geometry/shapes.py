@@ -15,9 +15,7 @@ STEP_PX = 4  # dense sources give one shape per block of 4 x 4 px, as the paper'
 MAX_TANH = 0.999  # where logarithms end: of a metric, tilt 45
 MIN_DISTINCT_SHARE = 0.5  # of frames that were measured one by one nearly all differ
 
-SHAPE_STEP = 1e-4
-"""Shapes of unit area that are this close are one: above the rounding of 32 bits, and so fine that
-the orientations of all features of an image hardly coincide."""
+SHAPE_STEP = 1e-4  # shapes of unit area that are this close are one; rounding of 32 bits is less
 
 
 def frames_from_affnet(outputs: Floats) -> Array:

@@ -1,11 +1,9 @@
 """Whether chance would find the inliers of a two-view geometry, too, and their frames' agreement.
 
 Two numbers that multiply: how many geometries with so many inliers are expected among random
-matches (a contrario: Desolneux, Moisan, Morel; Moisan and Stival for epipolar geometry), and the
-Bayes factor of the share of inliers whose local affine frames agree. What single random matches
-reach is not assumed but measured on the pair itself: features of its matches, paired anew. So
-photographs with all features in one corner or in rows, and frames that are all upright, get the
-chances that they have.
+matches (a contrario: Desolneux, Moisan, Morel; Moisan and Stival), and the Bayes factor of the
+share of inliers whose local affine frames agree. What single random matches reach is measured on
+the pair itself: features of its matches, paired anew.
 """
 
 import math

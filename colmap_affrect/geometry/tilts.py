@@ -6,8 +6,7 @@ bilinear: cosh d = (S11 S'22 + S22 S'11 - 2 S12 S'12) / 2, the hyperboloid model
 hyperbolic plane, and all votes of all shapes are one matrix product.
 
 Source: Rodriguez, Delon, Morel, "Covering the space of tilts" (2018), and Sec. 2.4 of
-the paper. The authors' program has t1 / t2 where 1 / (t1 t2) stands in the formula; here
-it is the formula, checked against a singular value decomposition in the tests.
+the paper, whose program has t1 / t2 where 1 / (t1 t2) stands in the formula.
 """
 
 from dataclasses import dataclass

@@ -76,9 +76,7 @@ MAX_PLANE_ERROR = 0.04  # relative, of a predicted inverse depth and of those it
 MIN_KNOWN = 20  # known depths that a depth map is fitted to
 MAX_FITTED = 500  # known depths of which pairs are tried and counted; more are thinned
 
-MAX_UNEXPLAINED = 0.5
-"""A depth map must leave at most this part of the spread of known depths unexplained: where all
-are nearly the same a wrong map fits, too."""
+MAX_UNEXPLAINED = 0.5  # part of the spread of known depths that a depth map may leave unexplained
 
 
 def scale_between(
@@ -100,12 +98,9 @@ def scale_by_planes(
 ) -> ScaleEstimate | None:
     """Estimate the scale as :func:`scale_between`, where no known depth lies beside a place.
 
-    The inverse depth of a plane is affine in the image: it is fitted to the known depths around
-    each place and taken where they lie on a plane that is certain enough there.
-
-    The arguments are those of :func:`scale_between`: places and radius in px, depths in any units,
-    whose ratio is the scale. But a place counts only with ``NUM_ON_PLANE`` known ones within the
-    radius, which may be several times as large. None where no place counts.
+    The inverse depth of a plane is affine in the image: it is fitted to the ``NUM_ON_PLANE`` known
+    depths nearest to each place, within the radius, and taken where it is certain enough. None
+    where no place counts.
     """
     rows, columns, _ = _nearest_known(known[0], places[0], radius_px, NUM_ON_PLANE)
     full = np.flatnonzero(np.bincount(rows, minlength=len(places[0])) == NUM_ON_PLANE)
@@ -130,10 +125,10 @@ def scale_by_depth_map(
 ) -> ScaleEstimate | None:
     """Estimate the scale as :func:`scale_between`, by a depth map where nothing else is near.
 
-    Inverse depths of the map are those of the model up to scale and shift, as networks predict
-    them; metric depth is so, too. Both are fitted to the known depths, robustly, and hold between
-    the nearest and the farthest of these only. Both arguments have depths of the map, NaN where it
-    has none, (K,) and (N,), and then the known ones or, all positive, those of the pair.
+    Inverse depths of the map are those of the model up to scale and shift, which are fitted to the
+    known depths robustly, and hold between the nearest and the farthest of these only. Both
+    arguments have depths of the map, NaN where it has none, (K,) and (N,), and then the known ones
+    or, all positive, those of the pair.
     """
     known_map, known_inverse = (1.0 / part[np.isfinite(known[0])] for part in known)
     fitted = _fitted_to(known_map, known_inverse)

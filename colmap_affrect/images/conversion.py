@@ -5,54 +5,47 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.errors import ImageError
 from colmap_affrect.images.headers import pages
 from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files, require_folder
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.outputs import OF_SYSTEMS, publish, temporary_folder
+from colmap_affrect.project.atomic_files import cannot_write
+from colmap_affrect.project.outputs import new_results
 
 AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
 
 
 @dataclass
 class ConversionReport:
-    """What became of the files of a folder."""
+    """What became of the files of a folder, by their names."""
 
-    # names of the files that were converted, with those that were made of them
+    # files that were converted, with those that were made of them
     written: dict[str, list[str]] = field(default_factory=dict)
-    # names of the files that COLMAP can read as they are
-    copied: list[str] = field(default_factory=list)
-    kept: list[str] = field(default_factory=list)  # names of the files that had been there before
-    # names of the files that cannot be read, with the reason
-    failures: dict[str, str] = field(default_factory=dict)
+    copied: list[str] = field(default_factory=list)  # files that COLMAP can read as they are
+    failures: dict[str, str] = field(default_factory=dict)  # why files cannot be read
 
     def summary(self) -> str:
         """Return one line, and one for each file that failed."""
         made = sum(len(names) for names in self.written.values())
         line = f"{len(self.written)} files converted into {made} PNG, {len(self.copied)} copied"
-        kept = f", {len(self.kept)} already there" if self.kept else ""
-        return "\n".join([line + kept, *(f"not {n}: {why}" for n, why in self.failures.items())])
+        return "\n".join([line, *(f"not {n}: {why}" for n, why in self.failures.items())])
 
 
 def convert_images(
     image_path: Path, output_path: Path, progress: Progress = SILENT
 ) -> ConversionReport:
-    """Fill a folder with the photographs of another one, all in formats that COLMAP reads.
+    """Make a new folder with the photographs of another one, all in formats that COLMAP reads.
 
     Pages of a file become a file each, ``scan.tif-page2.png``. EXIF, its orientation too, stays.
-    What is there already is not made again. Raises ImageError when there are no photographs,
-    OptionError when their folder is not there, or the new one is inside it.
+    Raises ImageError when there are no photographs, OptionError when their folder is not there, or
+    the new one is there already or inside it.
     """
     require_folder(image_path)
-    if output_path.resolve() == image_path.resolve():
-        raise OptionError(f"{output_path}: is the folder of the photographs; give another one")
-    if output_path.resolve().is_relative_to(image_path.resolve()):
-        raise OptionError(f"{output_path}: is inside {image_path}; give a folder beside it")
     with suppress(ImportError):  # of the extra "heic"
         from pillow_heif import register_heif_opener
 
@@ -60,55 +53,33 @@ def convert_images(
     names, report = photograph_files(image_path), ConversionReport()
     if not names:
         raise ImageError(f"{image_path}: holds no photographs")
-    _refuse_other_content(output_path, names)
     with (
-        temporary_folder(output_path) as temporary,
+        new_results(output_path, photographs=image_path) as (folder,),
         progress.stage("convert", len(names), "images") as advance,
     ):
         for name in names:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             try:
-                _convert(image_path / name, output_path, name, report, temporary)
-            except (ImageError, OptionError) as error:
+                _convert(image_path / name, folder, name, report)
+            except ImageError as error:
                 report.failures[name] = str(error)
+            except OSError as error:
+                raise cannot_write(output_path, error) from error
             advance(1)
     return report
 
 
-def _refuse_other_content(folder: Path, names: Sequence[str]) -> None:
-    """Refuse a folder with other things than photographs and what is made of these; OptionError."""
-    known = {PurePosixPath(name).parts[0] for name in names} | OF_SYSTEMS
-    for path in folder.iterdir() if folder.is_dir() else ():
-        is_picture = path.suffix.lower() in IMAGE_SUFFIXES and not path.is_dir()
-        if not (is_picture or path.name in known or path.name.startswith(".")):
-            raise OptionError(
-                f"{folder}: is not empty ({path.name}), and not only photographs are there; give a "
-                "new or an empty folder"
-            )
-
-
-def _convert(
-    path: Path, folder: Path, name: str, report: ConversionReport, temporary: Path
-) -> None:
-    suffix = PurePosixPath(name).suffix.lower()
+def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:
+    suffix = path.suffix.lower()
     numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
-    as_it_is = suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]
-    names = [_page_name(name, k, len(numbers)) for k in range(1, len(numbers) + 1)]
-    places = {k: folder / n for k, n in zip(numbers, [name] if as_it_is else names, strict=True)}
-    missing = {k: place for k, place in places.items() if place.is_symlink() or not place.exists()}
-    if not missing:
-        report.kept.append(name)
-        return
-    made = [(temporary / f"{number}.new", place) for number, place in missing.items()]
-    if as_it_is:
-        shutil.copy2(path, made[0][0])
-    else:
-        for (new, _), content in zip(made, _as_png(path, list(missing)), strict=True):
-            new.write_bytes(content)
-    publish(made, folder)
-    if as_it_is:
+    if suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]:
+        shutil.copy2(path, folder / name)
         report.copied.append(name)
-    else:
-        report.written[name] = names
+        return
+    made = {_page_name(name, k, len(numbers)): n for k, n in enumerate(numbers, start=1)}
+    for page, content in zip(made, _as_png(path, numbers), strict=True):
+        (folder / page).write_bytes(content)
+    report.written[name] = list(made)
 
 
 def _page_name(name: str, page: int, num_pages: int) -> str:

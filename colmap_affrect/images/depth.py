@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from math import log, prod
 from pathlib import Path
 from posixpath import splitext
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 from zipfile import BadZipFile
 
 import numpy as np
@@ -34,8 +34,8 @@ MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
 MIN_DISPARITY_FRAC = 0.01  # inverse depth below this share of the largest is sky, i.e. unknown
 NETWORK_IMAGE_SIZE_PX = 1024  # longer side; most networks work at about 384 to 784 px
 
-# What numpy raises for a kept prediction that is missing or damaged.
-_DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error)
+DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error)
+"""What numpy raises for a kept prediction that is missing or damaged."""
 
 
 class DepthSource(Protocol):
@@ -88,8 +88,8 @@ class DepthFilesOptions(DepthOptions):
 
     name: Literal["files"] = "files"
     path: str = ""
-    """Folder of depth maps, named as the images: ``a/b.jpg`` has ``a/b.npy``, or .npz, .png,
-    .tif (also after the image's full name, ``a/b.jpg.npy``)."""
+    """Folder of depth maps, named as the images: ``a/b.jpg`` has ``a/b.npy``, or .png, .tif (also
+    after the image's full name, ``a/b.jpg.npy``)."""
     png_scale: Annotated[float, within(1e-12, 1e12)] = 0.001
     """Depth of one step of a 16-bit PNG; only the ratio of depths matters."""
 
@@ -104,11 +104,7 @@ class DepthFilesOptions(DepthOptions):
         return bool(self.path)
 
     def file(self, name: str) -> Path | None:
-        """Return the first of the files of an image's map that exists.
-
-        Of ``a/b.jpg`` these are ``a/b.jpg.npy`` and so on in the order of ``SUFFIXES``, then
-        ``a/b.npy`` and so on.
-        """
+        """Return the map of an image, if any: ``a/b.jpg.npy`` and so on, then ``a/b.npy``."""
         stems = (name, splitext(name)[0])
         paths = (Path(self.path) / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES)
         return next((path for path in paths if path.is_file()), None)
@@ -145,10 +141,7 @@ class DepthFiles:
         self._path = Path(options.path)
 
     def require_some(self, names: Sequence[str]) -> None:
-        """Check, before any image is processed, that at least one has a map; else DepthError.
-
-        OptionError where there is no folder.
-        """
+        """Raise DepthError when no image has a map, OptionError when there is no folder."""
         if not self._path.is_dir():
             raise OptionError(f"{self._path}: no such folder; give the folder of the depth maps")
         if not any(self._options.file(name) for name in names):
@@ -158,10 +151,7 @@ class DepthFiles:
             )
 
     def depth(self, photograph: Photograph) -> Singles:
-        """Read the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
-
-        Raises DepthError if there is none, or it is damaged or not of this photograph.
-        """
+        """Read a map; DepthError if there is none, or it is damaged or not of this photograph."""
         path = self._options.file(photograph.name)
         if path is None:
             raise DepthError(
@@ -182,23 +172,17 @@ class DepthFiles:
         return f"looked for {name}.* and {splitext(name)[0]}.* with * one of {suffixes}"
 
 
-@dataclass(frozen=True)
-class _Prediction:
+class _Prediction(NamedTuple):
     values: Singles  # (h, w) depth or inverse depth
     inverse: bool  # whether the network predicts relative inverse depth
 
 
 class MonocularDepth:
-    """Depth from one image by a network of Hugging Face transformers.
+    """Depth from one image by a network of Hugging Face transformers (``depth-estimation``).
 
-    Any model of the ``depth-estimation`` pipeline will do; whether it predicts depth or inverse
-    depth (:func:`predicts_inverse_depth`) counts unless ``kind`` says ``inverse`` or ``ray``.
-
-    Relative inverse depth is known up to scale and shift. Here 0 is taken for infinitely far,
-    as the networks are trained to say of the sky, and less than ``MIN_DISPARITY_FRAC`` of the
-    largest value for unknown. Planes stay planes under a wrong shift, but their normals turn:
-    normals from such depth are approximate. A shift that is too large makes the scene flatter,
-    so that less is rectified, not more.
+    Relative inverse depth is known up to scale and shift: 0 is taken for infinitely far, and less
+    than ``MIN_DISPARITY_FRAC`` of the largest value for unknown. Normals from such depth are
+    approximate.
 
     Predictions are kept as ``<image name>.npz`` and used again for the same pixels and the same
     name of a model. Threads may share one instance: they take turns at the network.
@@ -207,7 +191,7 @@ class MonocularDepth:
     Options = MonocularOptions
 
     def __init__(self, options: MonocularOptions, context: DepthContext) -> None:
-        """Choose a network; it is loaded when the first prediction is asked for."""
+        """Choose a network; it is loaded for the first prediction."""
         self._model, self._kind = options.model, options.kind
         self._cache_path, self._device = context.cache_path, context.device
         self._network: Any = None
@@ -221,11 +205,7 @@ class MonocularDepth:
                 self._load()
 
     def depth(self, photograph: Photograph) -> Singles:
-        """Predict the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
-
-        Raises DepthError if the network cannot be loaded or predicts no depth, ImageError if the
-        photograph cannot be read.
-        """
+        """Predict the (h, w) float32 z-depth of a photograph, NaN where it is unknown."""
         prediction = self._prediction(photograph)
         kind = "inverse" if self._kind == "z" and prediction.inverse else self._kind
         values = prediction.values
@@ -294,8 +274,7 @@ class MonocularDepth:
 def predicts_inverse_depth(config: Any) -> bool:
     """Return whether a model predicts relative inverse depth, by its configuration.
 
-    Models of the type of Depth Anything say so. DPT does, as MiDaS was trained to, but for metric
-    DPT heads on DINOv2, the ones with ``add_projection``. All others predict depth.
+    Depth Anything says so. DPT does but for metric heads, those with ``add_projection``.
     """
     estimation_type = getattr(config, "depth_estimation_type", None)
     if estimation_type is not None:
@@ -347,14 +326,14 @@ def _read_prediction(file: Path, model: str, pixels: str) -> _Prediction | None:
             if (str(kept["model"]), str(kept["pixels"])) != (model, pixels):
                 return None
             return _Prediction(kept["values"], bool(kept["inverse"]))
-    except _DAMAGED:
+    except DAMAGED:
         return None
 
 
 def _write_prediction(file: Path, prediction: _Prediction, model: str, pixels: str) -> None:
     """Keep a prediction; the file appears under its name only when it is complete."""
     content = io.BytesIO()
-    np.savez(content, **vars(prediction), model=model, pixels=pixels)
+    np.savez(content, **prediction._asdict(), model=model, pixels=pixels)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         replace_bytes(file, content.getvalue())

@@ -1,7 +1,7 @@
 """What EXIF says of the camera of a photograph, and whether that can be true.
 
-EXIF describes the file that a camera wrote. What has been shrunk, cropped or edited since often
-keeps it as it was, so that every statement is held against the others and against the file.
+Files that were shrunk or cropped often keep it as it was: statements are compared with each other
+and with the file.
 """
 
 import math
@@ -33,15 +33,12 @@ class CameraTags:
     """What the file of a photograph says of its camera; missing and absurd values are None."""
 
     size: tuple[int, int]  # (width, height) of the stored pixels
-    # make, model and serial number, as far as they are there
-    body: tuple[str, str, str] = ("", "", "")
+    body: tuple[str, str, str] = ("", "", "")  # make, model and serial number
     lens: str = ""  # model of the lens
     focal_mm: float | None = None  # focal length
     equivalent_mm: float | None = None  # of a camera with 35 mm film and the same field of view
-    # focal-plane resolution, horizontal and vertical, the second may be missing
-    px_per_mm: tuple[float, float | None] | None = None
-    # (width, height) of the pixels when EXIF was written
-    original_size: tuple[int, int] | None = None
+    px_per_mm: tuple[float, float | None] | None = None  # focal-plane resolution, x and perhaps y
+    original_size: tuple[int, int] | None = None  # (width, height) when EXIF was written
     zoom: float = 1.0  # of the part of the sensor that was enlarged; 1 without
     absurd: tuple[str, ...] = ()  # names of tags whose values cannot be true
 
@@ -69,11 +66,9 @@ class CameraTags:
 class ExifFocal:
     """A focal length, or why there is none."""
 
-    # in px of the stored file; None where EXIF does not say or cannot be trusted
-    focal_px: float | None
-    # it had to be scaled to the photograph, COLMAP would take another one
-    is_rescaled: bool = False
-    why: str = ""  # what was found wrong; empty if nothing
+    focal_px: float | None  # of the stored file; None if EXIF does not say or cannot be trusted
+    is_rescaled: bool = False  # it is not the one that COLMAP would take
+    why: str = ""  # what is wrong; empty if nothing
 
 
 def read_camera_tags(path: Path) -> CameraTags | None:
@@ -148,7 +143,7 @@ def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFo
     """Decide on the focal length that EXIF gives a photograph.
 
     Of statements that agree the first counts, in COLMAP's order: 35 mm equivalent, focal-plane
-    resolution, width of the longer side of the sensor of this model, where it is known.
+    resolution, width of the sensor of this model, where it is known.
     """
     if tags.was_cropped:
         return ExifFocal(None, why=f"cropped or padded: {_sizes(tags)}")

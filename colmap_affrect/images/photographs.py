@@ -3,10 +3,10 @@
 import os
 import posixpath
 import unicodedata
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -84,10 +84,7 @@ class Photographs:
         return np.logical_and.reduce(masks) if masks else None
 
     def without_mask(self, names: Sequence[str]) -> list[str]:
-        """Return the images that have no mask in the folder of masks, if there is one.
-
-        OptionError when none has: it is another folder, or the names differ.
-        """
+        """Return the images without a mask, if masks are given; OptionError when none has one."""
         paths = {name: self._mask_paths(name) for name in names if self.masks.path}
         found = [name for name in paths if not any(path.is_file() for path in paths[name])]
         if found and len(found) == len(names):
@@ -120,18 +117,12 @@ class Photographs:
             return str(error)
         return ""
 
-    def moved(self, move: Callable[[Path], Path]) -> Self:
-        """Return the same photographs with all files in other places."""
-        masks = MaskOptions(**{name: str(move(Path(path))) for name, path in self.masks if path})
-        return replace(self, folder=move(self.folder), masks=masks)
-
 
 def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:
-    """Return the sorted names, relative to ``image_path``, of all images or of those listed.
+    """Return the sorted names, relative to ``image_path``, of all images below it or of a list.
 
-    Folders are searched through; hidden ones and files of other formats are passed over (see
-    :func:`left_out`). OptionError when there is no such folder or list, ImageError when it holds
-    none, or a listed one is missing.
+    Hidden files and other formats are passed over (:func:`left_out`). OptionError when there is no
+    such folder or list, ImageError when it holds none, or a listed one is missing.
     """
     require_folder(image_path)
     if image_list_path is not None:
@@ -187,10 +178,7 @@ def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
 def photograph_files(
     folder: Path, suffixes: Collection[str] = (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES)
 ) -> list[str]:
-    """Return the sorted names of all photographs below a folder, not of hidden ones or our output.
-
-    Those that COLMAP reads have ``IMAGE_SUFFIXES``; by default it is all formats.
-    """
+    """Return the sorted names of all photographs below a folder, without hidden ones and output."""
     found: list[str] = []
     for path, inner, files in os.walk(folder):
         inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(Path(path, n))]

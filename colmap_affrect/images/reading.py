@@ -37,9 +37,7 @@ FOREIGN_FORMATS = {
     "JPEG XL": rb"\x00\x00\x00\x0cJXL |\xff\x0a",
     "AVIF or HEIF": rb"....ftyp(avi|hei|hev|mif|msf)",
 }
-"""Patterns of the first bytes of formats that OpenCV may read, whatever the suffix, and pycolmap's
-wheel does not."""
-
+"""First bytes of formats that OpenCV may read, whatever the suffix, and pycolmap's wheel not."""
 
 TONE_PERCENTILES = (0.5, 99.5)  # black and white of a stretched photograph but for dust and glints
 MIN_TONE_RANGE = 0.5  # a photograph whose tones fill less of the range of its file is stretched
@@ -48,34 +46,21 @@ NUM_TONES = 250_000  # about so many pixels are looked at
 FRAME_FRAC = 0.1  # along each border is passed over: scans have frames and captions there
 BIG_TIFF = 43  # what files of more than 4 GiB have in the place of 42, with offsets of 64 bits
 
-
+GRAY_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
 """Several times faster, of JPEG files."""
 
 
 def read_gray(path: Path) -> GrayImage:
-    """Read an image as gray, as stored: EXIF orientation is not applied, 16 bit becomes 8.
-
-    Raises ImageError if it is no image.
-    """
+    """Read an image as 8-bit gray, without applying EXIF orientation; ImageError if it is none."""
     return in_eight_bits(decode(path))
 
 
-def readable_size(path: Path) -> tuple[int, int] | None:
-    """Return the (width, height) of an image as stored, None if it cannot be read."""
-    try:
-        height, width = decode(path).shape
-    except ImageError:
-        return None
-    return width, height
-
-
 def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorImage:
-    """Read an image in colour, as stored, its longer side shrunk to at most ``max_size_px``.
+    """Read an image in colour as :func:`read_gray`, shrunk to at most ``max_size_px``.
 
-    EXIF orientation is not applied. With ``stretch`` low contrast fills the range (:func:`tones`).
-    Raises ImageError if it is no image.
+    With ``stretch`` low contrast fills the range (:func:`tones`).
     """
     size = header_size(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
     is_far_larger = size is not None and max(size) >= 8 * max_size_px
@@ -84,10 +69,7 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
 
 
 def tones(image: NDArray[Any]) -> tuple[float, float] | None:
-    """Return what is to be black and white of an (H, W[, 3]) image, None to leave it as it is.
-
-    Detectors with a fixed threshold see next to nothing in scans of faded prints.
-    """
+    """Return what is to be black and white of an (H, W[, 3]) image, None to leave it as it is."""
     height, width = image.shape[:2]
     y, x = int(FRAME_FRAC * height), int(FRAME_FRAC * width)
     inner = image[y : height - y, x : width - x]
@@ -129,9 +111,6 @@ def require_png() -> None:
         )
 
 
-GRAY_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-
-
 def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
     """Read an image, by default as gray in the type it is stored in; ImageError if it is none."""
     if path.exists() and not path.is_file():
@@ -163,8 +142,8 @@ def foreign_format(path: Path) -> str:
 
 
 def _foreign(beginning: bytes) -> str:
-    found = (n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL))
-    return next(found, "")
+    matching = (n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL))
+    return next(matching, "")
 
 
 def _forget_orientation_of_tiff(data: Bytes) -> None:

@@ -15,10 +15,7 @@ from colmap_affrect.images.masks import mask_values
 
 ANTI_ALIASING_SIGMA = 0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
 
-TILE_PX = 64
-"""Homographies are executed in square tiles, each with the blur that its strongest compression
-needs; larger tiles would blur more of what is compressed less."""
-
+TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression
 SAMPLES_PER_TILE = 5  # points along a side of a tile at which its compression is measured
 MAX_DENSITY = 16  # samples per px of a warp along an axis; beyond, memory counts more than aliasing
 
@@ -35,12 +32,11 @@ def warp(image: GrayImage | ColorImage | Singles, rectification: Rectification) 
     """Render a rectification: one exact resampling, free of aliasing where it compresses.
 
     The image is resampled once, on a grid that is denser than the warp by integer factors, blurred,
-    and decimated by them. So pixels are picked, never interpolated again, and the map is exact.
-    Outside the image its border is reflected.
+    and decimated by them. Outside the image its border is reflected.
 
-    From (H, W) or (H, W, 3) levels 0 to 255 (float32 saves a conversion for each warp), by an
-    affine map diag(sx, sy) R(phi) + translation with sx >= 1 >= sy or any homography, to (height,
-    width) or (height, width, 3) uint8; what lies behind the camera has no meaning.
+    From (H, W) or (H, W, 3) levels 0 to 255, by an affine map diag(sx, sy) R(phi) + translation
+    with sx >= 1 >= sy or any homography, to (height, width) or (height, width, 3) uint8; what lies
+    behind the camera has no meaning.
     """
     # Rounding to 8 bits between the steps would shift edges by up to 0.1 px.
     source = np.asarray(image, dtype=np.float32)
@@ -61,12 +57,9 @@ def _warp_affine(source: Singles, rectification: Rectification) -> GrayImage:
     density = max(1, ceil(compression - 1e-9))
     dense_from_image = np.diag([1.0, density, 1.0]) @ matrix
     size = (width, (height - 1) * density + 1)
+    border = cv2.BORDER_REFLECT_101
     dense = cv2.warpAffine(
-        source,
-        dense_from_image[:2],
-        size,
-        flags=cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REFLECT_101,
+        source, dense_from_image[:2], size, flags=cv2.INTER_LINEAR, borderMode=border
     )
     sigma_px = _anti_aliasing_sigma(compression, density)
     if sigma_px > 0.0:

@@ -1,7 +1,4 @@
-"""Give a COLMAP model its scale and place: by positions, control points, or known distances.
-
-Where on earth it is, a file beside those of COLMAP says, which have no place for it.
-"""
+"""Give a COLMAP model its scale and place: by positions, control points, or known distances."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -25,10 +22,9 @@ from colmap_affrect.project.tables import read_table
 from colmap_affrect.project.workspace import Workspace
 
 GEOREFERENCE = "georeference.json"  # beside a model
-# of positions across the line that fits them best, in units of the length along it; with less the
-# model can be turned about that line
-MIN_WIDTH = 0.01
+MIN_WIDTH = 0.01  # of known places across the line that fits them best, in units of its length
 METRIC, ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "altitude")
+WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 SHOWN = 12  # residuals in the summary, the largest first
 
 Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
@@ -36,21 +32,15 @@ Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
 
 @dataclass(frozen=True)
 class Georeference:
-    """A model in metres whose x, y, z point east, north and up, and where its origin is (WGS 84).
+    """Origin (WGS 84) of a model in metres whose x, y, z point east, north and up."""
 
-    Attributes:
-        latitude: of the origin, degrees.
-        longitude: of the origin, degrees.
-        altitude: of the origin, metres above the ellipsoid, or as GPS has it.
-    """
-
-    latitude: float
-    longitude: float
-    altitude: float
+    latitude: float  # degrees
+    longitude: float  # degrees
+    altitude: float  # metres above the ellipsoid, or as GPS has it
 
     @classmethod
     def read(cls, model_path: Path) -> Self | None:
-        """Return what is on record beside a model, None if there is nothing."""
+        """Return that of a model, None if it has none."""
         path = model_path / GEOREFERENCE
         if not path.exists():
             return None
@@ -58,57 +48,42 @@ class Georeference:
             return TypeAdapter(cls).validate_json(path.read_bytes())
 
     def write(self, model_path: Path) -> None:
-        """Put it on record beside a model."""
+        """Write it beside a model: COLMAP's files have no place for it."""
         text = TypeAdapter(Georeference).dump_json(self, indent=1).decode()
         replace_text(model_path / GEOREFERENCE, text + "\n")
 
     def in_metres(self, positions: ArrayLike) -> Array:
         """Return metres east, north and up of the origin for latitudes, longitudes, altitudes."""
-        return np.asarray(_transform().ellipsoid_to_enu(positions, *astuple(self)))
+        return np.asarray(WGS84.ellipsoid_to_enu(positions, *astuple(self)))
 
     def on_earth(self, point: ArrayLike) -> tuple[float, float, float]:
         """Return latitude, longitude and altitude of a point of the model."""
-        places = _transform().enu_to_ellipsoid(np.asarray(point, float)[None], *astuple(self))
+        places = WGS84.enu_to_ellipsoid(np.asarray(point, float)[None], *astuple(self))
         latitude, longitude, altitude = places[0].tolist()
         return latitude, longitude, altitude
 
 
-def _transform() -> pycolmap.GPSTransform:
-    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """What a model is aligned to; exactly one of the first three, or distances.
+    """What a model is aligned to; exactly one of the first three, or distances."""
 
-    Attributes:
-        gps_database: COLMAP database that has positions of the photographs by GPS.
-        positions_path: CSV of where photographs were taken: name and x, y, z in metres, or
-            latitude, longitude, altitude.
-        points_path: CSV of points marked in photographs: point, image, px, py, and for control
-            points x, y, z in one row or more of each.
-        distances: two names, of photographs or of marked points, and their distance in metres.
-    """
-
-    gps_database: Path | None = None
+    gps_database: Path | None = None  # COLMAP database with positions of the photographs
+    # CSV of where photographs were taken: name and x, y, z in metres, or latitude, longitude,
+    # altitude
     positions_path: Path | None = None
+    # CSV of points marked in photographs: point, image, px, py; of control points also x, y, z
     points_path: Path | None = None
+    # two names, of photographs or marked points, and their distance in metres
     distances: tuple[tuple[str, str, float], ...] = ()
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What was done.
+    """What was done."""
 
-    Attributes:
-        scale: metres for a unit of the model as it was.
-        residuals: how far each position, point or distance is off after it, metres.
-        georeference: where the model is on earth, if that is known.
-    """
-
-    scale: float
-    residuals: Mapping[str, float]
-    georeference: Georeference | None = None
+    scale: float  # metres for a unit of the model as it was
+    residuals: Mapping[str, float]  # how far each position, point or distance is off, metres
+    georeference: Georeference | None = None  # where the model is on earth, if that is known
 
     def summary(self) -> str:
         """Return a few lines."""
@@ -125,17 +100,10 @@ class Alignment:
 
 
 def align(model_path: Path, output_path: Path, reference: Reference) -> Alignment:
-    """Write a model in metres; the old one stays as it is.
+    """Write a COLMAP model in metres to a new folder; the old one stays as it is.
 
     Positions and control points give scale, rotation and place, distances the scale alone.
-
-    Args:
-        model_path: folder of a COLMAP model.
-        output_path: folder of the new model, which must not exist.
-        reference: what to align to.
-
-    Raises:
-        AffrectError: when the reference is unreadable, or leaves open how the model lies.
+    Raises AffrectError when the reference is unreadable, or leaves open how the model lies.
     """
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
@@ -169,11 +137,7 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
 def _similarity(
     old: Places, true: Places, *, is_on_earth: bool
 ) -> tuple[pycolmap.Sim3d, dict[str, float], Georeference | None]:
-    """Return the similarity of least squares, its residuals, and the origin if on earth.
-
-    Not ``pycolmap.align_reconstruction_to_locations``: it knows no marked points, and leaves out
-    positions that do not fit without saying which.
-    """
+    """Return the similarity of least squares, its residuals, and the origin if on earth."""
     names = sorted(old.keys() & true.keys())
     if len(names) < 3:
         raise OptionError(

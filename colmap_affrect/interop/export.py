@@ -1,12 +1,8 @@
-"""A COLMAP model for other programs: points, text, NVM, Bundler, flat photographs, tables.
-
-PLY, text and undistorted photographs are pycolmap's own; of NVM and Bundler it has no writer.
-"""
+"""A COLMAP model for other programs: points, text, undistorted photographs, tables, maps."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +12,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import ImageError, OptionError
-from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.interop.align import Georeference
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
@@ -27,12 +22,7 @@ from colmap_affrect.project.workspace import Workspace
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 NO_EXTRA = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0)  # nerfstudio's distortion
 
-RADIAL_TERMS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2}
-"""Camera models that NVM and Bundler can hold, and how many radial terms each has."""
-
-NVM_TERMS, BUNDLER_TERMS = 1, 2  # radial terms that the formats have a place for
-
-FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL, Bundler, nerfstudio
+FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL and nerfstudio
 
 
 @dataclass(frozen=True)
@@ -48,51 +38,15 @@ class Source:
         images = (self.model.image(image_id) for image_id in self.model.reg_image_ids())
         return sorted(images, key=lambda image: str(image.name))
 
-    def radial(self, image: pycolmap.Image, num_terms: int, name: str) -> tuple[float, Array]:
-        """Return the focal length of an image and its radial terms, 0 if it lacks some."""
-        camera = self.model.cameras[image.camera_id]
-        known = RADIAL_TERMS.get(camera.model.name)
-        if known is None or known > num_terms:
-            raise OptionError(
-                f"{name}: cannot hold the camera of {image.name} ({camera.model.name}); export "
-                f"'undistorted' first, and then the model in its folder {DENSE}/sparse"
-            )
-        terms = np.zeros(num_terms)
-        terms[:known] = camera.params[len(camera.params) - known :]
-        return camera.mean_focal_length(), terms
-
-    def tracks(self) -> Iterator[tuple[pycolmap.Point3D, list[tuple[int, int, Array]]]]:
-        """Yield points with their tracks: place in images(), keypoint, its x y from the centre."""
-        images = self.images()
-        places = {image.image_id: place for place, image in enumerate(images)}
-        cameras = [self.model.cameras[image.camera_id] for image in images]
-        centers = [np.array([c.principal_point_x, c.principal_point_y]) for c in cameras]
-        for _, point in sorted(self.model.points3D.items()):
-            seen = []
-            for element in point.track.elements:
-                place, keypoint = places[element.image_id], element.point2D_idx
-                xy = images[place].points2D[keypoint].xy - centers[place]
-                seen.append((place, keypoint, xy))
-            yield point, seen
-
 
 def export(
     model_path: Path, output_path: Path, formats: Sequence[str], *, image_path: Path | None = None
 ) -> dict[str, Path]:
-    """Write a model in some formats.
+    """Write a COLMAP model in some of ``FORMATS``; return what was written by format.
 
-    Args:
-        model_path: folder of a COLMAP model.
-        output_path: folder for the files, made if missing; nothing in it is overwritten.
-        formats: keys of ``FORMATS``.
-        image_path: folder of the photographs, for undistorted ones; by default as the run
-            that made the model has it on record.
-
-    Returns:
-        What was written, by format.
-
-    Raises:
-        AffrectError: when a format cannot hold the model, or a file exists; nothing is written.
+    The output folder is made if missing; nothing in it is overwritten. ``image_path`` has the
+    photographs to undistort, by default those of the run that made the model. Raises AffrectError
+    when a format cannot hold the model, or a file exists; nothing is written then.
     """
     for name in formats:
         if name not in FORMATS:
@@ -125,51 +79,6 @@ def _text(source: Source, folder: Path) -> Path:
     path.mkdir()
     source.model.write_text(path)
     return path
-
-
-def _nvm(source: Source, folder: Path) -> Path:
-    """Write VisualSFM's file: keypoints from the principal point, k with the other sign."""
-    path, images = folder / "model.nvm", source.images()
-    lines = ["NVM_V3", "", str(len(images))]
-    for image in images:
-        focal, terms = source.radial(image, NVM_TERMS, "NVM")
-        if any(character.isspace() for character in image.name):
-            raise OptionError(f"NVM: cannot hold the name '{image.name}', which has a space")
-        x, y, z, w = image.cam_from_world().rotation.quat
-        values = [focal, w, x, y, z, *image.projection_center(), -terms[0], 0]
-        lines.append(f"{image.name} {_numbers(values)}")
-    lines += ["", str(source.model.num_points3D())]
-    for point, seen in source.tracks():
-        unique = {view[0]: view for view in reversed(seen)}  # one keypoint of each image
-        views = [
-            f"{place} {index} {_numbers(xy)}"
-            for place, index, xy in sorted(unique.values(), key=itemgetter(0))
-        ]
-        colour = " ".join(map(str, point.color))
-        lines.append(f"{_numbers(point.xyz)} {colour} {len(views)} {' '.join(views)}")
-    replace_text(path, "\n".join(lines) + "\n")
-    return path
-
-
-def _bundler(source: Source, folder: Path) -> Path:
-    """Write Bundler's file, whose cameras look along -z, and the list of its photographs."""
-    path, images = folder / "bundle.out", source.images()
-    lines = ["# Bundle file v0.3", f"{len(images)} {source.model.num_points3D()}"]
-    for image in images:
-        focal, terms = source.radial(image, BUNDLER_TERMS, "Bundler")
-        matrix = FLIP_Y_Z @ image.cam_from_world().matrix()
-        lines += map(_numbers, ([focal, *terms], *matrix[:, :3], matrix[:, 3]))
-    for point, seen in source.tracks():
-        views = [f"{place} {index} {_numbers(xy * [1, -1])}" for place, index, xy in seen]
-        colour = " ".join(map(str, point.color))
-        lines += [_numbers(point.xyz), colour, f"{len(views)} {' '.join(views)}"]
-    replace_text(path, "\n".join(lines) + "\n")
-    replace_text(folder / "bundle.list.txt", "".join(f"{image.name}\n" for image in images))
-    return path
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return " ".join(f"{float(value):.12g}" for value in values)
 
 
 def _undistorted(source: Source, folder: Path) -> Path:
@@ -266,8 +175,6 @@ def _geojson(source: Source, folder: Path) -> Path:
 FORMATS: dict[str, tuple[Callable[[Source, Path], Path], tuple[str, ...]]] = {
     "ply": (_points, ("points3D.ply",)),
     "text": (_text, ("text",)),
-    "nvm": (_nvm, ("model.nvm",)),
-    "bundler": (_bundler, ("bundle.out", "bundle.list.txt")),
     "undistorted": (_undistorted, (DENSE,)),
     "nerfstudio": (_nerfstudio, (DENSE,)),
     "cameras": (_cameras, ("cameras.csv",)),

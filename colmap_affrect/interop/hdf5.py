@@ -1,17 +1,14 @@
-"""Features and matches in other programs' HDF5 files, into and out of COLMAP databases.
-
-The layouts that are read and written are in :mod:`.hdf5_layouts`. Names must be those of images
-in the folder, and every value is checked before it reaches COLMAP.
-"""
+"""Features and matches in other programs' HDF5 files, into and out of COLMAP databases."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import CHECKS, USELESS_KEYPOINTS, keypoint_problems
 from colmap_affrect.colmap.database import (
     DESCRIPTOR_NORM,
     colmap_keypoints,
@@ -20,7 +17,6 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
-from colmap_affrect.colmap.useless_keypoints import leave_out_useless
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StoreError
 from colmap_affrect.geometry.arrays import Indices, Singles
@@ -37,7 +33,6 @@ from colmap_affrect.interop.hdf5_layouts import (
     check_names,
     created,
     listed,
-    match_datasets,
     noted,
     open_files,
 )
@@ -49,29 +44,19 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.pairs import listed_pairs
 
-PIXEL_ORIGINS = ("center", "corner")
-
 
 @dataclass(frozen=True)
 class InterchangeReport:
-    """What was imported or exported.
+    """What was imported or exported."""
 
-    Attributes:
-        action: ``imported`` or ``exported``.
-        layout: of the files, ``hloc`` or ``dim``.
-        num_images: images in the database or the file, those without features included.
-        num_verified: pairs with a two-view geometry; None where no verification was asked for.
-        notes: what was left out, chosen or lost, one line each.
-    """
-
-    action: str
-    layout: str
-    num_images: int
+    action: str  # ``imported`` or ``exported``
+    layout: str  # of the files, ``hloc`` or ``dim``
+    num_images: int  # in the database or the file, also those without features
     num_keypoints: int
     num_pairs: int
     num_matches: int
-    num_verified: int | None
-    notes: tuple[str, ...]
+    num_verified: int | None  # pairs with a two-view geometry; None if not asked for
+    notes: tuple[str, ...]  # what was left out, one line each
 
     def summary(self) -> str:
         """Return a line of numbers, and one for each note."""
@@ -92,7 +77,6 @@ def import_h5(
     *,
     cameras: CameraOptions | None = None,
     layout: str = "auto",
-    pixel_origin: str = "center",
     skip_verification: bool = False,
     random_seed: int = 0,
     progress: Progress = SILENT,
@@ -100,16 +84,13 @@ def import_h5(
     """Make a new COLMAP database from the features and matches of another program.
 
     Keypoints get 6 columns where the file has ``lafs``, 4 where it has ``scales`` and ``oris``,
-    else 2. All images of the folder are imported, with or without features. The database, which
-    must not be there (OptionError), appears when it is complete; nothing else is written. Files
-    that cannot be read, or contradict the photographs or each other, are a StoreError.
+    else 2. All images of the folder are imported, with or without features. ``layout`` is ``hloc``,
+    ``dim``, or ``auto``: as the matches are stored. ``random_seed`` is that of verification.
 
-    ``layout`` is ``hloc``, ``dim``, or ``auto``: as the matches are stored. ``pixel_origin`` is
-    where (0, 0) is, the ``center`` of the first pixel (both programs) or its ``corner``, which is
-    COLMAP's. ``random_seed`` is that of verification.
+    Raises OptionError when the database exists, StoreError for files that cannot be read, or
+    contradict the photographs or each other.
     """
-    _check_choice("layout", layout, ("auto", *LAYOUTS))
-    _check_choice("pixel_origin", pixel_origin, PIXEL_ORIGINS)
+    _check_layout(layout, ("auto", *LAYOUTS))
     cameras = cameras or CameraOptions()
     names = list_images(image_path)
     InitialCameras(image_path, cameras).check(names)
@@ -124,47 +105,28 @@ def import_h5(
                 f"{image_path}: COLMAP does not take (damaged, or of another size than camera "
                 f"mode {cameras.mode} allows): {listed(lost)}"
             )
-        _fill_database(new, files, pixel_origin, progress)
+        _fill_database(new, files, progress)
         with open_database(new) as database:
-            useless = leave_out_useless(database)
             counts = database.num_keypoints(), len(files.pairs), database.num_matches()
         without = sorted(set(names) - set(rejected) - files.keys.keys())
         notes = [
             *files.notes,
-            *_rounded(files),
-            *filter(None, [useless]),
             *noted("images without features are there without keypoints", without),
             *noted("images that COLMAP does not take are left out", rejected),
         ]
         num_verified = None
         if not skip_verification:
-            num_verified = _verify(new, len(files.pairs), random_seed, progress)
+            options = VerificationOptions(random_seed=random_seed)
+            with progress.stage("verify", len(files.pairs), "pairs") as advance:
+                verify(new, options, advance=advance)
+            num_verified = len(verified_pairs(new, options.min_num_inliers))
     num_images = len(names) - len(rejected)
     return InterchangeReport(
         "imported", files.layout.name, num_images, *counts, num_verified, tuple(notes)
     )
 
 
-def _verify(path: Path, num_pairs: int, random_seed: int, progress: Progress) -> int:
-    options = VerificationOptions(random_seed=random_seed)
-    with progress.stage("verify", num_pairs, "pairs") as advance:
-        verify(path, options, advance=advance)
-    return len(verified_pairs(path, options.min_num_inliers))
-
-
-def _rounded(files: ForeignFiles) -> list[str]:
-    """Say how far apart coordinates in float16 are, as deep-image-matching may write them."""
-    keys = map(files.keypoints_key, files.keys)
-    half = [key for key in keys if files.features.file[key].dtype == np.float16]
-    if not half:
-        return []
-    values = (files.features.read(key, (None, 2)) for key in half)
-    largest = max(points[np.isfinite(points)].max(initial=0) for points in values)
-    return [f"keypoints of {len(half)} images are float16, rounded to steps of "
-            f"{np.spacing(np.float16(largest)):g} px"]  # fmt: skip
-
-
-def _fill_database(path: Path, files: ForeignFiles, pixel_origin: str, progress: Progress) -> None:
+def _fill_database(path: Path, files: ForeignFiles, progress: Progress) -> None:
     """Write keypoints and matches of images that the database has."""
     counts: dict[str, int] = {}
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):
@@ -173,20 +135,22 @@ def _fill_database(path: Path, files: ForeignFiles, pixel_origin: str, progress:
             for name in files.keys:
                 camera = database.read_camera(images[name].camera_id)
                 files.check_size(name, (camera.width, camera.height))
-                keypoints = _read_keypoints(files, name, pixel_origin)
+                keypoints = _read_keypoints(files, name)
+                for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints, None)):
+                    raise StoreError(f"{files.features.path}: {CHECKS[kind][1]}: {name}")
                 database.write_keypoints(images[name].image_id, keypoints)
                 counts[name] = len(keypoints)
                 advance(1)
         with progress.stage("matches", len(files.pairs), "pairs") as advance:
             for pair in files.pairs:
                 indices = files.read_indices(pair, counts[pair[0]])
-                _check_range(files.matches.path, pair, indices, counts)
+                _require_in_range(files.matches.path, pair, indices, counts)
                 id1, id2 = (images[name].image_id for name in pair)
                 write_matches(database, id1, id2, indices)
                 advance(1)
 
 
-def _check_range(path: Path, pair: Pair, indices: Indices, counts: Mapping[str, int]) -> None:
+def _require_in_range(path: Path, pair: Pair, indices: Indices, counts: Mapping[str, int]) -> None:
     for name, column in zip(pair, indices.T, strict=True):
         wrong = column[(column < 0) | (column >= counts[name])]
         if len(wrong):
@@ -196,13 +160,13 @@ def _check_range(path: Path, pair: Pair, indices: Indices, counts: Mapping[str, 
             )
 
 
-def _read_keypoints(files: ForeignFiles, name: str, pixel_origin: str) -> Singles:
+def _read_keypoints(files: ForeignFiles, name: str) -> Singles:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
     source, key = files.features, files.keys[name]
     lafs, scales, oris = (f"{key}/{dataset}" for dataset in ("lafs", "scales", "oris"))
-    with np.errstate(over="ignore"):  # what float32 cannot hold is left out later
+    with np.errstate(over="ignore"):  # what float32 cannot hold is refused later
         points = source.read(files.keypoints_key(name), (None, 2)).astype(np.float32)
-        centers = np.asarray(colmap_from_pixel(points) if pixel_origin == "center" else points)
+        centers = np.asarray(colmap_from_pixel(points))
         count = len(points)
         if lafs in source.shapes:
             frames = source.read(lafs, (count, 2, 3)).astype(np.float64)
@@ -223,18 +187,15 @@ def export_h5(
     output_path: Path | None = None,
     database_path: Path | None = None,
     layout: str = "hloc",
-    half: bool = False,
     progress: Progress = SILENT,
 ) -> InterchangeReport:
-    """Write features and raw matches of an output folder of ours or a database, which stay so.
+    """Write features and raw matches of an output folder or a database, which stay as they are.
 
-    Features keep their indices. ``scales`` and ``oris`` are those of hloc: sigma in px, and degrees
-    from x towards y. Descriptors are of unit length. Scores, which a database does not have, are 1.
-
-    ``layout`` is ``hloc`` or ``dim``; with ``half`` all real numbers are float16, coordinates too.
-    Raises OptionError when a file exists, StoreError when the layout cannot hold the content.
+    Features keep their indices. Descriptors are of unit length. Scores, which a database does not
+    have, are 1. ``layout`` is ``hloc`` or ``dim``. Raises OptionError when a file exists,
+    StoreError when the layout cannot hold the content.
     """
-    _check_choice("layout", layout, tuple(LAYOUTS))
+    _check_layout(layout, tuple(LAYOUTS))
     if features_path.resolve() == matches_path.resolve():
         raise StoreError(f"{features_path}: features and matches need a file each")
     photographs = output_path and Workspace(output_path).photographs()
@@ -251,8 +212,6 @@ def export_h5(
             ):
                 for name in names:
                     size, data = content.features(name)
-                    if half:
-                        data = {key: values.astype(np.float16) for key, values in data.items()}
                     data["image_size"] = np.asarray(size)[:: form.size_step]
                     write(form.feature_key(name), data)
                     num_keypoints += len(data["keypoints"])
@@ -262,31 +221,22 @@ def export_h5(
                 progress.stage("matches", content.num_pairs, "pairs") as advance,
             ):
                 for pair in content.matches():
-                    kept = _one_match_per_keypoint(pair) if form.matches else pair
-                    write(*match_datasets(kept, form))
-                    num_matches += len(kept.indices)
-                    num_lost += len(pair.indices) - len(kept.indices)
+                    num_written = form.write_matches(write, pair)
+                    num_matches += num_written
+                    num_lost += len(pair.indices) - num_written
                     advance(1)
     notes = list(content.notes)
     if num_lost:
         notes.append(f"{num_lost} matches are left out: hloc's files hold one of each keypoint")
-    if half:
-        notes.append("coordinates are rounded: float16 has steps of 1 px from 1024 px on")
     return InterchangeReport(
         "exported", layout, len(names), num_keypoints, content.num_pairs, num_matches,
         None, tuple(notes),
     )  # fmt: skip
 
 
-def _one_match_per_keypoint(pair: PairMatches) -> PairMatches:
-    """Keep the first match of each keypoint of the first image: hloc's files have room for one."""
-    _, kept = np.unique(pair.indices[:, 0], return_index=True)
-    return replace(pair, indices=pair.indices[kept], scores=pair.scores[kept])
-
-
-def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    if value not in choices:
-        raise OptionError(f"{name} {value!r}: not one of {', '.join(choices)}")
+def _check_layout(layout: str, choices: Sequence[str]) -> None:
+    if layout not in choices:
+        raise OptionError(f"layout {layout!r}: not one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,13 @@
 """HDF5 files of other programs: safe access, and which image or pair each of their keys means.
 
-Three layouts are read, two are written; in all of them (0, 0) is the centre of the first pixel.
+In all layouts (0, 0) is the centre of the first pixel.
 
 ``hloc``
     Features: a group per image name, nested at '/', with ``keypoints`` (N, 2), ``descriptors``
     (D, N), ``scores`` (N,), ``image_size`` (width, height), and perhaps ``scales`` (N,) in sigmas,
     ``oris`` (N,) in degrees from x towards y, ``lafs`` (N, 2, 3). Matches: a group per pair with
     ``matches0`` (N0,), -1 where unmatched, and ``matching_scores0`` (N0,); in its key each '/'
-    of a name is '-', and '/' stands between the names ('_' in old files).
+    of a name is '-', and '/' stands between the names.
 ``dim`` (deep-image-matching)
     The same features by file name without folders, ``image_size`` as (height, width); matches
     [name 1][name 2] (M, 2). Also read without groups, as in the notebooks of the Image Matching
@@ -19,7 +19,7 @@ These files are not trusted: links and data in other files are refused, and arra
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -27,7 +27,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import OptionError, StoreError, damage, reason, such_as
+from colmap_affrect.errors import OptionError, StoreError, damage, such_as
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import refuse_colliding_keys
 from colmap_affrect.pairs.base import Pair
@@ -53,6 +53,17 @@ class Layout:
     pair_part: Callable[[str], str]  # what stands for that group in the key of a pair
     matches: str  # dataset in the group of a pair; empty where the key itself is a dataset
     size_step: int  # 1 where image_size is (width, height), -1 where it is (height, width)
+
+    def write_matches(self, write: Callable[[str, Datasets], None], pair: PairMatches) -> int:
+        """Write the matches of a pair, in hloc's files one of each keypoint; return how many."""
+        if not self.matches:
+            first, second = map(self.feature_key, pair.names)
+            write(first, {second: pair.indices})
+            return len(pair.indices)
+        _, kept = np.unique(pair.indices[:, 0], return_index=True)
+        one = replace(pair, indices=pair.indices[kept], scores=pair.scores[kept])
+        write(pair_key(*pair.names), hloc_matches(one))
+        return len(kept)
 
 
 LAYOUTS = {
@@ -100,12 +111,8 @@ def _opened(path: Path) -> Iterator[Source]:
     """Open a file for reading; links and data that lead out of it are refused."""
     if not path.is_file():
         raise OptionError(f"{path}: no such file")
-    try:
+    with damage(path, f"or still being written; {MEND}"):
         file = h5py.File(path, "r")
-    except OSError as error:
-        raise StoreError(
-            f"{path}: not an HDF5 file, damaged, or still being written ({reason(error)})"
-        ) from error
     with file:
         yield Source(path, file, _shapes(path, file))
 
@@ -229,35 +236,24 @@ def _name_pairs(
         raise StoreError(f"{source.path}: holds no 'matches0'; is it of another layout?")
     pairs: dict[Pair, str] = {}
     unknown, selves, again = [], [], []
-    for key in sorted(keys, key=lambda key: ("/" not in key, key)):
-        ways = _split_key(key, names)
-        if len(ways) > 1:
-            raise StoreError(f"{source.path}: {key} may be any of {listed(map(' + '.join, ways))}")
-        if not ways:
+    for key in sorted(keys):
+        parts = key.split("/")
+        if len(parts) != 2 or not names.keys() >= set(parts):
             unknown.append(key)
-        elif ways[0][0] == ways[0][1]:
+            continue
+        pair = names[parts[0]], names[parts[1]]
+        if pair[0] == pair[1]:
             selves.append(key)
-        elif ways[0] in pairs or ways[0][::-1] in pairs:
+        elif pair in pairs or pair[::-1] in pairs:
             again.append(key)
         else:
-            pairs[ways[0]] = key
+            pairs[pair] = key
     if unknown:
         raise StoreError(
             f"{source.path}: has matches of images that have no features: {listed(unknown)}"
         )
     notes = noted("pairs that are there twice, the second is left out", again)
     return pairs, notes + noted("images matched with themselves are left out", selves)
-
-
-def _split_key(key: str, names: Mapping[str, str]) -> list[Pair]:
-    """Return every way to read a key as two names."""
-    separator = "/" if "/" in key else "_"
-    parts = key.split(separator)
-    halves = (
-        (separator.join(parts[:count]), separator.join(parts[count:]))
-        for count in range(1, len(parts))
-    )
-    return [(names[a], names[b]) for a, b in halves if a in names and b in names]
 
 
 def _by_key(names: Iterable[str], layout: Layout) -> dict[str, list[str]]:
@@ -287,14 +283,6 @@ def check_names(names: Sequence[str], layout: Layout) -> None:
     folders = {str(parent) for key in groups for parent in PurePosixPath(key).parents}
     if both := sorted(folders & groups.keys()):
         raise StoreError(f"{both[0]}: is an image and the folder of another; rename it")
-
-
-def match_datasets(pair: PairMatches, layout: Layout) -> tuple[str, Datasets]:
-    """Return the group of a pair and its datasets."""
-    if layout.matches:
-        return pair_key(*pair.names), hloc_matches(pair)
-    first, second = map(layout.feature_key, pair.names)
-    return first, {second: pair.indices}
 
 
 @contextmanager

@@ -1,9 +1,8 @@
 """Functions with the names and signatures of pycolmap's, for scripts that call those.
 
-Arguments that say how photographs, cameras and pairs are read mean the same; options that describe
-SIFT keep their defaults or are refused (:mod:`.pycolmap_options`). What a database has no place for
-(descriptors, scores, the record of options) is kept in a folder beside it, ``x.affrect`` for
-``x.db``: it makes the functions go on where an earlier call stopped.
+Options that describe SIFT keep their defaults or are refused (:mod:`.pycolmap_options`). What a
+database has no place for is kept in a folder beside it, ``x.affrect`` for ``x.db``, with which the
+functions go on where an earlier call stopped.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any, TypedDict, Unpack
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
-from colmap_affrect.colmap.checks import FATAL, refuse_unusable
+from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
@@ -78,27 +77,17 @@ def extract_features(
     database_descriptors: bool = False,
     progress: Progress = SILENT,
 ) -> StageReport:
-    """Extract rectified features of photographs into a COLMAP database.
+    """Extract rectified features of photographs into a COLMAP database, which may be new.
 
     Images that have features already are passed over. One that cannot be read is named in the
-    report, and the others go on. Raises AffrectError for anything that the caller can mend.
+    report. Raises AffrectError for anything that the caller can mend. A cancelled token stops by
+    InterruptedError; what is done is kept. Other arguments are those of pycolmap, but
+    ``extraction_options`` are a recipe by name or path, its sections, or options; of pycolmap's,
+    the image size and where the work is done.
 
-    Args:
-        database_path: made if it is missing; one that has features of another program is refused.
-        image_path: folder of the photographs.
-        image_names: names below it; all images by default.
-        camera_mode: which images share a camera, as in pycolmap.
-        reader_options: as in pycolmap, with camera model and parameters, and masks.
-        extraction_options: name of a recipe, its path, its sections, or options; of pycolmap's,
-            the image size and where the work is done.
-        device: where networks run. As in pycolmap it overrules ``use_gpu``: ``auto`` is the CPU
-            where there is no GPU, and ``cuda`` is refused there.
-        cancellation_token: stops by InterruptedError when it is cancelled; what is done is kept.
-        from_database: begin ``database_path`` with the images, cameras, rigs, frames and pose
-            priors of this one, which stays as it is.
-        weights_path: folder with the weights of networks.
-        database_descriptors: write descriptors too, as COLMAP's matchers need them.
-        progress: where to show progress.
+    ``from_database``: begin ``database_path`` with the images, cameras, rigs, frames and pose
+    priors of this one, which stays as it is. ``weights_path``: folder with weights of networks.
+    ``database_descriptors``: write descriptors too, as COLMAP's matchers need them.
     """
     cameras, masks = translate.reader_options(reader_options, camera_mode)
     inputs = Inputs.of(
@@ -127,16 +116,10 @@ def match_exhaustive(
 ) -> Reports:
     """Match and verify all pairs of the images that :func:`extract_features` was given.
 
-    Args:
-        database_path: the same as there.
-        matching_options: ours, by default those of the recipe, of which a dictionary without
-            ``name`` changes some; of pycolmap's, what to verify and where the work is done.
-        pairing_options: as in pycolmap; the size of blocks does not change results.
-        verification_options: ours, or those of pycolmap, what differs from its defaults.
-        device: where matching runs, and networks of recipes that escalate; overrules ``use_gpu``,
-            see :func:`extract_features`.
-        cancellation_token: as in :func:`extract_features`.
-        ours: see :class:`Ours`.
+    ``matching_options`` are ours, by default those of the recipe, of which a dictionary without
+    ``name`` changes some; of pycolmap's, what to verify and where the work is done.
+    ``verification_options`` are ours, or what differs from pycolmap's defaults. Others are those of
+    pycolmap, and of :class:`Ours`.
     """
     translate.changes(pairing_options, pycolmap.ExhaustivePairingOptions, "pairing_options")
     given = (database_path, matching_options, verification_options, device, cancellation_token)
@@ -236,13 +219,12 @@ def verify(
     """Estimate the two-view geometries of the matched pairs of any database that lack one.
 
     As ``pycolmap.geometric_verification``, with the preset for sparse sets (or ``options``, ours or
-    those of pycolmap that have a counterpart). Every match is checked first, because one that
-    points at no keypoint ends the process inside COLMAP: DatabaseError. ``pairs_path`` lists the
-    pairs to verify, two names per line; all by default.
+    those of pycolmap that have a counterpart). DatabaseError where a match points at no keypoint.
+    ``pairs_path`` lists the pairs to verify, two names per line; all by default.
     """
     path, pairs = Path(database_path), None
     verification = translate.verification_options(options, random_seed)
-    refuse_unusable(path, FATAL | {"keypoints-not-finite"})
+    refuse_unusable(path)
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
         if pairs_path is not None:
             ids = image_ids(path)

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import FATAL, refuse_unusable
-from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.useless_keypoints import KINDS
+from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.interop.pycolmap_api import CANCELLED, Native, PathLike, Token
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -28,27 +26,16 @@ def incremental_mapping(
 ) -> dict[int, pycolmap.Reconstruction]:
     """Map any verified database by our mapper and write the models as pycolmap does.
 
-    Args:
-        database_path: COLMAP database with two-view geometries.
-        image_path: folder of the photographs, for the colours of the points; empty for none.
-        output_path: models are written to 0, 1, ... in it, or, with ``input_path``, into it.
-        options: what differs from pycolmap's defaults wins over our preset for sparse sets.
-        input_path: a model to be extended. Its poses and cameras stay with ``fix_existing_frames``.
-        initial_image_pair_callback: called when a first pair is registered.
-        next_image_callback: called for every further image.
-        cancellation_token: stops mapping when it is cancelled, by InterruptedError as in pycolmap.
-
-    Returns:
-        The models by the number of their folder, largest first.
+    ``options`` that differ from pycolmap's defaults win over our preset for sparse sets. Models are
+    written to 0, 1, ... in ``output_path``, or, with ``input_path``, a model to be extended, into
+    it; they are returned by the number of their folder, largest first. A cancelled token stops by
+    InterruptedError.
     """
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
     mapper = MAPPERS.make(translate.mapper_options(native))
     database, output = Path(database_path), Path(output_path)
-    has_useless = not refuse_unusable(database).keys().isdisjoint(KINDS)
+    refuse_unusable(database)
     with temporary_folder(output) as folder:
-        if has_useless:  # it stays as it is
-            copy_database(database, folder / "database.db", FATAL)
-            database = folder / "database.db"
         existing = None
         if translate.given_path(input_path):
             extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)

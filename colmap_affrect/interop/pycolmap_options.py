@@ -1,7 +1,7 @@
 """What pycolmap's option objects, or nested dictionaries of their fields, ask of us.
 
-A field that keeps pycolmap's default asks for nothing: ours stays. One that differs is honoured
-where :data:`HONOURED` has it, and refused by its name elsewhere.
+A field that keeps pycolmap's default asks for nothing. One that differs is honoured where
+:data:`HONOURED` has it, and refused by its name elsewhere.
 """
 
 from collections.abc import Mapping

@@ -4,11 +4,8 @@ A matcher of another package becomes known by an entry point of the group
 ``colmap_affrect.matchers``. Several threads may call the same object at once.
 """
 
-import logging
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -16,14 +13,8 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.features.base import NetworkContext, NetworkOptions
 from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.options import Registry
-from colmap_affrect.parallel.executor import unless_gpu_is_full
 
-logger = logging.getLogger(__name__)
-
-_SAID = threading.Lock()  # taken, and never given back, by the thread that warns
 ROUNDING = np.float32(1e-6)  # similarities that near to 1 are equal: two copies have ratio 1
-
-Found = TypeVar("Found")
 
 
 class MatcherOptions(NetworkOptions):
@@ -105,14 +96,3 @@ def distance_ratios(first: Singles, second: Singles) -> Singles:
     """Return the ratios of distances of unit vectors with these similarities."""
     distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
     return np.asarray(np.sqrt(np.divide(*distances)))
-
-
-def unless_gpu_is_full_or_say(with_gpu: Callable[[], Found], without: Callable[[], Found]) -> Found:
-    """Return what is done on a GPU, or without it where its memory is full; warn once."""
-
-    def warn_and_go_on() -> Found:
-        if _SAID.acquire(blocking=False):
-            logger.warning("the memory of the GPU is full; the CPU matches the rest")
-        return without()
-
-    return unless_gpu_is_full(with_gpu, warn_and_go_on)

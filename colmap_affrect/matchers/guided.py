@@ -5,9 +5,9 @@ among these few many more pass the ratio test, which gives more tracks through t
 Features of image 1 are compared in groups whose epipolar lines (or places) lie close together.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
 from colmap_affrect.geometry.epipolar import (
     EpipolarModel,
     HomographyModel,
-    PairModel,
     common_sign,
     epipolar_lines,
 )
@@ -76,27 +75,11 @@ class GuidableImage:
         return self.shapes is not None and len(self.shapes) > 0 and vary_singly(self.shapes)
 
 
-class Guide(Protocol):
-    """What the geometry of a pair says about matches of its features."""
-
-    @property
-    def model(self) -> PairModel:
-        """The geometry."""
-
-    def groups(self) -> Iterator[tuple[Indices, Indices]]:
-        """Yield features of image 1, each once, and all of image 2 that any of these may match."""
-
-    def allowed(self, rows: Indices, columns: Indices) -> Bools:
-        """Tell which of (R,) and (C,) features may match, (R, C)."""
-
-    def beside(self) -> "Sequence[Guide]":
-        """Return the geometry with image 2 moved away, so that in one of them nothing is right."""
-
-
 class EpipolarGuide:
     """Matches lie within a band around epipolar lines (Sampson's distance).
 
     Both images are brought to unit size, which keeps angles around far epipoles apart.
+    ``model`` is the geometry.
     """
 
     def __init__(self, fundamental: Array, points1: Array, points2: Array, band_px: float) -> None:
@@ -136,7 +119,10 @@ class EpipolarGuide:
         self._reach2 = inverse2, np.sqrt(self._squares1) * inverse2
 
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
-        """Sort by reach, then by angle: near the epipole lines fan out."""
+        """Yield features of image 1, each once, and all of image 2 that any of these may match.
+
+        Sorted by reach, then by angle: near the epipole lines fan out.
+        """
         order, edges = _sorted_within(np.log2(self._reach1[0]), self._angles1)
         order2, edges2 = _sorted_within(2.0 * np.log2(self._reach2[0]), self._angles2)
         classes = [_Pencil.of(part, self) for part in np.split(order2, edges2) if len(part)]
@@ -147,13 +133,13 @@ class EpipolarGuide:
             yield rows, np.concatenate([np.zeros(0, np.int64), *near])
 
     def allowed(self, rows: Indices, columns: Indices) -> Bools:
-        """See :class:`Guide`."""
+        """Return which of (R,) and (C,) features may match, (R, C)."""
         residuals = self._lines2[rows] @ self._homogeneous2[columns].T
         squares = self._squares2[rows, None] + self._squares1[columns]
         return np.asarray(residuals**2 <= self._band**2 * squares)
 
     def beside(self) -> "list[EpipolarGuide]":
-        """See :class:`Guide`; image 2 moves across most epipolar lines."""
+        """Return the geometry with image 2 moved away, across most epipolar lines."""
         points1, points2 = self.model.points
         normals = self._lines2[:, :2] / np.sqrt(np.maximum(self._squares2, TINY))[:, None]
         normals = normals[np.isfinite(normals).all(axis=1)]
@@ -173,7 +159,7 @@ class HomographyGuide:
         self._radius = BANDS_OF_HOMOGRAPHY * band_px
 
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
-        """See :class:`Guide`; a group is a part of a strip of image 2."""
+        """Yield the same as :meth:`EpipolarGuide.groups`; a group is a part of a strip."""
         points2, radius = self._points2, self._radius
         order2 = np.argsort(points2[:, 1])[: np.isfinite(points2).all(axis=1).sum()]
         if not len(order2):
@@ -190,17 +176,23 @@ class HomographyGuide:
             yield rows, order2[part][(x[part] >= lowest[0]) & (x[part] <= highest[0])]
 
     def allowed(self, rows: Indices, columns: Indices) -> Bools:
-        """See :class:`Guide`."""
+        """Return which of (R,) and (C,) features may match, (R, C)."""
         return _within(self._places[rows], self._points2[columns], self._radius)
 
     def beside(self) -> "list[HomographyGuide]":
-        """See :class:`Guide`; what lies before or behind the plane is along one direction only."""
+        """Return geometries that are moved away: in one of them nothing is right.
+
+        What lies before or behind the plane is along one direction only.
+        """
         points1, points2 = self.model.points
         steps = BANDS_BESIDE * self._band_px * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
         return [
             HomographyGuide(self.model.matrix, points1, points2 + step, self._band_px)
             for step in steps
         ]
+
+
+Guide = EpipolarGuide | HomographyGuide  # what the geometry of a pair says about matches
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ matched, and the matches united.
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -32,14 +33,14 @@ from colmap_affrect.matchers.base import (
     MatcherContext,
     MatcherOptions,
     Matches,
-    unless_gpu_is_full_or_say,
 )
 from colmap_affrect.options import within
-from colmap_affrect.parallel.executor import one_openmp_thread
+from colmap_affrect.parallel.executor import one_openmp_thread, unless_gpu_is_full
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
+    from torch import Tensor, nn
+
+logger = logging.getLogger(__name__)
 
 MIN_VIEW_FEATURES = 8  # of a view: no geometry could be verified by what fewer add
 TRAINING_SIZE_PX = 1024  # longer side in training, whose pixels scales of features are in
@@ -48,17 +49,16 @@ CHUNK_ROWS = 1 << 10  # features whose similarities are held at once, which boun
 DUPLICATE_RADIUS_PX = 2.0  # of nearer matches of several views, at both ends, the best stays
 
 
-@dataclass(frozen=True)
-class Training:
+class Training(NamedTuple):
     """What weights were trained for."""
 
     weights: str  # key of the file
     kind: str  # of the features that they take
-    recipe: str  # with such features, and what is to be changed in it
+    recipe: str  # with such features
     has_circles: bool = True  # whether frames are circles of one radius in the view, upright
 
 
-TRAININGS: dict[str, Training] = {
+TRAININGS = {
     "aliked": Training("lightglue-aliked", "aliked", "aliked-lightglue"),
     "disk": Training("lightglue-disk", "disk", "disk-lightglue"),
     "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat-lighterglue"),
@@ -66,21 +66,14 @@ TRAININGS: dict[str, Training] = {
     "dog-affnet-hardnet": Training(
         "lightglue-dog-affnet-hardnet", "dog-affnet-hardnet", "dog-affnet-hardnet-lightglue", False
     ),
-    "keynet-affnet-hardnet": Training(
-        "lightglue-keynet-affnet-hardnet", "keynet-affnet-hardnet",
-        "dog-affnet-hardnet-lightglue --set features.detector=keynet "
-        "--set matching.trained_for=keynet-affnet-hardnet", False,
-    ),
-}  # fmt: skip
+}
 
 
 class LightGlueOptions(MatcherOptions):
     """LightGlue, and LighterGlue for XFeat; defaults are those of LightGlue's authors."""
 
     name: Literal["lightglue"] = "lightglue"
-    trained_for: Literal[
-        "aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet", "keynet-affnet-hardnet"
-    ] = "aliked"
+    trained_for: Literal["aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet"] = "aliked"
     """Features that the weights were trained for."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of each view that are matched, those of the largest responses."""
@@ -93,8 +86,6 @@ class LightGlueOptions(MatcherOptions):
     max_num_view_pairs: Annotated[int, within(0, 1_000_000)] = 8
     """Of images with warps: pairs of views that are matched, those with most mutual nearest
     neighbours; 0: all."""
-    half_precision: bool = False
-    """Mixed precision on a GPU; a CPU keeps to 32 bits."""
 
     @property
     def weights(self) -> tuple[str, ...]:
@@ -119,7 +110,7 @@ class PreparedView:
     """One view of an image as the network takes it."""
 
     rows: Indices  # (N,) of the image's features
-    inputs: dict[str, Tensor]  # the network's, a batch of one, on its device
+    inputs: dict[str, Tensor]  # the network's, a batch of one
 
 
 @dataclass(frozen=True)
@@ -131,7 +122,7 @@ class PreparedViews:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all arrays, on whatever device."""
+        """Memory of all arrays."""
         tensors = (tensor for view in self.views for tensor in view.inputs.values())
         return self.keypoints.nbytes + sum(tensor.nbytes for tensor in tensors)
 
@@ -152,13 +143,11 @@ class LightGlue:
         self.options, self.training = options, TRAININGS[options.trained_for]
         self._path = context.weights[self.training.weights]
         self._device = resolve_device(context.device)
-        on_gpu = self._device.type != "cpu"
-        network = load_network(self._path, options, mixed=options.half_precision and on_gpu)
-        self._network = network.to(self._device)
+        self._network = load_network(self._path, options).to(self._device)
         self._gpu_lock = threading.Lock()
 
     def prepare(self, image: ImageFeatures) -> PreparedViews:
-        """Bring the features of each view into its own coordinates, and onto the device."""
+        """Bring the features of each view into its own coordinates."""
         self.options.require_extractor(image.extractor)
         features = image.features
         views = []
@@ -168,27 +157,21 @@ class LightGlue:
                 continue
             order = np.argsort(-features.responses[rows], kind="stable")
             rows = np.sort(rows[order[: self.options.max_num_features]])
-            views.append(self._view(features.select(rows), rows, image.image_size))
+            views.append(PreparedView(rows, self._inputs(features.select(rows), image.image_size)))
         return PreparedViews(tuple(views), features.keypoints)
 
-    def _view(
-        self, features: LocalFeatures, rows: Indices, image_size: tuple[int, int]
-    ) -> PreparedView:
+    def _inputs(self, features: LocalFeatures, image_size: tuple[int, int]) -> dict[str, Tensor]:
         import torch
 
         lafs, size = features.lafs, np.asarray(image_size, np.float64)
         if features.rectification_ids[0]:
             lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
         values = network_inputs(lafs, size, max(image_size), self.options.trained_for)
-        inputs = {
+        values["descriptors"] = features.descriptors
+        return {
             name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
-            for name, array in (values | {"descriptors": features.descriptors}).items()
+            for name, array in values.items()
         }
-        moved = unless_gpu_is_full_or_say(
-            lambda: {name: tensor.to(self._device) for name, tensor in inputs.items()},
-            lambda: inputs,
-        )
-        return PreparedView(rows, moved)
 
     def match(self, first: PreparedViews, second: PreparedViews) -> Matches:
         """Match two images; scores are the network's."""
@@ -200,46 +183,39 @@ class LightGlue:
         return parts[0] if len(parts) == 1 else united(parts, first.keypoints, second.keypoints)
 
     def _match_views(self, first: PreparedView, second: PreparedView) -> Matches:
-        import torch
-
         if not len(first.rows) or not len(second.rows):
             return Matches.none()
-        pair = {"image0": first.inputs, "image1": second.inputs}
-        rows, columns, scores = unless_gpu_is_full_or_say(
-            lambda: self._run(self._network, pair, self._device),
-            lambda: self._run(self._network_on_cpu, pair, torch.device("cpu")),
+        rows, columns, scores = unless_gpu_is_full(
+            lambda: self._run(self._network, first, second),
+            lambda: self._run(self._network_on_cpu, first, second),
         )
         return Matches(np.stack([first.rows[rows], second.rows[columns]], axis=1), scores)
 
-    def _run(
-        self, network: torch.nn.Module, pair: dict[str, dict[str, Tensor]], device: torch.device
-    ) -> tuple[Indices, Indices, Singles]:
+    def _run(self, network: nn.Module, *views: PreparedView) -> tuple[Indices, Indices, Singles]:
         import torch
 
+        device = next(network.parameters()).device
         on_gpu = device.type != "cpu"
         torch.get_num_threads()  # lets torch set up this thread, which would undo the next line
         limit = nullcontext() if on_gpu else one_openmp_thread()
         with torch.inference_mode(), limit, self._gpu_lock if on_gpu else nullcontext():
-            there = {
-                image: {name: tensor.to(device) for name, tensor in inputs.items()}
-                for image, inputs in pair.items()
-            }
-            found = network(there)
+            found = network({
+                f"image{k}": {name: tensor.to(device) for name, tensor in view.inputs.items()}
+                for k, view in enumerate(views)
+            })  # fmt: skip
             rows, columns = found["matches"][0].cpu().numpy().T
             scores = found["scores"][0].float().cpu().numpy()
         order = np.argsort(rows, kind="stable")
         return rows[order], columns[order], scores[order]
 
     @cached_property
-    def _network_on_cpu(self) -> torch.nn.Module:
+    def _network_on_cpu(self) -> nn.Module:
+        logger.warning("the memory of the GPU is full; the CPU matches what does not fit")
         return load_network(self._path, self.options)
 
 
-def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) -> torch.nn.Module:
-    """Build kornia's LightGlue with the parameters in a file, all of them, else WeightsError.
-
-    With ``mixed`` precision kornia computes in 16 bits where that is safe.
-    """
+def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
+    """Build kornia's LightGlue with the parameters in a file, all of them, else WeightsError."""
     from kornia.feature import LightGlue as Network
 
     configuration = {
@@ -248,7 +224,6 @@ def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) 
         "depth_confidence": options.depth_confidence,
         "width_confidence": options.width_confidence,
         "filter_threshold": options.min_score,
-        "mp": mixed,
     }
     network = Network(features=None, **configuration)  # type: ignore[arg-type]
     state = {renamed(name): value for name, value in load_state_dict(path).items()}
@@ -303,8 +278,6 @@ def network_inputs(
     the sense of training: COLMAP's of SIFT, else kornia's.
     """
     values = {"keypoints": np.clip(lafs[:, :, 2], 0.0, size), "image_size": size}
-    if trained_for == "keynet-affnet-hardnet":
-        values["lafs"] = lafs
     if trained_for not in ("sift", "dog-affnet-hardnet"):
         return values
     sigmas = np.sqrt(determinants(lafs[:, :, :2])) / MEASUREMENT_SIGMAS
@@ -319,18 +292,15 @@ def promising(
     first: Sequence[PreparedView], second: Sequence[PreparedView], count: int
 ) -> list[tuple[PreparedView, PreparedView]]:
     """Return the pairs of views with most mutual nearest neighbours among all features."""
-    descriptors1, descriptors2 = (
-        np.concatenate([view.inputs["descriptors"][0].cpu().numpy() for view in views])
-        for views in (first, second)
-    )
-    views1, views2 = (
-        np.repeat(np.arange(len(views)), [len(view.rows) for view in views])
-        for views in (first, second)
-    )
+    descriptors, numbers = [], []
+    for views in (first, second):
+        descriptors.append(np.concatenate([v.inputs["descriptors"][0].numpy() for v in views]))
+        numbers.append(np.repeat(np.arange(len(views)), [len(view.rows) for view in views]))
+    views1, views2 = numbers
     nearest1 = np.empty(len(views1), np.int64)
     nearest2, closest = np.zeros(len(views2), np.int64), np.full(len(views2), -np.inf)
     for start in range(0, len(views1), CHUNK_ROWS):
-        similarities = descriptors1[start : start + CHUNK_ROWS] @ descriptors2.T
+        similarities = descriptors[0][start : start + CHUNK_ROWS] @ descriptors[1].T
         nearest1[start : start + CHUNK_ROWS] = similarities.argmax(axis=1)
         best = similarities.max(axis=0)
         nearest2 = np.where(best > closest, start + similarities.argmax(axis=0), nearest2)
@@ -351,11 +321,9 @@ def united(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matche
     order = np.argsort(-scores, kind="stable")
     indices, scores = indices[order], scores[order]
     for column in (0, 1):  # the best match of each feature, in both images
-        _, best = np.unique(indices[:, column], return_index=True)
-        best.sort()
+        best = np.sort(np.unique(indices[:, column], return_index=True)[1])
         indices, scores = indices[best], scores[best]
     places = keypoints1[indices[:, 0]], keypoints2[indices[:, 1]]
     kept = without_duplicates(*places, DUPLICATE_RADIUS_PX)
-    indices, scores = indices[kept], scores[kept]
-    rising = np.argsort(indices[:, 0])
+    rising = kept[np.argsort(indices[kept, 0])]
     return Matches(indices[rising], scores[rising])

@@ -6,8 +6,7 @@ features of several warps at one location do not reject each other. All descript
 in chunks of bounded memory; many at first coarsely (:mod:`colmap_affrect.matchers.nearest_8bit`).
 """
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,13 +19,11 @@ from colmap_affrect.matchers.base import (
     MatcherOptions,
     Matches,
     distance_ratios,
-    unless_gpu_is_full_or_say,
 )
 from colmap_affrect.matchers.nearest_8bit import (
     CoarseDescriptors,
-    MakeCoarse,
     ShortList,
-    coarse_descriptors,
+    coarse_pays,
     short_lists,
 )
 from colmap_affrect.options import within
@@ -61,47 +58,36 @@ class MatchableImage:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all arrays, on whatever device."""
+        """Memory of all arrays."""
         kept = (self.descriptors, self.keypoints, self.rivals.starts, self.rivals.indices)
         return sum(array.nbytes for array in kept) + (self.coarse.nbytes if self.coarse else 0)
 
 
 class NearestNeighbors:
-    """Compares all descriptors; where the memory of a GPU is full, a CPU does, just the same."""
+    """Compares all descriptors, on the CPU."""
 
     Options = NearestOptions
 
     def __init__(self, options: NearestOptions, context: MatcherContext) -> None:
-        self.options = options
-        self._make_coarse = coarse_descriptors(context.num_similarities, context.device)
+        self.options, self._is_coarse = options, coarse_pays(context.num_similarities)
 
     def prepare(self, image: ImageFeatures) -> MatchableImage:
         """Make the features of an image ready for matching."""
         descriptors, keypoints = image.features.descriptors, image.features.keypoints
-        return unless_gpu_is_full_or_say(
-            partial(matchable, descriptors, keypoints, self.options, self._make_coarse),
-            partial(matchable, descriptors, keypoints, self.options),
-        )
+        return matchable(descriptors, keypoints, self.options, is_coarse=self._is_coarse)
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
         """Match two images."""
-        exact1, exact2 = (replace(image, coarse=None) for image in (first, second))
-        return unless_gpu_is_full_or_say(
-            partial(match_features, first, second, self.options),
-            partial(match_features, exact1, exact2, self.options),
-        )
+        return match_features(first, second, self.options)
 
 
 def matchable(
-    descriptors: Floats,
-    keypoints: Floats,
-    options: NearestOptions,
-    make_coarse: MakeCoarse | None = None,
+    descriptors: Floats, keypoints: Floats, options: NearestOptions, *, is_coarse: bool = False
 ) -> MatchableImage:
-    """Prepare (N, D) unit descriptors at (N, 2) px; ``make_coarse`` is the same for all images."""
+    """Prepare (N, D) unit descriptors at (N, 2) px; all images are coarse, or none."""
     descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
     rivals = neighbors_within(keypoints, options.min_contrast_distance_px)
-    coarse = make_coarse(descriptors) if make_coarse else None
+    coarse = CoarseDescriptors.of(descriptors) if is_coarse else None
     return MatchableImage(descriptors, keypoints, rivals, coarse)
 
 

@@ -1,4 +1,4 @@
-"""Short lists for the ratio test, by similarities of descriptors in 8 bits (CPU) or 16 bits (GPU).
+"""Short lists for the ratio test, by similarities of descriptors in 8 bits.
 
 Few features pass the test. Coarse similarities say which may, and which features may be their two
 nearest neighbours; only these are compared exactly. Six standard deviations of the rounding error
@@ -9,10 +9,10 @@ torch is loaded here, when there is enough to match to pay for that.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache, partial
-from typing import Any, ClassVar, Self
+from functools import cache
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,11 @@ from colmap_affrect.parallel.executor import available_cores, one_openmp_thread
 MIN_SIMILARITIES_PER_CORE = 6e8  # with fewer, loading torch takes longer than it saves
 ERROR_SIGMAS = 6.0  # of the rounding error, allowed for on each side
 MAX_CODE, ZERO_CODE = 127, 128  # largest signed code; code 0 as an unsigned one
-CODE_STEP = 1.0 / 250  # of 8-bit similarities: negative ones become 0, errors exceed 1 a little
+CODE_STEP = 1.0 / 250  # of similarities: negative ones become 0, errors exceed 1 a little
+NUM_ROWS = 512  # compared at once, a multiple of ``SIZE_MULTIPLE``
 SIZE_MULTIPLE = 256
 """Both factors of a product are padded to a multiple of it: oneDNN prepares and keeps a program
 for every size, and many sizes take memory and time."""
-HALF_ERROR = 2.0**-11  # standard deviation, rounded up, of similarities in 16 bits
-TAKEN_OUT = -4.0  # less than any similarity
 
 
 @dataclass(frozen=True)
@@ -43,70 +42,13 @@ class ShortList:
     entry_columns: Indices  # (E,) int64 features of the second image, rising in each row
 
 
-class ByteSimilarities:
-    """(R, N) similarities as 8-bit codes, on the CPU."""
-
-    def __init__(self, codes: Bytes) -> None:
-        self.codes = codes
-
-    def largest(self) -> tuple[Indices, Indices]:
-        """Return the column of a largest similarity of each row, and its code."""
-        columns = self.codes.argmax(axis=1)
-        return columns, self.codes[np.arange(len(columns)), columns].astype(np.int64)
-
-    def take_out(self, rows: Indices, columns: Indices) -> Bytes:
-        """Make some similarities 0; return what they were."""
-        before = self.codes[rows, columns]
-        self.codes[rows, columns] = 0
-        return before
-
-    def at_least(self, rows: Indices, least: Singles) -> tuple[Indices, Indices]:
-        """Return where some rows reach a limit each: indices into ``rows``, and columns."""
-        above = self.codes[rows] >= np.maximum(least, 1).astype(np.uint8)[:, None]
-        index, columns = np.divmod(np.flatnonzero(above), above.shape[1])
-        return index, columns
-
-
-class HalfSimilarities:
-    """(R, N) similarities in 16 bits on a GPU; methods as those of :class:`ByteSimilarities`."""
-
-    def __init__(self, values: Any) -> None:
-        self.values = values
-
-    def _there(self, array: NDArray[Any]) -> Any:
-        import torch
-
-        return torch.from_numpy(array).to(self.values.device)
-
-    def largest(self) -> tuple[Indices, Singles]:
-        """See :class:`ByteSimilarities`."""
-        values, columns = self.values.max(dim=1)
-        return columns.cpu().numpy(), values.float().cpu().numpy()
-
-    def take_out(self, rows: Indices, columns: Indices) -> Singles:
-        """See :class:`ByteSimilarities`."""
-        places = self._there(rows), self._there(columns)
-        before = self.values[places].float().cpu().numpy()
-        self.values[places] = TAKEN_OUT
-        return np.asarray(before)
-
-    def at_least(self, rows: Indices, least: Singles) -> tuple[Indices, Indices]:
-        """See :class:`ByteSimilarities`."""
-        above = self.values[self._there(rows)] >= self._there(least.astype(np.float32))[:, None]
-        index, columns = (found.cpu().numpy() for found in above.nonzero(as_tuple=True))
-        return index, columns
-
-
 @dataclass(frozen=True)
-class EightBitDescriptors:
-    """Descriptors as signed 8-bit numbers, on the CPU."""
+class CoarseDescriptors:
+    """Descriptors as signed 8-bit numbers."""
 
     codes: NDArray[np.int8]  # (N, D) descriptors divided by ``step`` and rounded
     packed: Any  # the same as the second factor of products
     step: float  # the largest value over 127
-
-    num_rows: ClassVar[int] = 512  # compared at once, a multiple of ``SIZE_MULTIPLE``
-    unit: ClassVar[float] = CODE_STEP  # of similarities
 
     @classmethod
     def of(cls, descriptors: Singles) -> Self:
@@ -120,103 +62,60 @@ class EightBitDescriptors:
         """Memory they take."""
         return 2 * self.codes.nbytes
 
-    def margin(self, other: Self) -> float:
-        """Return the error of a similarity that is allowed for."""
-        # A rounding error is uniform: its standard deviation is a step over the root of 12.
-        return ERROR_SIGMAS * math.hypot(self.step, other.step, CODE_STEP) / math.sqrt(12)
 
-    def similarities(self, rows: Indices, other: Self) -> ByteSimilarities:
-        """Compare some features with all of another image."""
-        unit = self.step * other.step
-        return ByteSimilarities(_similarity_codes(self.codes[rows], other.packed, unit))
-
-
-@dataclass(frozen=True)
-class HalfDescriptors:
-    """Descriptors as 16-bit floating point numbers, on a GPU."""
-
-    values: Any  # (N, D) tensor
-
-    num_rows: ClassVar[int] = 4096  # compared at once
-    unit: ClassVar[float] = 1.0  # of similarities
-
-    @classmethod
-    def of(cls, descriptors: Singles, device: str) -> Self:
-        """Copy (N, D) unit rows to a device."""
-        import torch
-
-        return cls(torch.from_numpy(descriptors).to(device, torch.float16))
-
-    @property
-    def nbytes(self) -> int:
-        """Memory they take."""
-        return int(self.values.nbytes)
-
-    def margin(self, other: Self) -> float:
-        """Return the error of a similarity that is allowed for."""
-        del other
-        return ERROR_SIGMAS * HALF_ERROR
-
-    def similarities(self, rows: Indices, other: Self) -> HalfSimilarities:
-        """Compare some features with all of another image."""
-        import torch
-
-        chosen = self.values[torch.from_numpy(rows).to(self.values.device)]
-        return HalfSimilarities(chosen @ other.values.T)
-
-
-CoarseDescriptors = EightBitDescriptors | HalfDescriptors
-MakeCoarse = Callable[[Singles], CoarseDescriptors]  # makes coarse descriptors of (N, D) unit rows
-
-
-def coarse_descriptors(num_similarities: float, device: str = "auto") -> MakeCoarse | None:
-    """Return what makes coarse descriptors; None where they do not pay.
-
-    ``num_similarities`` are those of all pairs of features to come; the device ``auto`` asks for a
-    GPU only when there is enough to do.
-    """
-    enough = MIN_SIMILARITIES_PER_CORE * available_cores()
-    if device in ("auto", "cpu") and num_similarities < enough:
-        return None
-    from colmap_affrect.features.networks import resolve_device
-
-    resolved = resolve_device(device)
-    if resolved.type != "cpu":
-        return partial(HalfDescriptors.of, device=str(resolved))
-    return EightBitDescriptors.of if has_fast_8_bit_products() else None
+def coarse_pays(num_similarities: float) -> bool:
+    """Return whether coarse similarities save time, for those of all pairs of features to come."""
+    enough = num_similarities >= MIN_SIMILARITIES_PER_CORE * available_cores()
+    return enough and has_fast_8_bit_products()
 
 
 def short_lists(
-    first: Any, second: Any, rows: Indices, rivals: NeighborLists, max_ratio: float
+    first: CoarseDescriptors,
+    second: CoarseDescriptors,
+    rows: Indices,
+    rivals: NeighborLists,
+    max_ratio: float,
 ) -> Iterator[ShortList]:
-    """Compare some features of one image (``rows``) with all of another, both of one class.
+    """Compare some features of one image (``rows``) with all of another.
 
     ``rivals`` has for each feature of the other image those too close to be its second neighbour,
     ``max_ratio`` limits the ratio of the distances to the first and the second neighbour.
     """
-    margin = first.margin(second)
-    width = 2.0 * margin / first.unit
-    for begin in range(0, len(rows), first.num_rows):
-        similarities = first.similarities(rows[begin : begin + first.num_rows], second)
-        best, highest = similarities.largest()
+    # A rounding error is uniform: its standard deviation is a step over the root of 12.
+    margin = ERROR_SIGMAS * math.hypot(first.step, second.step, CODE_STEP) / math.sqrt(12)
+    width = 2.0 * margin / CODE_STEP
+    unit = first.step * second.step
+    for begin in range(0, len(rows), NUM_ROWS):
+        chosen = first.codes[rows[begin : begin + NUM_ROWS]]
+        codes = _similarity_codes(chosen, second.packed, unit)
+        best, highest = _largest(codes)
         of_best = rivals.of(best)
-        is_close = similarities.take_out(*of_best) >= highest[of_best[0]] - width
-        runners_up, second_highest = similarities.largest()
+        is_close = codes[of_best] >= highest[of_best[0]] - width
+        codes[of_best] = 0
+        runners_up, second_highest = _largest(codes)
         doubtful = _is_hidden(best, runners_up, of_best, is_close, rivals)
         doubtful |= second_highest <= width  # codes have no negative similarities
-        nearer, farther = first.unit * highest, first.unit * second_highest
+        nearer, farther = CODE_STEP * highest, CODE_STEP * second_highest
         # sqrt((1 - nearer) / (1 - farther)) may be below the limit
         passing = 1.0 - nearer - margin < max_ratio**2 * (1.0 - farther + margin)
         may = np.flatnonzero(passing | doubtful)
         if not len(may):
             continue
-        near = similarities.at_least(may, np.maximum(second_highest[may] - width, HALF_ERROR))
+        least = np.maximum(second_highest[may] - width, 1).astype(np.uint8)
+        above = np.flatnonzero(codes[may] >= least[:, None])
+        near = np.divmod(above, codes.shape[1])
         parts = zip(near, rivals.of(best[may]), strict=True)
         entry_rows, columns = (np.concatenate(part) for part in parts)
         entries = np.sort(entry_rows << 32 | columns)  # far faster than an order by two keys
         yield ShortList(
             begin + may, runners_up[may], doubtful[may], entries >> 32, entries & 0xFFFF_FFFF
         )
+
+
+def _largest(codes: Bytes) -> tuple[Indices, Indices]:
+    """Return the column of a largest code of each row, and the code."""
+    columns = codes.argmax(axis=1)
+    return columns, codes[np.arange(len(columns)), columns].astype(np.int64)
 
 
 def _is_hidden(

@@ -8,13 +8,11 @@ results are the same as here, because it must have the same versions of the pack
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import logging
 import pickle
 import platform
 import re
 import threading
-import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -38,9 +36,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT_S = 10.0
-POLL_S = 2.0  # how often the scheduler is asked for the number of workers
+POLL_S = 2.0  # how often to look whether there are workers at all
 TASKS_PER_THREAD = 2  # one that is being worked on and one that waits, so that no worker has to
-FINGERPRINT_BYTES = 1 << 16
 
 PACKAGES = (
     "colmap-affrect", "distributed", "numpy", "opencv-python-headless", "torch", "kornia",
@@ -50,11 +47,11 @@ PACKAGES = (
 
 @dataclass(frozen=True)
 class WorkerEnvironment:
-    """What results depend on besides the task: versions of ``PACKAGES``, fingerprints of paths."""
+    """What results depend on besides the task: versions of ``PACKAGES``, and sizes of files."""
 
     host: str
     versions: tuple[tuple[str, str], ...]
-    files: tuple[tuple[str, str], ...]
+    files: tuple[tuple[str, int], ...]
 
     @classmethod
     def of(cls, paths: Sequence[str]) -> Self:
@@ -62,7 +59,7 @@ class WorkerEnvironment:
         return cls(
             platform.node(),
             tuple((name, _version(name)) for name in PACKAGES),
-            tuple((path, _fingerprint(Path(path))) for path in paths),
+            tuple((path, _size(Path(path))) for path in paths),
         )
 
     def require_same(self, worker: WorkerEnvironment) -> None:
@@ -73,12 +70,11 @@ class WorkerEnvironment:
                     f"worker on {worker.host}: has {name} {there}, and the machine that leads the "
                     f"work {here}; results could differ, install the same versions on both"
                 )
-        for (path, here), (_, there) in zip(self.files, worker.files, strict=True):
-            if here != there:
-                raise ClusterError(
-                    f"worker on {worker.host}: does not see {path}, as the workers before did; "
-                    "mount it there, or end that worker, and run the same command again"
-                )
+        if other := set(self.files) - set(worker.files):
+            raise ClusterError(
+                f"worker on {worker.host}: does not see {min(other)[0]} as this machine does; put "
+                "it on storage that all machines share, under the same path"
+            )
 
 
 def _version(package: str) -> str:
@@ -89,16 +85,12 @@ def _version(package: str) -> str:
         return "missing"
 
 
-def _fingerprint(path: Path) -> str:
-    """Return what the content of a file or folder can be known by, '' for a missing one."""
+def _size(path: Path) -> int:
+    """Return the size of a file in bytes, 0 for a folder, -1 for what is not there."""
     try:
-        if path.is_dir():
-            return "folder"
-        with path.open("rb") as file:
-            start = hashlib.sha256(file.read(FINGERPRINT_BYTES)).hexdigest()
-            return f"{file.seek(0, 2)} {start}"
+        return 0 if path.is_dir() else path.stat().st_size
     except OSError:
-        return ""
+        return -1
 
 
 @dataclass(frozen=True)
@@ -203,15 +195,12 @@ def _require_scheduler(address: str, security: Security) -> None:
 @contextmanager
 def _silent(package: str) -> Iterator[None]:
     """Keep a package from logging to the terminal: errors that matter are raised."""
-    handlers = logging.getLogger(package).handlers
-    levels = [handler.level for handler in handlers]
-    for handler in handlers:
-        handler.setLevel(logging.CRITICAL + 1)
+    its = logging.getLogger(package)
+    handlers, its.handlers = its.handlers, [logging.NullHandler()]
     try:
         yield
     finally:
-        for handler, level in zip(handlers, levels, strict=True):
-            handler.setLevel(level)
+        its.handlers = handlers
 
 
 class Cluster:
@@ -219,35 +208,24 @@ class Cluster:
 
     def __init__(self, client: Client, address: str) -> None:
         self._client, self._address = client, address
-        self._num_threads, self._asked_at = 0, -POLL_S
 
     def require_workers(self) -> None:
         """Refuse, by a ClusterError, a cluster without workers or whose results would differ."""
         with suppress(TimeoutError):
             self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
-        workers = self._ask([])
+        here = WorkerEnvironment.of([])
+        try:
+            self._client.run_on_scheduler(WorkerEnvironment.of, [])  # which unpickles tasks
+            workers = list(self._client.run(WorkerEnvironment.of, []).values())
+        except (ModuleNotFoundError, AttributeError) as error:
+            raise self._not_installed(error) from error
         if not workers:
             raise ClusterError(
                 f"{self._address}: the cluster has no workers; start some, with 'dask worker "
                 f"{self._address}' on each machine"
             )
-        here = WorkerEnvironment.of([])
         for worker in workers:
             here.require_same(worker)
-
-    def sees(self, paths: Sequence[Path]) -> bool:
-        """See :class:`~colmap_affrect.parallel.executor.Executor`."""
-        names = [str(path) for path in paths]
-        here = WorkerEnvironment.of(names)
-        return all(worker.files == here.files for worker in self._ask(names))
-
-    def _ask(self, paths: Sequence[str]) -> list[WorkerEnvironment]:
-        try:
-            self._client.run_on_scheduler(WorkerEnvironment.of, [])  # which unpickles tasks
-            found: dict[str, WorkerEnvironment] = self._client.run(WorkerEnvironment.of, paths)
-        except (ModuleNotFoundError, AttributeError) as error:
-            raise self._not_installed(error) from error
-        return list(found.values())
 
     def _not_installed(self, error: Exception) -> ClusterError:
         return ClusterError(
@@ -261,7 +239,7 @@ class Cluster:
         """See :class:`~colmap_affrect.parallel.executor.Executor`.
 
         Raises ClusterError when the scheduler is lost, several workers are lost with one task, or a
-        worker that joins later differs.
+        worker differs or does not see the files.
         """
         job = _Job(pickle.dumps(function), WorkerEnvironment.of([str(path) for path in files]))
         name = f"{type(function).__name__}-{uuid.uuid4().hex}"
@@ -272,7 +250,7 @@ class Cluster:
                     _work, job, pickle.dumps(task), key=f"{name}-{number}", pure=False
                 )
                 pending.append((future, task))
-                while len(pending) >= self._max_num_pending():
+                while len(pending) >= TASKS_PER_THREAD * max(1, self._num_threads()):
                     yield self._result(*pending.popleft())
             while pending:
                 yield self._result(*pending.popleft())
@@ -281,11 +259,8 @@ class Cluster:
                 with suppress(OSError, RuntimeError, CancelledError):
                     self._client.cancel([future for future, _ in pending])
 
-    def _max_num_pending(self) -> int:
-        if time.monotonic() > self._asked_at + POLL_S:
-            self._num_threads = sum(self._client.nthreads().values())
-            self._asked_at = time.monotonic()
-        return TASKS_PER_THREAD * max(1, self._num_threads)
+    def _num_threads(self) -> int:
+        return sum(self._client.nthreads().values())
 
     def _result(self, future: Future, task: object) -> Any:
         from distributed import KilledWorker
@@ -311,6 +286,6 @@ class Cluster:
         while not future.done():
             with suppress(TimeoutError):
                 future.result(timeout=POLL_S)
-            if not is_warned and not self._client.nthreads():
+            if not is_warned and not self._num_threads():
                 logger.warning("%s: no workers are left; waiting for some", self._address)
                 is_warned = True

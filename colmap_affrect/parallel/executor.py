@@ -27,16 +27,14 @@ Result = TypeVar("Result")
 class Executor(Protocol):
     """Where the work on images and pairs is done."""
 
-    def sees(self, paths: Sequence[Path]) -> bool:
-        """Tell whether files and folders are there for the work as they are for this process."""
-
     def map(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
         """Yield ``function(task)`` in task order, or raise what it raises; few tasks are in flight.
 
         The function does not change its state; it and the tasks, which are taken from the iterable
-        when their turn comes, can be pickled. ``files`` are what it reads.
+        when their turn comes, can be pickled. ``files`` are what it reads, which is refused
+        where workers do not see the same.
         """
 
 
@@ -45,11 +43,6 @@ class Threads:
 
     def __init__(self, num_threads: int) -> None:
         self._num_threads = num_threads
-
-    def sees(self, paths: Sequence[Path]) -> bool:
-        """Return True; see :class:`Executor`."""
-        del paths
-        return True
 
     def map(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()

@@ -160,17 +160,6 @@ def _folder_made(folder: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def publish(made: list[tuple[Path, Path]], folder: Path) -> None:
-    """Give what was made in a temporary folder its names in a folder, as :func:`new_results`."""
-    for _, target in made:
-        refuse_link(target)
-        if folder.resolve() not in _resolved(target).parents:
-            raise OptionError(f"{target}: a link leads out of {folder}; remove it")
-        target.parent.mkdir(parents=True, exist_ok=True)
-    with uninterrupted():
-        _publish(made, replaces=False)
-
-
 def _publish(made: list[tuple[Path, Path]], *, replaces: bool) -> None:
     """Give everything its name; on failure nothing new has it."""
     done: list[tuple[Path, Path]] = []

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -97,10 +98,6 @@ class FeatureStore(GroupStore):
     def names(self) -> list[str]:
         """Return the sorted names of the images."""
         return sorted(self._entries())
-
-    def complete(self, keys: Iterable[str]) -> set[str]:
-        """Return those of the images that are there and complete."""
-        return self._entries().keys() & set(keys)
 
     def write(
         self,
@@ -188,9 +185,8 @@ class FeatureStore(GroupStore):
 
     def level_ends(self, name: str) -> list[int]:
         """Return, for each level that an image has, the number of features up to it."""
-        with self._open("r") as file:
-            ends: list[int] = checked(self._group(file, name), "level_ends").tolist()
-            return ends
+        ends: list[int] = self._values(name, "level_ends").tolist()
+        return ends
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
@@ -198,9 +194,8 @@ class FeatureStore(GroupStore):
 
     def image_size(self, name: str) -> tuple[int, int]:
         """Return the (width, height) of one image in px."""
-        with self._open("r") as file:
-            width, height = checked(self._group(file, name), "image_size").tolist()
-            return width, height
+        width, height = self._values(name, "image_size").tolist()
+        return width, height
 
     def image_sizes(self) -> dict[str, tuple[int, int]]:
         """Return the (width, height) of each image in px."""
@@ -208,13 +203,11 @@ class FeatureStore(GroupStore):
 
     def read_frames(self, name: str) -> Singles:
         """Read the (N, 2, 3) frames of one image."""
-        with self._open("r") as file:
-            return checked(file[name], "lafs")
+        return self._values(name, "lafs")
 
-    def read_rectification_ids(self, name: str) -> NDArray[np.int32]:
-        """Read the (N,) warps that the features of one image come from."""
+    def _values(self, name: str, dataset: str) -> NDArray[Any]:
         with self._open("r") as file:
-            return checked(self._group(file, name), "rectification_ids")
+            return checked(self._group(file, name), dataset)
 
 
 def pair_key(name1: str, name2: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any, Self
 from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
-from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError, damage, made_again
+from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
 from colmap_affrect.options import digest_of
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 from colmap_affrect.project.outputs import (
@@ -35,12 +35,9 @@ from colmap_affrect.project.record import (
 
 logger = logging.getLogger(__name__)
 
-INPUTS = "inputs.sha256"  # in sparse/, of older versions: what is in ``made_from`` now
-FILES_OF_SPARSE = {INPUTS, "guided-before.json"}
 FILES_OF_MODEL = {
     "cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin", "summary.json",
 }  # fmt: skip
-OF_OLDER_VERSIONS = ("contents.json", ".features.h5.index")
 LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends
 OWN_STEMS = {
     "cameras", "config", "database", "depth", "features", "guided", "matches", "methods", "pairs",
@@ -243,11 +240,7 @@ class Workspace:
 
         Of verified pairs and, after a space, of the model that was extended, if any.
         """
-        if not self.sparse.exists():
-            return ""
-        old = self.sparse / INPUTS
-        with damage(old, made_again("map", self.path)):
-            return self.made_from("map") or (old.read_text("ascii") if old.exists() else "")
+        return self.made_from("map") if self.sparse.exists() else ""
 
     def record_options(
         self,
@@ -267,30 +260,27 @@ class Workspace:
         """
         self._refuse_foreign_results(stage)
         self._remove(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
-        self._remove(self.path / name for name in OF_OLDER_VERSIONS)
         record, begun = self.recorded(), self.begun
         if overwrite:
             self.refuse_foreign_models()
             self._remove(self._results(stage))
             begun = self._begun_before(stage)
             record = record if begun else {}
-        if stage in begun:
-            self._refuse_other_options(stage, options, recipe)
+        if stage in begun and (why := self._difference(stage, options, recipe)):
+            raise StaleStoreError(
+                f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
+            )
         begun = [name for name in STAGES if name in begun or name == stage]
         later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
         changed = {**record, **later, stage: dict(options), "begun": begun}
         self._write_record({**changed, "recipe": recipe or record.get("recipe", "")})
 
-    def _refuse_other_options(self, stage: str, options: Mapping[str, Any], recipe: str) -> None:
+    def _difference(self, stage: str, options: Mapping[str, Any], recipe: str) -> str:
+        """Return where options differ from those on record, empty if they do not."""
         known, record = self.recorded().get("recipe"), self.recorded()[stage]
-        difference = first_difference(placeless(record, GIVEN), placeless(options, GIVEN))
-        if difference:
-            other = known and recipe and known != recipe
-            why = f" (recipe {known!r} there, {recipe!r} now)" if other else ""
-            raise StaleStoreError(
-                f"{self.path}: the {stage} stage was run there with {difference}{why}; "
-                f"{self._remedy}"
-            )
+        found = first_difference(placeless(record, GIVEN), placeless(options, GIVEN))
+        is_other = found and known and recipe and known != recipe
+        return f"{found} (recipe {known!r} there, {recipe!r} now)" if is_other else found
 
     def rewind(self, why: str = "what it was made from has changed") -> None:
         """Remove the database and what was made from it, for inputs that have changed.
@@ -306,7 +296,6 @@ class Workspace:
 
     def forget_models(self) -> None:
         """Have the models made anew, which stay until others take their place."""
-        (self.sparse / INPUTS).unlink(missing_ok=True)
         self.record_made_from("map", "")
 
     @property
@@ -322,10 +311,12 @@ class Workspace:
         """
         record = self.recorded()
         chosen = {stage: placeless(record.get(stage, {}), GIVEN) for stage in stages}
-        for options in chosen.values():
-            for key in NOT_IN_DIGESTS:
-                options.pop(key, None)
-        return digest_of(chosen)
+        return digest_of(
+            {
+                stage: {k: value for k, value in options.items() if k not in NOT_IN_DIGESTS}
+                for stage, options in chosen.items()
+            }
+        )
 
     def _refuse_foreign_results(self, stage: str) -> None:
         first = {"copy": "extract", "extract": "copy"}.get(stage)
@@ -334,11 +325,8 @@ class Workspace:
                 f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
                 "use another --output-path"
             )
-        if {"copy", "extract"} & set(self.begun):
-            return
-        database = [] if self.users_database else [self.database]
-        for path in (*database, self.sparse, self.features, self.matches, self.guided):
-            if path.exists():
+        for path in (self.database, self.sparse, self.features, self.matches, self.guided):
+            if path.exists() and path != self.users_database and not self.begun:
                 raise StaleStoreError(
                     f"{path}: exists and was not made here; it is left as it is, use "
                     "another --output-path"
@@ -346,7 +334,7 @@ class Workspace:
 
     def refuse_foreign_models(self) -> None:
         """Refuse to remove models beside which others have put something; StaleStoreError."""
-        files = [path for path in self.sparse.glob("*") if path.name not in FILES_OF_SPARSE]
+        files = list(self.sparse.glob("*"))
         for folder in [path for path in files if path.is_dir() and path.name.isdecimal()]:
             files.remove(folder)
             files += [path for path in folder.iterdir() if path.name not in FILES_OF_MODEL]

@@ -36,7 +36,7 @@ def inspect_image(
     with new_results(*paths, replaces=True) as (*new_sheets, plan):
         for number, (photograph, _) in enumerate(read):
             level = inspect_level(extractor, photograph, number)
-            draw_sheet(level, stored_size, new_sheets[number])
+            draw_sheet(level, new_sheets[number])
             lines.append(f"level {number}, {level.rectifier}: {summary(level)}")
             descriptions.append(describe_level(level))
         description = {

@@ -1,17 +1,19 @@
 """Cameras and points of models, in one frame, to be drawn in a page."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_model
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.geometry.arrays import Array, Bytes
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.report.pictures import base64_text
 
+MAX_ALIGNMENT_ERROR = 0.05  # of a camera in two models, in radii of the view
 MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE = 20_000, 40_000  # of a model, and of all that are on a page
 POINT_PERCENTILE = 90.0  # share of the points, from the middle outwards, that the view holds
 RADIUS_MARGIN = 1.15
@@ -50,160 +52,107 @@ class View3D:
         return {"points": self.points, "count": self.num_points, "cameras": cameras}
 
 
-@dataclass(frozen=True)
-class Model:
-    """A model as arrays."""
-
-    names: tuple[str, ...]
-    centers: Array  # (M, 3) of the cameras
-    axes: Array  # (M, 3, 3) rotations world_from_camera
-    half_sizes: Array  # (M, 2) half width and height of the view at depth 1
-    points: Array  # (N, 3)
-    colors: Bytes  # (N, 3)
-
-    def transformed(self, scale: float, rotation: Array, translation: Array) -> Self:
-        """Return it after x -> scale rotation x + translation."""
-        return replace(
-            self,
-            centers=scale * self.centers @ rotation.T + translation,
-            axes=rotation @ self.axes,
-            points=scale * self.points @ rotation.T + translation,
-        )
-
-
 def read_scene(paths: Mapping[str, Path | None]) -> list[View3D]:
     """Read models, bring them into the frame of the largest, and prepare them for the page.
 
     ``paths`` are the folders by the names that the page has for the models; None for no model.
     """
-    models, notes = read_models(paths)
-    views = {name: _view(model, notes.get(name, "")) for name, model in models.items()}
-    return [views.get(name) or View3D(note=notes[name]) for name in paths]
-
-
-def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dict[str, str]]:
-    """Read models and bring them into the frame of the largest.
-
-    Returns the models, and what is special about them or why they are missing, by name.
-    """
-    models: dict[str, Model] = {}
+    models: dict[str, pycolmap.Reconstruction] = {}
     notes = {name: "There is no model." for name, path in paths.items() if path is None}
-    max_num_points = min(MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE // max(1, len(paths)))
     for name, path in paths.items():
         try:
             if path is not None:
-                models[name] = _read(path, max_num_points)
+                models[name] = read_model(path)
         except AffrectError as error:
             notes[name] = f"The model cannot be shown: {error}"
-    return (_in_one_frame(models, notes) if models else {}), notes
+    if models:
+        notes |= _bring_into_one_frame(models)
+    limit = min(MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE // max(1, len(paths)))
+    return [
+        _view(models[name], notes.get(name, ""), limit) if name in models else View3D(note=note)
+        for name, note in ((name, notes.get(name, "")) for name in paths)
+    ]
 
 
-def _read(path: Path, max_num_points: int) -> Model:
-    model = read_model(path)
-    images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
-    cameras = [model.cameras[image.camera_id] for image in images]
-    ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
-    if len(ids) > max_num_points:
-        ids = np.random.default_rng(0).choice(ids, max_num_points, replace=False)
-    points = [model.points3D[point_id] for point_id in ids.tolist()]
-    return Model(
-        tuple(image.name for image in images),
-        np.array([image.projection_center() for image in images]).reshape(-1, 3),
-        np.array([image.cam_from_world().rotation.matrix().T for image in images]),
-        np.array([np.array([c.width, c.height]) / c.mean_focal_length() / 2 for c in cameras]),
-        np.array([point.xyz for point in points]).reshape(-1, 3),
-        np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
-    )
+def _bring_into_one_frame(models: Mapping[str, pycolmap.Reconstruction]) -> dict[str, str]:
+    """Align models with the largest; return which have a frame of their own, and why."""
+    notes, reference = {}, max(models, key=lambda name: models[name].num_reg_images())
+    _turn_upright(models[reference])
+    for name in models.keys() - {reference}:
+        align = pycolmap.align_reconstructions_via_proj_centers
+        similarity = align(models[name], models[reference], MAX_ALIGNMENT_ERROR)
+        if similarity:
+            models[name].transform(similarity)
+            continue
+        _turn_upright(models[name])
+        notes[name] = (
+            f"Shares fewer than three photographs at different places with the model of "
+            f"{reference}: drawn in a frame of its own."
+        )
+    return notes
 
 
-def _in_one_frame(models: Mapping[str, Model], notes: dict[str, str]) -> dict[str, Model]:
-    """Align models with the largest, turn what is up upwards, and scale the view to radius 1."""
-    reference = max(models, key=lambda name: len(models[name].names))
-    upright = _upright(models[reference])
-    framed = {}
-    for name, model in models.items():
-        if name == reference:
-            framed[name] = upright
-        elif similarity := similarity_of(model, upright):
-            framed[name] = model.transformed(*similarity)
-        else:
-            framed[name] = _upright(model)
-            notes[name] = (
-                f"Shares fewer than two photographs at different places with the model of "
-                f"{reference}: drawn in a frame of its own."
-            )
-    return framed
-
-
-def similarity_of(source: Model, target: Model) -> tuple[float, Array, Array] | None:
-    """Estimate scale, rotation and translation target_from_source from the shared images.
-
-    Medians, so that single misplaced cameras do not matter. None with fewer than two shared
-    images at different places.
-    """
-    shared = [name for name in source.names if name in target.names]
-    rows = [source.names.index(name) for name in shared]
-    columns = [target.names.index(name) for name in shared]
-    if len(shared) < 2:
-        return None
-    rotations = target.axes[columns] @ np.swapaxes(source.axes[rows], 1, 2)
-    agreement = np.einsum("iab,jab->ij", rotations, rotations)
-    rotation = rotations[int(np.argmax(np.median(agreement, axis=1)))]
-    first, second = np.triu_indices(len(shared), 1)
-    centers, goals = source.centers[rows], target.centers[columns]
-    lengths = np.linalg.norm(centers[first] - centers[second], axis=1)
-    goal_lengths = np.linalg.norm(goals[first] - goals[second], axis=1)
-    apart = (lengths > 1e-9) & (goal_lengths > 1e-9)
-    if not apart.any():
-        return None
-    scale = float(np.median(goal_lengths[apart] / lengths[apart]))
-    translation = np.median(goals - scale * centers @ rotation.T, axis=0)
-    return scale, rotation, translation
-
-
-def _upright(model: Model) -> Model:
+def _turn_upright(model: pycolmap.Reconstruction) -> None:
     """Turn a model so that z is up, as cameras are held on average, and y is where they look.
 
-    The middle of cameras and points goes to the origin, and the scale is that of the view.
+    The middle of cameras and points goes to the origin, and the radius of the view becomes 1.
     """
-    up = -model.axes[:, :, 1].mean(axis=0)
+    axes, centers = _poses(model)
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    up = -axes[:, :, 1].mean(axis=0)
     if np.linalg.norm(up) < 1e-6:
-        up = -model.axes[0, :, 1]
+        up = -axes[0, :, 1]
     up /= np.linalg.norm(up)
-    along = np.cross(model.axes[:, :, 2].mean(axis=0), up)
+    along = np.cross(axes[:, :, 2].mean(axis=0), up)
     if np.linalg.norm(along) < MIN_COMMON_DIRECTION:  # they look in all directions
         along = np.linalg.svd(up[None])[2][1]
     along /= np.linalg.norm(along)
     rotation = np.stack([along, np.cross(up, along), up])
-    centers, points = model.centers @ rotation.T, model.points @ rotation.T
     spread = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else []
     inner = points[spread <= np.percentile(spread, POINT_PERCENTILE)] if len(points) else points
-    held = np.concatenate([inner, centers])
+    held = np.concatenate([inner, centers]) @ rotation.T
     middle = (held.min(axis=0) + held.max(axis=0)) / 2
     radius = RADIUS_MARGIN * max(float(np.linalg.norm(held - middle, axis=1).max()), 1e-9)
-    return model.transformed(1 / radius, rotation, -middle / radius)
+    model.transform(pycolmap.Sim3d(1 / radius, pycolmap.Rotation3d(rotation), -middle / radius))
 
 
-def _view(model: Model, note: str) -> View3D:
-    inside = np.abs(model.points).max(axis=1, initial=0.0) <= 1.0
-    points, colors = model.points[inside], model.colors[inside]
+def _poses(model: pycolmap.Reconstruction) -> tuple[Array, Array]:
+    """Return (M, 3, 3) world_from_camera rotations and (M, 3) centres of the registered images."""
+    poses = [model.images[i].cam_from_world().inverse() for i in sorted(model.reg_image_ids())]
+    axes = np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3)
+    return axes, np.array([pose.translation for pose in poses]).reshape(-1, 3)
+
+
+def _view(model: pycolmap.Reconstruction, note: str, max_num_points: int) -> View3D:
+    ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
+    if len(ids) > max_num_points:
+        ids = np.random.default_rng(0).choice(ids, max_num_points, replace=False)
+    chosen = [model.points3D[point_id] for point_id in ids.tolist()]
+    points = np.array([point.xyz for point in chosen]).reshape(-1, 3)
+    colors = np.array([point.color for point in chosen], dtype=np.uint8).reshape(-1, 3)
+    inside = np.abs(points).max(axis=1, initial=0.0) <= 1.0
+    points, colors = points[inside], colors[inside]
     if not colors.any():
         colors = np.full_like(colors, 128)
     colors = (DARKEST + colors.astype(np.float64) / 255 * COLOR_RANGE).astype(np.uint8)
     quantised = np.rint((points + 1.0) / 2.0 * np.iinfo(np.uint16).max).astype("<u2")
+    names = [model.images[image_id].name for image_id in sorted(model.reg_image_ids())]
     return View3D(
         len(points),
         base64_text(quantised.tobytes() + colors.tobytes()),
-        tuple(zip(model.names, _pyramids(model), strict=True)),
+        tuple(zip(names, _pyramids(model), strict=True)),
         note,
     )
 
 
-def _pyramids(model: Model) -> Array:
+def _pyramids(model: pycolmap.Reconstruction) -> Array:
     """Return the (M, 5, 3) centre and corners of the view of each camera."""
-    half = np.minimum(model.half_sizes, MAX_HALF_WIDTH)
+    images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    cameras = [model.cameras[image.camera_id] for image in images]
+    half = np.array([np.array([c.width, c.height]) / c.mean_focal_length() / 2 for c in cameras])
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     corners = np.ones((len(half), 4, 3))
-    corners[:, :, :2] = signs * half[:, None]
-    turned = np.einsum("mab,mcb->mca", model.axes, corners * CAMERA_DEPTH)
-    return np.concatenate([model.centers[:, None], model.centers[:, None] + turned], axis=1)
+    corners[:, :, :2] = signs * np.minimum(half, MAX_HALF_WIDTH)[:, None]
+    axes, centers = _poses(model)
+    turned = np.einsum("mab,mcb->mca", axes, corners * CAMERA_DEPTH)
+    return np.concatenate([centers[:, None], centers[:, None] + turned], axis=1)

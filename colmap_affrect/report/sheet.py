@@ -1,178 +1,143 @@
 """One picture of one level of a recipe: the photograph with its regions, features, and warps."""
 
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
-from textwrap import wrap
-from typing import Any
 
-import matplotlib.style
+import cv2
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties, findfont, get_font
-from matplotlib.patheffects import withStroke
 
 from colmap_affrect.data import (
     ColorImage,
     GrayImage,
     LocalFeatures,
-    Mask,
     Photograph,
     RectificationPlan,
 )
-from colmap_affrect.geometry.affine import transform_frames
-from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
+from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.report.levels import InspectedLevel, summary
 
-Color = tuple[float, float, float]
-Size = tuple[int, int]
+Color = tuple[int, int, int]
+Marks = dict[tuple[float, float], str]  # text by place, px
 
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#882255")
 """Okabe and Ito's colours for all kinds of colour vision, and one of Paul Tol's."""
 
 TINT = 0.45  # share of the colour over a region
-
-DPI = 100
-WIDTH_INCHES, TOP_INCHES, WARP_INCHES, TITLE_INCHES = 16.0, 7.0, 2.6, 0.6
-TITLE_CHARS = 180  # that fit into a line
-WARPS_PER_ROW, MAX_NUM_WARPS = 6, 24
+WIDTH_PX, PANELS_PER_ROW, WARPS_PER_ROW, MAX_NUM_WARPS = 1596, 2, 6, 24
+TITLE_PX, MARGIN_PX = 24, 4
 MAX_NUM_FEATURES, MAX_NUM_WARP_FEATURES = 1500, 120  # drawn, the strongest
 FEATURE_SIGMAS = 2.0  # radius of the ellipses drawn for features
 TURN = np.linspace(0.0, 2.0 * np.pi, 25)
 UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
-DARK = "#555555"
-OUTLINED = [withStroke(linewidth=2.5, foreground="white")]
-STYLE: list[str | dict[str, Any]] = [
-    "default",
-    {
-        "font.family": "DejaVu Sans",
-        "font.size": 9.0,
-        "axes.titlesize": 9.0,
-        "text.parse_math": False,
-    },
-]
+DARK: Color = (85, 85, 85)
 
 
-def draw_sheet(level: InspectedLevel, stored_size: Size, path: Path) -> None:
+def draw_sheet(level: InspectedLevel, path: Path) -> None:
     """Draw one level and write it as PNG.
 
     Above the photograph with the regions and their warps in one colour each, beside it its
-    features; below the largest warps with theirs. ``stored_size`` is (width, height) of the image
-    file in px.
+    features; below the largest warps with theirs.
     """
-    colors = warp_colors(level.plan)
-    items = level.plan.items
+    colors, items = warp_colors(level.plan), level.plan.items
     largest = sorted(range(len(items)), key=lambda index: -items[index].canvas_area_px)
-    chosen = sorted(largest[:MAX_NUM_WARPS])
-    rows = [chosen[first : first + WARPS_PER_ROW] for first in range(0, len(chosen), WARPS_PER_ROW)]
-    heights = [TOP_INCHES]
-    for row in rows:
-        aspects = [items[index].canvas_size[1] / items[index].canvas_size[0] for index in row]
-        heights.append(WARP_INCHES * min(1.5, max(aspects)) + TITLE_INCHES)
-    with matplotlib.style.context(STYLE):
-        figure = Figure(
-            (WIDTH_INCHES, sum(heights)), dpi=DPI, facecolor="white", layout="constrained"
-        )
-        FigureCanvasAgg(figure)
-        figure.suptitle("\n".join(map(printable, _title(level, stored_size))))
-        grid = figure.add_gridspec(len(heights), WARPS_PER_ROW, height_ratios=heights)
-        half = WARPS_PER_ROW // 2
-        _draw_regions(figure.add_subplot(grid[0, :half]), level)
-        _draw_all_features(figure.add_subplot(grid[0, half:]), level, colors)
-        for place, index in enumerate(chosen, WARPS_PER_ROW):
-            axes = figure.add_subplot(grid[divmod(place, WARPS_PER_ROW)])
-            _draw_warp(axes, level, index + 1, colors[index])
-        figure.savefig(path, format="png")
-
-
-def printable(text: str) -> str:
-    """Replace the characters that the font of the sheets has no glyph for."""
-    font = get_font(findfont(FontProperties(family="DejaVu Sans")))
-    return "".join(
-        character if font.get_char_index(ord(character)) else "\N{REPLACEMENT CHARACTER}"
-        for character in text
-    )
-
-
-def _title(level: InspectedLevel, stored_size: Size) -> Iterator[str]:
+    warps = [_warp(level, index, colors[index]) for index in sorted(largest[:MAX_NUM_WARPS])]
+    rows = [_row([_regions(level), _features(level, colors)], PANELS_PER_ROW)]
+    for first in range(0, len(warps), WARPS_PER_ROW):
+        rows.append(_row(warps[first : first + WARPS_PER_ROW], WARPS_PER_ROW))
+    title = np.full((TITLE_PX, WIDTH_PX, 3), 255, np.uint8)
     width, height = level.photograph.size
-    stored = f" (stored: {stored_size[0]} x {stored_size[1]} px)"
-    which = f"level {level.number} of escalation" if level.number else "level of every image"
-    steps = ", ".join(f"{step} {seconds:.2f} s" for step, seconds in level.seconds.items())
-    yield from wrap(level.photograph.name, TITLE_CHARS)
-    yield (
-        f"{width} x {height} px{stored * (level.photograph.size != stored_size)}; {which}: "
-        f"rectifier {level.rectifier}, features {level.extractor}"
-    )
-    yield f"{summary(level)}: {steps}" + "; contrast stretched" * level.photograph.stretched
-    yield from wrap(level.warning, TITLE_CHARS)
+    which = f"level {level.number}: {level.rectifier}, {level.extractor}, {width} x {height} px"
+    _write(title, f"{which}; {summary(level)}", (MARGIN_PX, TITLE_PX - 8))
+    _, data = cv2.imencode(".png", np.concatenate([title, *rows])[:, :, ::-1])
+    replace_bytes(path, data.tobytes())
 
 
-def _draw_regions(axes: Axes, level: InspectedLevel) -> None:
+def _regions(level: InspectedLevel) -> tuple[ColorImage, str]:
     image = tinted(level.photograph, level.plan)
     if level.photograph.mask is not None:
         image[~level.photograph.mask] //= 3
-    has_regions = any(item.region is not None for item in level.plan.items)
-    all_of_it = "every warp shows the whole photograph" if level.plan.items else "no warps"
-    dark = "; dark: masked" if level.photograph.mask is not None else ""
-    _show(axes, image, f"Regions: {'by number of warp' if has_regions else all_of_it}{dark}")
-    labels: dict[tuple[float, ...], list[int]] = {}
+    numbers = defaultdict(list)
     for number, item in enumerate(level.plan.items, 1):
         if item.region is not None:
-            middle = region_middle(item.region, item.region_origin)
-            labels.setdefault(tuple(middle.tolist()), []).append(number)
-    for (x, y), numbers in labels.items():
-        text = ", ".join(map(str, numbers[:3])) + " ..." * (len(numbers) > 3)
-        axes.text(x, y, text, ha="center", va="center", path_effects=OUTLINED)
+            rows, columns = np.nonzero(item.region)
+            middle = columns.mean() + item.region_origin[0], rows.mean() + item.region_origin[1]
+            numbers[middle].append(str(number))
+    marks = {place: ", ".join(alike[:3]) for place, alike in numbers.items()}
+    dark = "; dark: masked" if level.photograph.mask is not None else ""
+    title = f"regions by number of warp{dark}" if marks else f"no regions{dark}"
+    return _panel(image, PANELS_PER_ROW, marks=marks), title
 
 
-def _draw_all_features(axes: Axes, level: InspectedLevel, colors: Sequence[Color]) -> None:
+def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImage, str]:
     features = level.features
+    palette = [DARK, *colors]
+    drawn = [palette[number] for number in features.rectification_ids.tolist()]
+    pale = 255 - (255 - level.photograph.gray) // 2
+    image = _panel(pale, PANELS_PER_ROW, features, drawn, MAX_NUM_FEATURES)
     shown = min(len(features), MAX_NUM_FEATURES)
-    title = f"Features: the strongest {shown} of {len(features)}; gray: of the photograph itself"
-    _show(axes, 255 - (255 - level.photograph.gray) // 2, title)
-    palette = [to_rgb(DARK), *colors]
-    ids = features.rectification_ids.tolist()
-    _draw_features(axes, features, [palette[view] for view in ids], MAX_NUM_FEATURES)
+    return image, f"the strongest {shown} of {len(features)} features; gray: without a warp"
 
 
-def _draw_warp(axes: Axes, level: InspectedLevel, number: int, color: Color) -> None:
-    item = level.plan.items[number - 1]
-    found, kept = level.found[number], level.kept_of(number)
-    (width, height), angle = item.canvas_size, np.rad2deg(item.tilt_angle_rad)
-    image, mask = level.views[number]
-    pale = 255 - (255 - image) // 4  # outside of the region
-    _show(
-        axes,
-        image if mask is None else np.where(mask, image, pale),
-        f"{number}: tilt {item.tilt:.2f} at {angle:.0f}°, {width} x {height} px\n"
-        f"{len(kept)} of {len(found)} features kept",
-    )
-    frames = transform_frames(item.rectified_from_image, kept.lafs)
-    _draw_features(axes, kept.with_frames(frames), [color] * len(kept), MAX_NUM_WARP_FEATURES)
+def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, str]:
+    item = level.plan.items[index]
+    found, kept = level.found[index + 1], level.kept_of(index + 1)
+    image, mask = level.views[index + 1]
+    if mask is not None:
+        outside = 255 - (255 - image) // 4
+        image = np.where(mask if image.ndim == 2 else mask[:, :, None], image, outside)
+    features = kept.with_frames(transform_frames(item.rectified_from_image, kept.lafs))
+    panel = _panel(image, WARPS_PER_ROW, features, [color] * len(kept), MAX_NUM_WARP_FEATURES)
+    return panel, f"{index + 1}: tilt {item.tilt:.2f}, {len(kept)} of {len(found)} features"
 
 
-def _draw_features(
-    axes: Axes, features: LocalFeatures, colors: Sequence[Color], max_num: int
-) -> None:
-    order = np.argsort(-features.responses, kind="stable")[:max_num]
-    lafs = features.lafs[order]
-    outlines = lafs[:, :, :2] @ UNIT_CIRCLE * (FEATURE_SIGMAS / MEASUREMENT_SIGMAS)
-    segments = np.swapaxes(outlines + lafs[:, :, 2:], 1, 2)
-    chosen = [colors[index] for index in order.tolist()]
-    axes.add_collection(LineCollection(list(segments), colors=chosen, linewidths=1.2))
+def _panel(
+    image: GrayImage | ColorImage,
+    per_row: int,
+    features: LocalFeatures | None = None,
+    colors: Sequence[Color] = (),
+    max_num: int = 0,
+    marks: Marks | None = None,
+) -> ColorImage:
+    """Show an image as large as fits, with its strongest features as ellipses, and texts."""
+    side, height, width = WIDTH_PX // per_row - MARGIN_PX, *image.shape[:2]
+    scale = side / max(width, height)
+    size = max(1, round(scale * width)), max(1, round(scale * height))
+    panel = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    panel = np.array(np.broadcast_to(panel.reshape(*size[::-1], -1), (*size[::-1], 3)))
+    panel_from_image = resized_from_original((width, height), size)
+    if features is not None:
+        order = np.argsort(-features.responses, kind="stable")[:max_num]
+        lafs = transform_frames(panel_from_image, features.lafs[order])
+        outlines = lafs[:, :, :2] @ UNIT_CIRCLE * (FEATURE_SIGMAS / MEASUREMENT_SIGMAS)
+        points = np.rint(np.swapaxes(outlines + lafs[:, :, 2:], 1, 2)).astype(np.int32)
+        for index, outline in zip(order.tolist(), points, strict=True):
+            cv2.polylines(panel, [outline], True, colors[index], 1, cv2.LINE_AA)
+    for place, text in (marks or {}).items():
+        x, y = np.rint(project(panel_from_image, np.array([place]))[0]).astype(int).tolist()
+        _write(panel, text, (x, y))
+    return panel
 
 
-def _show(axes: Axes, image: GrayImage | ColorImage, title: str) -> None:
-    """Show an image; data coordinates are its px, and nothing that is drawn later moves it."""
-    axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-    axes.autoscale(False)
-    axes.set_title(title)
-    axes.set_axis_off()
+def _row(panels: Sequence[tuple[ColorImage, str]], per_row: int) -> ColorImage:
+    """Put panels beside each other, each below its title."""
+    height = max(len(panel) for panel, _ in panels) + TITLE_PX
+    row = np.full((height, WIDTH_PX, 3), 255, np.uint8)
+    for place, (panel, title) in enumerate(panels):
+        left = place * WIDTH_PX // per_row
+        row[TITLE_PX : TITLE_PX + len(panel), left : left + panel.shape[1]] = panel
+        _write(row, title, (left + MARGIN_PX, TITLE_PX - 8))
+    return row
+
+
+def _write(image: ColorImage, text: str, place: tuple[int, int]) -> None:
+    """Write black on white, from the left end of the base line on."""
+    for color, thickness in (((255, 255, 255), 3), ((0, 0, 0), 1)):
+        cv2.putText(
+            image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, thickness, cv2.LINE_AA
+        )
 
 
 def warp_colors(plan: RectificationPlan) -> list[Color]:
@@ -186,7 +151,8 @@ def warp_colors(plan: RectificationPlan) -> list[Color]:
         for item in plan.items
     ]
     groups = list(dict.fromkeys(keys))
-    return [to_rgb(PALETTE[groups.index(key) % len(PALETTE)]) for key in keys]
+    texts = [PALETTE[groups.index(key) % len(PALETTE)] for key in keys]
+    return [(int(text[1:3], 16), int(text[3:5], 16), int(text[5:], 16)) for text in texts]
 
 
 def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
@@ -196,14 +162,6 @@ def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
         if item.region is not None:
             rows, columns = np.nonzero(item.region)
             pixels = rows + item.region_origin[1], columns + item.region_origin[0]
-            mixed = (1.0 - TINT) * photograph.gray[pixels][:, None] + TINT * 255.0 * np.array(color)
+            mixed = (1.0 - TINT) * photograph.gray[pixels][:, None] + TINT * np.array(color)
             image[pixels] = np.rint(mixed).astype(np.uint8)
     return image
-
-
-def region_middle(region: Mask, origin: tuple[int, int]) -> Array:
-    """Return the (2,) pixel of an (h, w) region that is nearest to its centre of mass, image px."""
-    rows, columns = np.nonzero(region)
-    points = np.stack([columns, rows], axis=1).astype(np.float64)
-    nearest = np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1))
-    return np.asarray(points[nearest] + origin)

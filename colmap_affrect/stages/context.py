@@ -15,7 +15,6 @@ from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.contents import file_sha256
-from colmap_affrect.project.record import WEIGHTS
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
@@ -74,17 +73,19 @@ class Context:
     @property
     def inputs(self) -> Inputs:
         """Which photographs the run is about, and what is known of them."""
-        return self._built(Inputs, self._extract_section(Inputs))
+        self.workspace.require("extract")
+        return self._built(Inputs, "extract", ExtractionOptions)
 
     @property
     def extraction(self) -> ExtractionOptions:
         """How features are extracted."""
-        return self._built(ExtractionOptions, self._extract_section(ExtractionOptions))
+        self.workspace.require("extract")
+        return self._built(ExtractionOptions, "extract", Inputs)
 
     @property
     def pairing(self) -> PairOptions:
         """How pairs are chosen."""
-        return self._built(PairOptions, self.workspace.planned("pairs"))
+        return self._built(PairOptions, "pairs")
 
     @property
     def matching(self) -> MatcherOptions:
@@ -95,17 +96,17 @@ class Context:
     @property
     def verification(self) -> VerificationOptions:
         """How pairs are verified."""
-        return self._built(VerificationOptions, self.workspace.planned("verify"))
+        return self._built(VerificationOptions, "verify")
 
     @property
     def escalation(self) -> EscalateOptions:
         """Which pairs are escalated."""
-        return self._built(EscalateOptions, self.workspace.planned("escalate"))
+        return self._built(EscalateOptions, "escalate")
 
     @property
     def guiding(self) -> GuidedOptions:
         """How verified pairs are matched again."""
-        return self._built(GuidedOptions, self.workspace.planned("guide"))
+        return self._built(GuidedOptions, "guide")
 
     @property
     def mapping(self) -> MapperOptions:
@@ -113,15 +114,14 @@ class Context:
         options: MapperOptions = self._part(MAPPERS, "map")
         return options
 
-    def _extract_section(self, cls: type[Options]) -> dict[str, Any]:
-        """Return what belongs to some options, of which the extract stage has two."""
-        others = {*Inputs.model_fields, *ExtractionOptions.model_fields} - cls.model_fields.keys()
-        record = self.workspace.require("extract")
-        return {key: value for key, value in record.items() if key not in {*others, WEIGHTS}}
-
-    def _built(self, cls: type[AnyOptions], values: dict[str, Any] | None) -> AnyOptions:
-        where = str(self.workspace.config)
-        return from_record(where, lambda: cls.from_mapping(values or {}, where))
+    def _built(
+        self, cls: type[AnyOptions], stage: str, beside: type[Options] | None = None
+    ) -> AnyOptions:
+        """Return options of a stage, without those ``beside`` them in its section."""
+        others = beside.model_fields if beside else {}
+        where, record = str(self.workspace.config), self.workspace.planned(stage) or {}
+        values = {key: value for key, value in record.items() if key not in others}
+        return from_record(where, lambda: cls.from_mapping(values, where))
 
     def _part(self, registry: Registry[Any], stage: str) -> Any:
         where, values = str(self.workspace.config), self.workspace.planned(stage) or {}
@@ -130,7 +130,8 @@ class Context:
     @property
     def features(self) -> FeatureStore:
         """The features; a file that was made with other options than those on record is refused."""
-        return FeatureStore(self.workspace.features, self.workspace.options_digest("extract"))
+        digest = self.workspace.options_digest("extract")
+        return FeatureStore(self.workspace.features.absolute(), digest)
 
     @property
     def matches(self) -> MatchStore:

@@ -5,8 +5,8 @@ import time
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.checks import refuse_unusable
-from colmap_affrect.colmap.database_copy import copy_with_frames
+from colmap_affrect.colmap.checks import FATAL, refuse_unusable
+from colmap_affrect.colmap.database_copy import add_frames, copy_database
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.errors import DatabaseError, OptionError, such_as
@@ -51,14 +51,11 @@ def copy_verified(
             warnings[str(source)] = "has changed; its copy and the models are made anew"
         workspace.rewind()
         workspace.record_made_from("copy", digest)
-    left_out = ""
     if not workspace.database.exists():
-        left_out = copy_with_frames(source, workspace.database)
+        copy_database(source, workspace.database, FATAL, add_frames)
     warnings |= _other_sizes(workspace.database, image_path) if image_path else {}
     for name, what in warnings.items():
         logger.warning("%s: %s", name, what)
-    if left_out:  # which is logged
-        warnings[workspace.database.name] = left_out
     record_cameras(workspace.database, workspace.cameras)
     workspace.record_options("verify", verification.to_mapping())
     num_pairs = colmap_database.num_matched_pairs(workspace.database)

@@ -13,7 +13,6 @@ from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.errors import (
-    ClusterError,
     DatabaseError,
     ImageError,
     OptionError,
@@ -68,13 +67,13 @@ def extract(
     names = inputs.names()
     names = checked_names(folder, image_names, "image_names") if image_names else names
     options, known = recipe.extraction, {} if overwrite else context.features.contents()
-    contents = contents_of(inputs, names, options, known)
+    contents = inputs.contents(names, options, known)
     if contents != known:  # else they were seen to be good
         inputs.check_names(names)
     whole = inputs.photographs.without_mask(names)
     extractor = prepared_recipe(context, options, names)
     if not overwrite:
-        refuse_other_photographs(workspace, inputs.image_path, contents)
+        _refuse_other_photographs(workspace, inputs.image_path, contents)
     weights = digests(extractor.weights)
     workspace.record_options(
         "extract",
@@ -83,12 +82,15 @@ def extract(
         recipe=recipe.name,
         overwrite=overwrite,
     )
-    warnings = forget_changed(context, inputs, contents, are_all=not image_names)
+    warnings = _forget_changed(context, inputs, contents, are_all=not image_names)
     _start_database(workspace)
-    done = context.features.complete(names)
+    done = set(names).intersection(context.features.names())
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
-    warnings |= _passed_over(inputs, names, whole, is_list=bool(image_names))
+    if not (inputs.image_list_path or image_names):
+        warnings |= not_named(folder, names) if inputs.from_database else left_out(folder)
+    if whole:
+        warnings["masks"] = f"{len(whole)} images have none and are used whole, as {whole[0]} is"
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
@@ -101,18 +103,6 @@ def extract(
     new, kept = set(missing) - failures.keys(), done - failures.keys()
     wall_s = time.perf_counter() - start
     return StageReport("extract", wall_s, len(new), len(kept), failures, warnings)
-
-
-def _passed_over(
-    inputs: Inputs, names: Sequence[str], whole: Sequence[str], *, is_list: bool
-) -> dict[str, str]:
-    """Return which photographs are left out, and which have no mask."""
-    folder, found = Path(inputs.image_path), dict[str, str]()
-    if not (inputs.image_list_path or is_list):
-        found |= not_named(folder, names) if inputs.from_database else left_out(folder)
-    if whole:
-        found["masks"] = f"{len(whole)} images have none and are used whole, as {whole[0]} is"
-    return found
 
 
 def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:
@@ -134,25 +124,25 @@ def _extract_missing(
     warnings: dict[str, str],
 ) -> dict[str, str]:
     """Extract images one by one; return why some cannot be used, and add to the warnings."""
-    store = context.features
-    failures: dict[str, str] = {}
-    faded: list[str] = []
-    with context.progress.stage("extract", len(names), "images") as advance:
-        images = [(name, 0) for name in names]
-        with closing(extract_images(context, inputs, extractor, images)) as found_images:
-            for name, found in zip(names, found_images, strict=True):
-                if isinstance(found, ImageError):
-                    logger.warning("%s", found)
-                    failures[name] = str(found)
-                else:
-                    if not len(found.features):
-                        logger.warning("%s: no features (blank or too small?)", name)
-                    if found.warning:
-                        warnings[name] = found.warning
-                    if found.stretched:
-                        faded.append(name)
-                    store.write(name, found.features, found.image_size, contents[name])
-                advance(1)
+    store, images = context.features, [(name, 0) for name in names]
+    failures, faded = dict[str, str](), list[str]()
+    with (
+        context.progress.stage("extract", len(names), "images") as advance,
+        closing(extract_images(context, inputs, extractor, images)) as found_images,
+    ):
+        for name, found in zip(names, found_images, strict=True):
+            if isinstance(found, ImageError):
+                logger.warning("%s", found)
+                failures[name] = str(found)
+            else:
+                if not len(found.features):
+                    logger.warning("%s: no features (blank or too small?)", name)
+                if found.warning:
+                    warnings[name] = found.warning
+                if found.stretched:
+                    faded.append(name)
+                store.write(name, found.features, found.image_size, contents[name])
+            advance(1)
     if faded:
         warnings["contrast"] = (
             f"is low in {len(faded)} of {len(names)} photographs, such as {one_line(faded[0])}; it "
@@ -176,26 +166,18 @@ def extract_images(
     """Yield the features of images, or why one cannot be used, in order.
 
     ``images`` are names and levels of escalation. By default there are as many threads as cores and
-    memory allow. ClusterError when workers do not see the depth maps.
+    memory allow. ClusterError when workers do not see the photographs or the depth maps.
     """
     if not images:
         return
     if later := {name for name, level in images if level}:
-        refuse_changed(context, inputs, later)
+        _refuse_changed(context, inputs, later)
     executor = context.executor or Threads(num_images_at_once(extractor))
-    depth_folder = extractor.options.depth.folder
-    if depth_folder and not executor.sees([depth_folder]):
-        raise ClusterError(
-            f"{depth_folder}: the workers of the cluster do not see this folder of depth maps; put "
-            "it on storage that all of them share"
-        )
     files = inputs.photographs.files(images[0][0])
-    is_shared = executor.sees(files)
-    tasks: Iterable[ImageTask] = image_tasks(context.workspace, inputs, extractor.options, images)
-    if not is_shared:
-        tasks = (task.with_files() for task in tasks)
-    outcomes = executor.map(extractor, tasks, files if is_shared else ())
-    for (name, level), found in zip(images, outcomes, strict=True):
+    if depth_folder := extractor.options.depth.folder:
+        files.append(depth_folder)
+    tasks = _image_tasks(context.workspace, inputs, extractor.options, images)
+    for (name, level), found in zip(images, executor.map(extractor, tasks, files), strict=True):
         if isinstance(found, ExtractedImage):
             logger.debug("%s: %d features (level %d)", name, len(found.features), level)
             if found.warning:
@@ -203,21 +185,18 @@ def extract_images(
         yield found
 
 
-def image_tasks(
+def _image_tasks(
     workspace: Workspace,
     inputs: Inputs,
     options: ExtractionOptions,
-    images: Iterable[tuple[str, int]],
+    images: Sequence[tuple[str, int]],
 ) -> Iterator[ImageTask]:
     """Yield what is to be done for images; cameras are read where rectification depends on them."""
-    known = {}
-    if workspace.database.exists():
-        known = colmap_database.read_cameras(workspace.database)
-    initial = inputs.initial_cameras
+    has_database, initial = workspace.database.exists(), inputs.initial_cameras
+    known = colmap_database.read_cameras(workspace.database) if has_database else {}
     names = inputs.names() if options.uses_depth else []
     for name, level in images:
-        camera = known.get(name)
-        intrinsics = None
+        camera, intrinsics = known.get(name), None
         if options.uses_depth:
             intrinsics = (
                 colmap_database.camera_matrix(camera) if camera else initial.matrix(name, names)
@@ -295,15 +274,13 @@ def write_descriptors(context: Context) -> None:
 # the database and all that follows on all images, and on cameras that are given.
 
 
-def refuse_other_photographs(
+def _refuse_other_photographs(
     workspace: Workspace, image_path: str, contents: Mapping[str, Content]
 ) -> None:
     """Refuse another folder of photographs unless it has some that were worked on."""
     before = (workspace.planned("extract") or {}).get("image_path", image_path)
-    if before == image_path:
-        return
-    known = FeatureStore(workspace.features).contents()
-    if known and len(changed_images(known, contents)) == len(known.keys() & contents.keys()):
+    known = {} if before == image_path else FeatureStore(workspace.features).contents()
+    if known and len(_changed(known, contents)) == len(known.keys() & contents.keys()):
         raise StaleStoreError(
             f"{workspace.path}: the extract stage was run there with image_path={before!r}, and "
             f"none of the photographs in {image_path} is one of them; use --overwrite to discard "
@@ -311,23 +288,13 @@ def refuse_other_photographs(
         )
 
 
-def contents_of(
-    inputs: Inputs,
-    names: Iterable[str],
-    options: ExtractionOptions,
-    known: Mapping[str, Content],
-) -> dict[str, Content]:
-    """Return what the files of images hold now; ``known`` ones are read only if they changed."""
-    return {name: content_of(inputs.files(name, options), known.get(name)) for name in names}
-
-
-def changed_images(known: Mapping[str, Content], now: Mapping[str, Content]) -> list[str]:
+def _changed(known: Mapping[str, Content], now: Mapping[str, Content]) -> list[str]:
     """Return the images whose files are not those any more that their features are from."""
     both = [name for name in now if name in known and known[name].digest]
     return [name for name in both if known[name].digest != now[name].digest]
 
 
-def forget_changed(
+def _forget_changed(
     context: Context, inputs: Inputs, contents: Mapping[str, Content], *, are_all: bool
 ) -> dict[str, str]:
     """Remove what was made from inputs that have changed since, so that it is made again.
@@ -335,11 +302,10 @@ def forget_changed(
     The changed images lose their features last: a run that is killed before finds them changed
     again. ``contents`` are those of each image now; ``are_all`` says that there are no other
     images. Returns one line by the folder of the photographs, empty if nothing has changed.
-    StaleStoreError for results in a user's database.
     """
     workspace, store = context.workspace, context.features
     known = store.contents()
-    changed = changed_images(known, contents)
+    changed = _changed(known, contents)
     are_all = are_all and not workspace.users_database
     gone = sorted(known.keys() - contents.keys()) if are_all else []
     cameras, before = content_of(inputs.camera_files).digest, workspace.made_from("cameras")
@@ -364,11 +330,11 @@ def _counted(names: Sequence[str], what: str) -> list[str]:
     return [f"{len(names)} {what} ({such_as(names)})"] if names else []
 
 
-def refuse_changed(context: Context, inputs: Inputs, names: Iterable[str]) -> None:
-    """Refuse to add to the features of photographs that have changed; StaleStoreError."""
+def _refuse_changed(context: Context, inputs: Inputs, names: Iterable[str]) -> None:
+    """Refuse to add to the features of photographs that have changed."""
     known = context.features.contents()
-    now = contents_of(inputs, names, context.extraction, known)
-    if changed := _counted(changed_images(known, now), "changed"):
+    now = inputs.contents(names, context.extraction, known)
+    if changed := _counted(_changed(known, now), "changed"):
         raise StaleStoreError(
             f"{context.workspace.features}: {changed[0]} since their features were extracted; run "
             "extract again"

@@ -175,9 +175,8 @@ class Guiding:
         """
         if not pairs:
             return
-        features, executor = self.context.features, self.context.executor
-        if executor is None or not executor.sees([features.path]):
-            executor = Threads(available_cores())
+        features = self.context.features
+        executor = self.context.executor or Threads(available_cores())
         matcher = GuidedMatcher(features, self.options)
         stationary = StationaryFilter(features, self.context.matches)
         ordered = ordered_for_reuse(pairs, IMAGES_IN_MEMORY)

@@ -1,6 +1,6 @@
 """Which photographs a run is about, what is known of them, and how they are extracted."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,6 +17,7 @@ from colmap_affrect.images.photographs import (
     refuse_colliding_keys,
 )
 from colmap_affrect.options import Options
+from colmap_affrect.project.contents import Content, content_of
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.recipes import ExtractionOptions
 
@@ -65,8 +66,16 @@ class Inputs(Options):
             raise ImageError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
         return names
 
-    def files(self, name: str, options: ExtractionOptions) -> list[Path]:
-        """Return the files that the features of an image depend on."""
+    def contents(
+        self, names: Iterable[str], options: ExtractionOptions, known: Mapping[str, Content]
+    ) -> dict[str, Content]:
+        """Return what the files hold that the features of images depend on.
+
+        They are read only where they have changed since they held what is ``known``.
+        """
+        return {name: content_of(self._files(name, options), known.get(name)) for name in names}
+
+    def _files(self, name: str, options: ExtractionOptions) -> list[Path]:
         files = self.photographs.files(name)
         if options.uses_depth:
             depth = options.depth.file(name)

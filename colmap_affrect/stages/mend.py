@@ -1,8 +1,8 @@
 """Mend: what others have changed in the database of a folder since a command last worked there.
 
-What the stores hold is made again, as little as possible: the rows that differ, or all where images
-and cameras are not the same. What was meant is kept: pairs that were deleted, which do not come
-back then, pose priors, intrinsics, rigs, and pairs of other programs.
+A database that does not hold what the stores do is made again. What was meant is kept: pairs that
+were deleted, which do not come back then, pose priors, intrinsics, rigs, and pairs of other
+programs.
 """
 
 import logging
@@ -12,11 +12,9 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 
-import numpy as np
-
+from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.cameras import read_camera_records, write_camera_records
 from colmap_affrect.colmap.checks import FATAL, refuse_unusable
-from colmap_affrect.colmap.database import all_cameras
 from colmap_affrect.colmap.seal import (
     Change,
     begin_work,
@@ -27,10 +25,8 @@ from colmap_affrect.colmap.seal import (
     keep_seal,
     remove_seal,
 )
-from colmap_affrect.colmap.tables import Tables, delete_rows, open_read_only, read_tables
-from colmap_affrect.colmap.useless_keypoints import KINDS
+from colmap_affrect.colmap.tables import Tables, open_read_only, pair_images, read_tables
 from colmap_affrect.errors import AffrectError, DatabaseError, such_as
-from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.workspace import Workspace
@@ -38,14 +34,12 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.match import write_matches
-from colmap_affrect.stages.pairs import delete_pairs, listed_pairs
-from colmap_affrect.stages.verify import verify_matches, verify_new
+from colmap_affrect.stages.pairs import delete_pairs
+from colmap_affrect.stages.verify import verify_matches
 
 logger = logging.getLogger(__name__)
 
-UNUSABLE = (FATAL | KINDS | {"no-frame"}) - {"keypoints-outside"}
-NOTHING = np.zeros(0, np.int64)
+UNUSABLE = FATAL | {"no-frame"}
 RIGS = ("rigs", "rig_sensors", "frames", "frame_data")
 
 
@@ -54,26 +48,18 @@ class Edits:
     """What others have changed in a database.
 
     Attributes:
-        lost: why it cannot be used and must be made again, empty if it need not be.
-        keypoints: ids of images whose keypoints differ from what was written.
-        pairs: ids of pairs whose matches or geometries do.
+        lost: why it must be made again, empty if it need not be.
+        changed_pairs: what of matches and geometries was changed, empty if nothing was.
         deleted: ids and names of pairs that were deleted.
         cameras: ids of cameras whose intrinsics were changed.
         others: what else was changed and is kept.
     """
 
     lost: tuple[str, ...] = ()
-    keypoints: Indices = field(default_factory=NOTHING.copy)
-    pairs: Indices = field(default_factory=NOTHING.copy)
+    changed_pairs: tuple[str, ...] = ()
     deleted: dict[int, Pair] = field(default_factory=dict)
     cameras: tuple[int, ...] = ()
     others: tuple[str, ...] = ()
-
-    @property
-    def written(self) -> str:
-        """What is written again."""
-        parts = [(len(self.keypoints), "image", "keypoints of "), (len(self.pairs), "pair", "")]
-        return " and ".join(f"{of}{_counted(count, what)}" for count, what, of in parts if count)
 
     @property
     def kept(self) -> str:
@@ -81,14 +67,14 @@ class Edits:
         texts = list(self.others)
         if self.deleted:
             names = such_as(" - ".join(pair) for pair in self.deleted.values())
-            texts.append(f"{_counted(len(self.deleted), 'pair')} deleted ({names}), for good")
+            texts.append(f"{_counted_pairs(len(self.deleted))} deleted ({names}), for good")
         if self.cameras:
             texts.append(f"intrinsics of cameras {such_as(map(str, self.cameras))}")
         return ", ".join(texts)
 
     def __str__(self) -> str:
         """Say what was changed."""
-        return "; ".join(self.lost or filter(None, [self.written, self.kept]))
+        return "; ".join(filter(None, self.lost or [*self.changed_pairs, self.kept]))
 
 
 def edits_of(path: Path) -> Edits | None:
@@ -102,7 +88,7 @@ def edits_of(path: Path) -> Edits | None:
         with open_read_only(path) as connection:
             edits = _edits(found, read_tables(connection))
         if not edits.lost:
-            refuse_unusable(path, UNUSABLE - KINDS if len(edits.keypoints) else UNUSABLE)
+            refuse_unusable(path, UNUSABLE)
         return edits
     except AffrectError as error:
         text = str(error).removeprefix(f"{path}: ").partition(";")[0]
@@ -113,33 +99,31 @@ def edits_of(path: Path) -> Edits | None:
 
 def _edits(found: dict[str, Change], tables: Tables) -> Edits:
     lost = ["its tables are others"] * ("tables" in found)
-    for part, what in (("images", tables.names), ("cameras", {})):
+    for part, names in (("images", tables.names), ("cameras", {}), ("keypoints", tables.names)):
         if part in found:
-            lost.append(_changed_rows(part, found[part], what))
-    pairs = [found[part] for part in ("matches", "geometries") if part in found]
-    if any(0 < change.num_before == len(change.gone) for change in pairs):
+            lost.append(_changed_rows(part, found[part], names))
+    pairs = {part: found[part] for part in ("matches", "geometries") if part in found}
+    if any(0 < change.num_before == len(change.gone) for change in pairs.values()):
         lost.append("all pairs are gone")
-    rigs, others = any(part in found for part in RIGS), list[str]()
+    rigs = any(part in found for part in RIGS)
     if rigs and not tables.names.keys() <= tables.frame_images:
         lost.append("images have no frames any more")
-    gone = sorted({int(key) for change in pairs for key in change.gone})
-    changed = np.unique(np.concatenate([NOTHING, *(change.changed for change in pairs)]))
-    more = len({int(key) for change in pairs for key in change.added})
-    others += ["rigs and frames"] * rigs + ["pose priors"] * ("priors" in found)
-    others += [f"{_counted(more, 'pair')} more"] * bool(more)
-    intrinsics = found["intrinsics"].changed.tolist() if "intrinsics" in found else ()
+    gone = sorted({int(key) for change in pairs.values() for key in change.gone})
+    more = len({int(key) for change in pairs.values() for key in change.added})
+    others = ["rigs and frames"] * rigs + ["pose priors"] * ("priors" in found)
+    others += [f"{_counted_pairs(more)} more"] * bool(more)
+    changed = {part: len(set(change.changed) - set(gone)) for part, change in pairs.items()}
     return Edits(
         tuple(lost),
-        found["keypoints"].keys if "keypoints" in found else NOTHING,
-        np.setdiff1d(changed, gone),
+        tuple(f"{part}: {number} changed" for part, number in changed.items() if number),
         {} if lost else {key: tables.pair_names(key) for key in gone},
-        tuple(intrinsics),
+        tuple(found["intrinsics"].changed.tolist() if "intrinsics" in found else ()),
         tuple(others),
     )
 
 
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'s' * (count != 1)}"
+def _counted_pairs(number: int) -> str:
+    return f"{number} pair{'s' * (number != 1)}"
 
 
 def _changed_rows(part: str, change: Change, names: dict[int, str]) -> str:
@@ -183,38 +167,30 @@ def watched(context: Context, *, follows: bool = True, discards: bool = False) -
 def mend(context: Context, *, follows: bool) -> None:
     """Make again, or keep, what others have changed in the database; a warning says what."""
     workspace, path = context.workspace, context.workspace.database
-    begun = workspace.begun
+    begun, is_copied = workspace.begun, workspace.is_copy
     if not begun or not (path.exists() or "verify" in begun):
         return
-    found, is_copied = edits_of(path), workspace.is_copy
-    if found and not str(found) and not (is_copied or has_seal(path)):
-        found = Edits(_unlike_features(context))
-    if not (found and str(found)):
-        if found and has_seal(path):
+    edits, is_sealed = edits_of(path), has_seal(path)
+    if edits and not str(edits) and not (is_copied or is_sealed):
+        edits = Edits(_unlike_features(context))
+    if not edits or not str(edits):
+        if edits and is_sealed:
             keep_seal(path)
         return
     if not is_copied:
-        delete_pairs(workspace, found.deleted.values())
-        found = _without_others(context, found)
-    if found.lost or (found.written and is_copied):
-        _make_again(context, found, begun, follows=follows)
+        delete_pairs(workspace, edits.deleted.values())
+    # Before pairs are matched here those in the database are of other programs.
+    lost = edits.lost or (edits.changed_pairs if is_copied or "match" in begun else ())
+    if lost:
+        _make_again(context, "; ".join(lost), begun, follows=follows)
         return
-    for what, done in (found.kept, "which is kept"), (found.written, "and is written again"):
-        if what:
-            logger.warning("%s: was changed since the last run, %s: %s", path, done, what)
+    logger.warning("%s: was changed since the last run, which is kept: %s", path, edits)
     remove_seal(path)  # what is deleted now was not by others
-    pairs = np.concatenate([found.pairs, np.array(list(found.deleted), np.int64)])
-    delete_rows(
-        path, {"keypoints": found.keypoints, "matches": pairs, "two_view_geometries": pairs}
-    )
-    _keep_cameras(workspace, found.cameras)
-    if found.written and "verify" in begun:
-        try:
-            write_matches(context, listed_pairs(context))
-            verify_new(context)
-        except AffrectError:
-            workspace.rewind()  # half of it must not count as verified
-            raise
+    with colmap_database.open_database(path) as database:
+        for images in map(pair_images, edits.deleted):
+            database.delete_matches(*images)
+            database.delete_two_view_geometry(*images)
+    _keep_cameras(workspace, edits.cameras)
 
 
 def _unlike_features(context: Context) -> tuple[str, ...]:
@@ -231,30 +207,19 @@ def _unlike_features(context: Context) -> tuple[str, ...]:
     return tuple(found[:1])
 
 
-def _without_others(context: Context, found: Edits) -> Edits:
-    """Leave pairs alone that the stores do not hold: another program has added them."""
-    if not len(found.pairs):
-        return found
-    with open_read_only(context.workspace.database) as connection:
-        tables = read_tables(connection)
-    ours = set(map(frozenset, listed_pairs(context)))
-    are_ours = [frozenset(tables.pair_names(int(key))) in ours for key in found.pairs]
-    return replace(found, pairs=found.pairs[np.array(are_ours)])
-
-
-def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows: bool) -> None:
+def _make_again(context: Context, why: str, begun: Sequence[str], *, follows: bool) -> None:
     workspace = context.workspace
     original = Path(workspace.require("copy")["database"]) if workspace.is_copy else None
     if original and not original.exists():
         raise DatabaseError(
-            f"{workspace.database}: was changed since the last run ({found}), and {original} is "
+            f"{workspace.database}: was changed since the last run ({why}), and {original} is "
             "gone, of which it is a copy; put that back, or give another by --from-database"
         )
     kept = _put_aside(workspace)
     logger.warning(
         "%s: was changed since the last run (%s); it is made again from %s%s",
         workspace.database,
-        found,
+        why,
         original or f"{workspace.features.name} and {workspace.matches.name}",
         f", what was there is {kept.name}" if kept else "",
     )
@@ -288,7 +253,7 @@ def _keep_cameras(workspace: Workspace, changed: Sequence[int]) -> None:
     if not changed:
         return
     records = read_camera_records(workspace.cameras)
-    for camera in all_cameras(workspace.database):
+    for camera in colmap_database.all_cameras(workspace.database):
         if camera.camera_id in changed and camera.camera_id in records:
             records[camera.camera_id] = replace(
                 records[camera.camera_id],

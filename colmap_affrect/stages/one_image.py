@@ -1,17 +1,12 @@
-"""What is done for one photograph, in a thread of this process or on a worker of a cluster.
+"""What is done for one photograph, in a thread of this process or on a worker of a cluster."""
 
-Workers read photographs from shared storage. Where they do not see them, or see other files in
-their place, photographs and masks travel with the tasks.
-"""
-
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +35,7 @@ from colmap_affrect.parallel.executor import (
 )
 from colmap_affrect.parallel.opencv_threads import SHARED_OPENCV_THREADS
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.recipes import ExtractionOptions
+from colmap_affrect.recipes import ExtractionOptions, Level
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
 from colmap_affrect.rectifiers.execute import extract_rectified
 from colmap_affrect.stages.context import Resources, require_same_files
@@ -77,34 +72,9 @@ class ImageTask:
     # (3, 3) camera matrix in pixel-centre px of the stored image; by default COLMAP's guess
     intrinsics: Array | None = None
     camera_size: tuple[int, int] | None = None  # (width, height) of its camera, if any
-    sent: Mapping[Path, bytes] | None = None  # its files by absolute path; None to read them
 
     def __str__(self) -> str:
         return self.name
-
-    def with_files(self) -> Self:
-        """Return the task with its files; extraction will report those that cannot be read."""
-        sent = {}
-        for path in self.photographs.files(self.name):
-            with suppress(OSError):
-                sent[path] = path.read_bytes()
-        return replace(self, sent=sent)
-
-    @contextmanager
-    def unpacked(self) -> Iterator[Photographs]:
-        """Yield where the files are; those that were sent are written to a temporary folder."""
-        if self.sent is None:
-            yield self.photographs
-            return
-        with TemporaryDirectory() as root:
-            for path, content in self.sent.items():
-                here = moved(path, Path(root))
-                here.parent.mkdir(parents=True, exist_ok=True)
-                here.write_bytes(content)
-            try:
-                yield self.photographs.moved(lambda path: moved(path, Path(root)))
-            except ImageError as error:
-                raise ImageError(str(error).replace(root, "")) from error
 
 
 @dataclass(eq=False)
@@ -131,27 +101,21 @@ class ImageExtractor:
 
     def __call__(self, task: ImageTask) -> ExtractedImage | ImageError:
         """Extract the features of a photograph, or return why it cannot be used."""
+        path = task.photographs.folder / task.name
         try:
-            with task.unpacked() as photographs:
-                found = self.extract_file(
-                    photographs.folder / task.name,
-                    task.name,
-                    task.intrinsics,
-                    task.level,
-                    photographs.mask(task.name),
-                )
+            mask = task.photographs.mask(task.name)
+            found = self.extract_file(path, task.name, task.intrinsics, task.level, mask)
         except ImageError as error:
             return error
         except Exception as error:
             if not lacks_memory(error):
                 raise
-            return ImageError(f"{task.photographs.folder / task.name}: {MEMORY_HINT}")
+            return ImageError(f"{path}: {MEMORY_HINT}")
         size, expected = found.image_size, task.camera_size
         if expected and expected != size:
             return ImageError(
-                f"{task.photographs.folder / task.name}: is {size[0]} x {size[1]} px, and its "
-                f"camera in the database {expected[0]} x {expected[1]} px; give the images that "
-                "the database is of"
+                f"{path}: is {size[0]} x {size[1]} px, and its camera in the database "
+                f"{expected[0]} x {expected[1]} px; give the images that the database is of"
             )
         return found
 
@@ -172,11 +136,10 @@ class ImageExtractor:
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
         with self.network_lock, SHARED_OPENCV_THREADS:
-            found = unless_gpu_is_full(
-                lambda: self.extract(photograph, level),
-                lambda: self._extract_on_cpu(photograph, level),
+            features, warning = unless_gpu_is_full(
+                lambda: self._features(photograph, level),
+                lambda: self._features_on_cpu(photograph, level),
             )
-        features = found.features
         if photograph.size != original_size:
             resized = resized_from_original(original_size, photograph.size)
             frames = transform_frames(np.linalg.inv(resized), features.lafs)
@@ -185,17 +148,16 @@ class ImageExtractor:
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
         kept = features.select(keep)
-        return ExtractedImage(kept, original_size, found.warning, photograph.stretched)
+        return ExtractedImage(kept, original_size, warning, photograph.stretched)
 
-    def extract(self, photograph: Photograph, level: int = 0) -> ExtractedImage:
+    def _features(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
         """Plan and execute; frames are in px of the photograph at the size of processing."""
         plan, warning = self.plan_or_warn(photograph, level)
-        features = self.execute(photograph, plan, level)
-        return ExtractedImage(features, photograph.size, warning)
+        return self.execute(photograph, plan, level), warning
 
-    def _extract_on_cpu(self, photograph: Photograph, level: int) -> ExtractedImage:
-        found = self._on_cpu.extract(photograph, level)
-        return replace(found, warning="; ".join(filter(None, (MEMORY_IS_FULL, found.warning))))
+    def _features_on_cpu(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
+        features, warning = self._on_cpu._features(photograph, level)
+        return features, "; ".join(filter(None, (MEMORY_IS_FULL, warning)))
 
     @cached_property
     def _on_cpu(self) -> "ImageExtractor":
@@ -265,16 +227,6 @@ class ImageExtractor:
         )
 
 
-def moved(path: Path, root: Path) -> Path:
-    """Return where a file would be if ``root`` were the root of the file system.
-
-    >>> moved(Path("/photos/a.jpg"), Path("/sent")).as_posix()
-    '/sent/photos/a.jpg'
-    """
-    absolute = path.absolute()
-    return root / absolute.relative_to(absolute.anchor)
-
-
 def num_images_at_once(extractor: ImageExtractor) -> int:
     """Return how many images are worked on at once in this process.
 
@@ -315,24 +267,24 @@ def prepare(
     options.check_depth()
     weights = resolve(options.weights, resources.weights_path, progress=progress)
     device = resources.require_device(uses_network=options.uses_networks)
-    network = NetworkContext(weights, device)
+    network, depth = NetworkContext(weights, device), None
     extractor = cache(lambda features: EXTRACTORS.make(features, network))
     extractors = tuple(extractor(level.features) for level in options.levels)
-    depth = None
     if options.uses_depth:
-        depth_context = DepthContext(resources.depth_cache_path, network.device)
-        depth = DEPTH_SOURCES.make(options.depth, depth_context)
+        context = DepthContext(resources.depth_cache_path, device)
+        depth = DEPTH_SOURCES.make(options.depth, context)
         if image_names is not None:
             depth.require_some(image_names)
     shapes = cache(lambda source, features: SHAPES.make(source, network, features))
-    rectifiers = []
-    for level in options.levels:
+
+    def rectifier(level: Level) -> Rectifier:
         item, source = level.rectifier, None
         if isinstance(item, CoverOptions):
             source = shapes(item.shape_source, level.features)
-        inputs = RectifierInputs(source, depth if item.uses_depth else None)
-        rectifiers.append(RECTIFIERS.make(item, inputs))
-    return ImageExtractor(options, extractors, tuple(rectifiers), weights, resources)
+        return RECTIFIERS.make(item, RectifierInputs(source, depth if item.uses_depth else None))
+
+    rectifiers = tuple(map(rectifier, options.levels))
+    return ImageExtractor(options, extractors, rectifiers, weights, resources)
 
 
 def _prepared_elsewhere(

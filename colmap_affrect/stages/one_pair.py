@@ -1,8 +1,4 @@
-"""What is done for one pair, in a thread of this process or on a worker of a cluster.
-
-Workers read features from shared storage. Where they do not see the file, those of its two images
-travel with each pair.
-"""
+"""What is done for one pair, in a thread of this process or on a worker of a cluster."""
 
 import threading
 from collections import OrderedDict
@@ -50,43 +46,18 @@ def iterate_matches(
 ) -> Generator[PairMatches, None, None]:
     """Match pairs, in an order in which an image, once read, stays in memory for most of its pairs.
 
-    Workers that do not see the file of features get those of each pair. By default there is a
-    thread for each core.
+    By default there is a thread for each core. ClusterError when workers do not see the file of
+    features.
     """
     if not pairs:
         return
     executor = executor or Threads(available_cores())
-    store = FeatureStore(matching.store.path.absolute(), matching.store.options_digest)
-    counts = store.num_keypoints()
+    counts = matching.store.num_keypoints()
     num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    images = CachedMatcher(replace(matching, store=store, num_similarities=num_similarities))
-    files = [store.path]
-    is_shared = executor.sees(files)
-    tasks = (
-        PairTask(pair, None if is_shared else (images.read(pair[0]), images.read(pair[1])))
-        for pair in ordered_for_reuse(pairs, max(1, num_kept // 2))
-    )
-    yield from executor.map(images, tasks, files if is_shared else ())
-
-
-@dataclass(frozen=True)
-class StoredFeatures:
-    """The features of an image that are matched."""
-
-    image: ImageFeatures  # the features
-    indices: Indices  # (N,) int64 that they have in the store
-
-
-@dataclass(frozen=True)
-class PairTask:
-    """One pair to match; the features of its images where the worker does not see their file."""
-
-    names: Pair
-    sent: tuple[StoredFeatures, StoredFeatures] | None = None
-
-    def __str__(self) -> str:
-        return " and ".join(self.names)
+    matcher = CachedMatcher(replace(matching, num_similarities=num_similarities))
+    ordered = ordered_for_reuse(pairs, max(1, num_kept // 2))
+    yield from executor.map(matcher, ordered, [matching.store.path])
 
 
 @dataclass(frozen=True)
@@ -131,32 +102,29 @@ class CachedMatcher:
         self._weights = resolve(options.weights, resources.weights_path)
         context = MatcherContext(self._weights, resources.device, matching.num_similarities)
         self._matcher = MATCHERS.make(options, context)
-        self._images = ImageCache(
-            lambda name: self._prepare(self.read(name)), lambda image: int(image.content.nbytes)
-        )
+        self._images = ImageCache(self._prepare, lambda image: int(image.content.nbytes))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuilt, (self._matching, digests(self._weights))
 
-    def __call__(self, task: PairTask) -> PairMatches:
-        """Match by the features that came with the task, or by those in the store."""
-        if task.sent:
-            images = [self._prepare(stored) for stored in task.sent]
-        else:
-            images = [self.prepared(name) for name in task.names]
-        first, second = images
+    def __call__(self, names: Pair) -> PairMatches:
+        """Match the stored features of two images."""
+        first, second = map(self.prepared, names)
         found = self.match(first, second)
         rows, columns = found.indices.T
         indices = np.stack([first.indices[rows], second.indices[columns]], axis=1)
         count = int(first.indices.max(initial=-1)) + 1
-        return PairMatches(task.names, indices, found.scores, count, self._matching.level)
+        return PairMatches(names, indices, found.scores, count, self._matching.level)
 
     def match(self, first: PreparedImage, second: PreparedImage) -> Matches:
         """Match two images; indices are those among the features that were prepared."""
         return self._matcher.match(first.content, second.content)
 
-    def read(self, name: str) -> StoredFeatures:
-        """Read the features of an image."""
+    def prepared(self, name: str) -> PreparedImage:
+        """Return an image ready for matching."""
+        return self._images.get(name)
+
+    def _prepare(self, name: str) -> PreparedImage:
         matching, store = self._matching, self._matching.store
         indices = store.level_indices(name, matching.level, matching.base)
         features = store.read(name).select(indices)
@@ -164,16 +132,8 @@ class CachedMatcher:
             order = np.argsort(-features.responses, kind="stable")
             strongest = np.sort(order[: matching.max_num_features])
             indices, features = indices[strongest], features.select(strongest)
-        size = store.image_size(name)
-        return StoredFeatures(ImageFeatures(features, size, matching.extractor), indices)
-
-    def _prepare(self, stored: StoredFeatures) -> PreparedImage:
-        content = self._matcher.prepare(stored.image)
-        return PreparedImage(content, stored.image.features.lafs, stored.indices)
-
-    def prepared(self, name: str) -> PreparedImage:
-        """Return an image ready for matching."""
-        return self._images.get(name)
+        image = ImageFeatures(features, store.image_size(name), matching.extractor)
+        return PreparedImage(self._matcher.prepare(image), features.lafs, indices)
 
 
 def _rebuilt(matching: Matching, sent: Mapping[str, str]) -> CachedMatcher:

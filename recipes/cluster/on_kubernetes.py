@@ -1,9 +1,11 @@
-"""Reconstruct on Kubernetes: start workers as pods, run colmap-affrect on them, end them.
+r"""Reconstruct on Kubernetes: start workers as pods, run colmap-affrect on them, end them.
 
 Everything after ``--`` goes to ``colmap-affrect run``, which runs on this machine. Needs ``pip
-install dask-kubernetes`` and Dask's operator in the Kubernetes cluster. Usage:
+install dask-kubernetes`` and Dask's operator in the Kubernetes cluster, and photographs and results
+on a volume that this machine mounts at the same path. Usage:
 
-    python on_kubernetes.py --image IMAGE --workers 20 -- --image-path photos --output-path out
+    python on_kubernetes.py --image IMAGE --workers 20 --claim photographs -- \
+        --image-path /shared/photos --output-path /shared/out
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--cores", type=int, default=8, help="of each worker")
     parser.add_argument("--memory", default="16Gi", help="of each worker")
-    parser.add_argument("--claim", help="persistent volume claim with photographs and results")
+    parser.add_argument(
+        "--claim", required=True, help="persistent volume claim with photographs and results"
+    )
     parser.add_argument("--mount-path", default="/shared", help="of the claim in the workers")
     parser.add_argument("arguments", nargs="+", help="of colmap-affrect run, after --")
     options = parser.parse_args()
@@ -41,10 +45,9 @@ def main() -> int:
     container = pod["containers"][0]
     amount = {"cpu": str(options.cores), "memory": options.memory}
     container["resources"] = {"requests": amount, "limits": amount}
-    if options.claim:
-        claim = {"claimName": options.claim}
-        pod["volumes"] = [{"name": "shared", "persistentVolumeClaim": claim}]
-        container["volumeMounts"] = [{"name": "shared", "mountPath": options.mount_path}]
+    claim = {"claimName": options.claim}
+    pod["volumes"] = [{"name": "shared", "persistentVolumeClaim": claim}]
+    container["volumeMounts"] = [{"name": "shared", "mountPath": options.mount_path}]
     with KubeCluster(custom_cluster_spec=spec) as cluster:
         cluster.wait_for_workers(1)
         address = cluster.scheduler_address

@@ -17,7 +17,6 @@ moments depend on how fast the machine is.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import random
 import re
 import shutil
@@ -34,8 +33,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from attacks import ended
-from command import Ended, start
+from command import run_in_process_of_its_own
 from machine import describe_machine, table
 from results import (
     Undisturbed,
@@ -44,6 +42,7 @@ from results import (
     results,
     run_arguments,
     run_undisturbed,
+    tree,
 )
 
 SAMPLE = Path(__file__).parents[2] / "sample_scenes" / "courtyard" / "images"
@@ -55,10 +54,8 @@ CALLS = "write,pwrite64,fsync,fdatasync,rename,ftruncate,unlink,mkdir,rmdir,fall
 
 def content(out: Path) -> dict[str, Any]:
     """All results of a run: what :func:`results.results` has, and each file of the models."""
-    models = sorted(out.glob("sparse/**/*.bin"))
-    return results(out) | {
-        str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in models
-    }
+    models = tree(out / "sparse", times=False)
+    return results(out) | {name: value for name, value in models.items() if name.endswith(".bin")}
 
 
 @dataclass(frozen=True)
@@ -97,18 +94,13 @@ class Case:
 
     def assert_finishes(self, out: Path) -> None:
         """Run again without disturbance and have the same results."""
-        end = ended(*self.arguments(out))
+        end = run_in_process_of_its_own(*self.arguments(out))
         assert end.code == 0, end.stderr
         found = content(out)
-        different = [key for key in self.content if found.get(key) != self.content[key]]
-        assert found.keys() == self.content.keys(), set(found) ^ set(self.content)
+        different = {
+            key for key in {*self.content, *found} if found.get(key) != self.content.get(key)
+        }
         assert not different, f"other {', '.join(different)} than of the undisturbed run"
-
-
-def ended_in(process: subprocess.Popen[str], timeout_s: float = 300) -> Ended:
-    with process:
-        stdout, stderr = process.communicate(timeout=timeout_s)
-    return Ended(process.returncode, stdout, stderr.splitlines())
 
 
 def run_traced(options: Sequence[object], arguments: Sequence[str]) -> int:
@@ -122,10 +114,9 @@ def run_traced(options: Sequence[object], arguments: Sequence[str]) -> int:
 
 def kills(case: Case, out: Path, chance: random.Random) -> str:
     """Kill a run at random moments, several times in one folder."""
-    stages = end_again_and_again(
-        case.photos, out, case.options, case.undisturbed.worked_s,
-        [signal.SIGKILL] * KILLS_IN_ONE_FOLDER, chance,
-    )  # fmt: skip
+    signals = [signal.SIGKILL] * KILLS_IN_ONE_FOLDER
+    worked_s = case.undisturbed.worked_s
+    stages = end_again_and_again(case.photos, out, case.options, worked_s, signals, chance)
     case.assert_finishes(out)
     return ", ".join(stages)
 
@@ -152,11 +143,10 @@ def disks(case: Case, out: Path, chance: random.Random) -> str:
     disk.mkdir(exist_ok=True)
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={num_kib}k", "none", disk], check=True)
     try:
-        end = ended_in(start(*case.arguments(disk / "out")))
+        end = run_in_process_of_its_own(*case.arguments(disk / "out"))
         if end.code:
-            assert end.code == 1, (end.code, end.stderr)
-            assert len(end.stderr) == 1, end.stderr
-            assert "free space" in end.stderr[0], end.stderr
+            assert (end.code, len(end.stderr)) == (1, 1), end
+            assert "free space" in end.stderr[0], end
         subprocess.run(["mount", "-o", "remount,size=2g", disk], check=True)
         case.assert_finishes(disk / "out")
     finally:
@@ -164,17 +154,17 @@ def disks(case: Case, out: Path, chance: random.Random) -> str:
     return f"{num_kib} KiB, exit code {end.code}"
 
 
-TRIALS: dict[str, tuple[Callable[[Case, Path, random.Random], str], int]] = {
-    "kills": (kills, KILLS_IN_ONE_FOLDER),
-    "calls": (calls, 1),
-    "disks": (disks, 1),
+TRIALS: dict[str, tuple[Callable[[Case, Path, random.Random], str], int, str]] = {
+    "kills": (kills, KILLS_IN_ONE_FOLDER, "at random moments"),
+    "calls": (calls, 1, "kills at system calls"),
+    "disks": (disks, 1, "that are full"),
 }
-"""Kinds of trials, and how many disturbances each has."""
+"""Kinds of trials, how many disturbances each has, and what these are."""
 
 
 def campaign(cases: Sequence[Case], kind: str, count: int, seed: int, folder: Path) -> list[str]:
     """Make trials of a kind; return what went wrong."""
-    trial, num_each = TRIALS[kind]
+    trial, num_each, _ = TRIALS[kind]
     wrong = []
     for index in range(-(-count // num_each)):
         case, begun = cases[index % len(cases)], time.monotonic()
@@ -182,12 +172,12 @@ def campaign(cases: Sequence[Case], kind: str, count: int, seed: int, folder: Pa
         out = folder / f"{kind}-{index}"
         shutil.rmtree(out, ignore_errors=True)
         try:
-            told = trial(case, out, random.Random(f"{seed} {kind} {index}"))
+            said = trial(case, out, random.Random(f"{seed} {kind} {index}"))
             shutil.rmtree(out, ignore_errors=True)
         except (AssertionError, subprocess.TimeoutExpired) as error:
-            told = f"WRONG: {error}"
-            wrong.append(f"{name}: {told}")
-        print(f"{name}: {told}; {time.monotonic() - begun:.0f} s", flush=True)
+            said = f"WRONG: {error}"
+            wrong.append(f"{name}: {said}")
+        print(f"{name}: {said}; {time.monotonic() - begun:.0f} s", flush=True)
     return wrong
 
 
@@ -197,18 +187,17 @@ def main() -> int:
     parser.add_argument("--output-path", type=Path, required=True)
     parser.add_argument("--image-path", type=Path, nargs="+", default=[SAMPLE])
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kills", type=int, default=0, help="at random moments")
-    parser.add_argument("--calls", type=int, default=0, help="kills at system calls")
-    parser.add_argument("--disks", type=int, default=0, help="that are full")
+    parser.add_argument("--kills", type=int, default=0, help=TRIALS["kills"][2])
+    parser.add_argument("--calls", type=int, default=0, help=TRIALS["calls"][2])
+    parser.add_argument("--disks", type=int, default=0, help=TRIALS["disks"][2])
     arguments = parser.parse_args()
     folder = arguments.output_path.resolve()
     cases = []
     for number, path in enumerate(arguments.image_path):
         options = SMALL if number % 2 else (*SMALL, *ALL_STAGES)
         cases.append(Case(path.resolve(), options, folder / path.parent.name))
-    for case in cases:
-        shutil.rmtree(case.folder, ignore_errors=True)
-        case.folder.mkdir(parents=True)
+        shutil.rmtree(cases[-1].folder, ignore_errors=True)
+        cases[-1].folder.mkdir(parents=True)
     print(describe_machine(), flush=True)
     rows, wrong = [], []
     for kind in TRIALS:

@@ -105,54 +105,23 @@ def test_wrong_options_are_one_clear_line(options: dict[str, object], message: s
     assert "\n" not in str(error.value)
 
 
-CAMERAS = "# comment\n7 PINHOLE 90 60 101 102 44 31\n9 SIMPLE_RADIAL 90 60 80 45 30 0.1\n"
-IMAGES = "# comment\n3 1 0 0 0 0 0 0 9 b 1.jpg\n1.5 2 -1\n1 1 0 0 0 0 0 0 7 a.jpg\n\n"
-
-
-def test_cameras_of_a_text_model_without_points_are_read(tmp_path: Path) -> None:
-    (tmp_path / "cameras.txt").write_text(CAMERAS)
-    (tmp_path / "images.txt").write_text(IMAGES)
-    for path in (tmp_path, tmp_path / "cameras.txt"):
-        found = given(path)
-        assert found["a.jpg"].params == (101, 102, 44, 31)
-        assert found["b 1.jpg"].params == (80, 45, 30, 0.1)
-        assert found["b 1.jpg"].size == (90, 60)
-        assert found["a.jpg"].label != found["b 1.jpg"].label
-        assert found[""].params == ()
-
-
-def test_one_camera_without_images_is_that_of_all(tmp_path: Path) -> None:
-    (tmp_path / "cameras.txt").write_text(CAMERAS.rpartition("9 ")[0])
-    assert given(tmp_path / "cameras.txt")[""].params == (101, 102, 44, 31)
-
-
-def test_cameras_of_a_binary_model_are_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("write", ["write_binary", "write_text"])
+def test_cameras_of_a_model_are_read(tmp_path: Path, write: str) -> None:
     model = pycolmap.synthesize_dataset(
         pycolmap.SyntheticDatasetOptions(num_points3D=5, num_rigs=2, num_frames_per_rig=2)
     )
-    model.write(tmp_path)
-    found = given(tmp_path)
-    for image in model.images.values():
-        assert found[image.name].params == tuple(model.cameras[image.camera_id].params)
-
-
-@pytest.mark.parametrize(
-    ("cameras", "images", "message"),
-    [
-        ("7 PINHOLE 90 x 1 2 3 4\n", IMAGES, "cameras.txt, line 1: not CAMERA_ID MODEL WIDTH"),
-        (CAMERAS, IMAGES.replace(" 9 b", " 8 b"), "images.txt, line 2: not an image of a camera"),
-        (CAMERAS, None, "images.txt: cannot be read"),
-    ],
-)
-def test_wrong_models_are_one_clear_line(
-    tmp_path: Path, cameras: str, images: str | None, message: str
-) -> None:
-    (tmp_path / "cameras.txt").write_text(cameras)
-    if images is not None:
-        (tmp_path / "images.txt").write_text(images)
-    with pytest.raises(OptionError, match=message) as error:
+    getattr(model, write)(tmp_path)
+    for path in (tmp_path, tmp_path / f"cameras.{write[6:9].replace('tex', 'txt')}"):
+        found = given(path)
+        assert found[""].params == ()
+        for image in model.images.values():
+            camera = model.cameras[image.camera_id]
+            assert found[image.name].params == pytest.approx(tuple(camera.params))
+            assert found[image.name].size == (camera.width, camera.height)
+    for file in tmp_path.glob("points3D.*"):
+        file.unlink()
+    with pytest.raises(OptionError, match=r"^--cameras-path .*give the folder that holds cameras"):
         given(tmp_path)
-    assert "\n" not in str(error.value)
 
 
 FROM_EXIF = CameraRecord(("a č.jpg", "b.jpg"), "exif", 812.5, size=(640, 480))

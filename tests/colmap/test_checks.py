@@ -72,6 +72,12 @@ def changed_keypoint(row: int, column: int, value: float) -> Statement:
     return replace_data("keypoints", 2, keypoints)
 
 
+def at_one_place(count: int, num_there: int) -> Statement:
+    keypoints = np.full((count, 6), 20, np.float32)
+    keypoints[num_there:, 0] = np.arange(count - num_there)
+    return replace_data("keypoints", 2, keypoints)
+
+
 def new_matches(first: int, second: int, table: str = "matches") -> Statement:
     indices = np.array([[0, 1]], np.uint32)
     columns = "pair_id, rows, cols, data" + (", config" * (table != "matches"))
@@ -115,6 +121,7 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
      [f"F of pair_id {pair_id(1, 3)}"]),
     ("keypoints-not-finite", [changed_keypoint(6, 1, np.nan)], ["b c.png"]),
     ("keypoints-outside", [changed_keypoint(3, 0, 91.5)], ["b c.png"]),
+    ("keypoints-at-one-place", [at_one_place(11, 10)], ["b c.png"]),
     ("match-data",
      [f"UPDATE matches SET rows = 3 {OF_13}"], ["a.png - side/č.png (raw matches)"]),
     ("match-data",
@@ -140,6 +147,7 @@ def test_what_is_broken_is_found_and_nothing_else(
     [
         "DELETE FROM frames",  # none has one: as in databases of old
         changed_keypoint(0, 0, 90.5),  # within the tolerance
+        at_one_place(11, 9),
         replace_data("keypoints", 2, np.full((7, 4), 3, np.float32)),
         replace_data("matches", pair_id(1, 2), np.array([[4, 6]], np.uint32)),  # the last ones
         f"UPDATE two_view_geometries SET rows = 0, data = NULL, config = 0 "

@@ -20,7 +20,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import (
     copy_database,
-    copy_with_frames,
     copy_without_features,
     newest_schema_version,
     open_copy,
@@ -120,7 +119,7 @@ def test_command_takes_an_output_folder(source: Path, tmp_path: Path, call: Call
 
 def test_what_is_exported_comes_back(source: Path, tmp_path: Path) -> None:
     export_database(source, tmp_path / "old.db")
-    copy_with_frames(tmp_path / "old.db", tmp_path / "new.db")
+    copy_database(tmp_path / "old.db", tmp_path / "new.db")
     with open_database(tmp_path / "new.db") as new, open_database(source) as database:
         (prior,) = new.read_all_pose_priors()
         np.testing.assert_array_equal(prior.position, GPS)
@@ -253,20 +252,6 @@ def test_old_database_is_migrated_in_the_copy_only(old_database: Path, tmp_path:
     assert schema_version(tmp_path / "copy.db") == newest_schema_version() > 3800
     with open_database(tmp_path / "copy.db") as database:
         assert database.read_keypoints(7).tolist() == [[10.5, 20.5], [30.5, 40.5]]
-
-
-def test_old_database_without_features_can_be_mapped(old_database: Path, tmp_path: Path) -> None:
-    copy_without_features(old_database, tmp_path / "new.db")
-    with open_database(tmp_path / "new.db") as database:
-        images = {image.name: image for image in database.read_all_images()}
-        assert {name: image.image_id for name, image in images.items()} == {"7.jpg": 7, "8.jpg": 8}
-        assert all(image.has_frame_id() for image in images.values())
-        assert not database.exists_keypoints(7)
-        camera = database.read_camera(3)
-        assert (camera.params.tolist(), camera.has_prior_focal_length) == (
-            [500.0, 320.0, 240.0],
-            True,
-        )
 
 
 def test_images_without_a_frame_get_one_and_others_keep_theirs(

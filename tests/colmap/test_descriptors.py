@@ -12,7 +12,6 @@ from small_scene import write_photographs
 import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
-    colmap_descriptors,
     image_ids,
     open_database,
     write_descriptors,
@@ -59,6 +58,18 @@ def test_colmap_matches_what_float_descriptors_match(tmp_path: Path) -> None:
     assert len(found - expected) <= 0.05 * len(expected)
 
 
+def written(path: Path, *descriptors: NDArray[np.floating]) -> list[NDArray[np.uint8]]:
+    """Write descriptors of an image each; return them as COLMAP has them."""
+    with open_database(path) as database:
+        camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 300.0, 320, 240)
+        database.write_camera(camera)
+        for number, rows in enumerate(descriptors, start=1):
+            database.write_image(pycolmap.Image(name=f"{number}.png", camera_id=1))
+            database.write_keypoints(number, np.full((len(rows), 2), 5.0, np.float32))
+            write_descriptors(database, number, rows)
+        return [database.read_descriptors(n + 1).data for n in range(len(descriptors))]
+
+
 def test_signed_descriptors_of_networks_are_matched_too(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
 
@@ -71,24 +82,20 @@ def test_signed_descriptors_of_networks_are_matched_too(tmp_path: Path) -> None:
     second = unit(cosines * first + np.sqrt(1.0 - cosines**2) * noise)
     second[900:] = unit(rng.normal(size=(600, 128)))
     path = tmp_path / "a.db"
-    with open_database(path) as database:
-        camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 300.0, 320, 240)
-        database.write_camera(camera)
-        for number, rows in enumerate((first, second), start=1):
-            image = pycolmap.Image(name=f"{number}.png", camera_id=1)
-            database.write_image(image)
-            database.write_keypoints(number, np.full((len(rows), 2), 5.0, np.float32))
-            write_descriptors(database, number, rows)
+    written(path, first, second)
     expected, found = float_matches(first, second), colmap_matches(path)
     assert len(expected) > 600
     assert len(expected & found) >= 0.95 * len(expected)
 
 
-def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble() -> None:
+def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble(
+    tmp_path: Path,
+) -> None:
     row = np.full((1, 128), np.sqrt((1.0 - 0.26) / 125))
     row[0, :3] = 0.3, 0.4, 0.1
-    assert colmap_descriptors(row)[0, :3].tolist() == [154, 205, 51]
-    assert colmap_descriptors(np.zeros((0, 128))).shape == (0, 128)
-    assert not colmap_descriptors(np.zeros((2, 128))).any()
+    values, none, zeros = written(tmp_path / "a.db", row, np.zeros((0, 128)), np.zeros((2, 128)))
+    assert values[0, :3].tolist() == [154, 205, 51]
+    assert len(none) == 0
+    assert not zeros.any()
     with pytest.raises(DatabaseError, match=r"64 elements.*leave out --database-descriptors"):
-        colmap_descriptors(np.ones((3, 64)))
+        written(tmp_path / "b.db", np.ones((3, 64)))

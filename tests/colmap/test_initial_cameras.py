@@ -188,11 +188,12 @@ def test_cameras_that_cannot_be_are_one_clear_line(
 
 def test_model_must_be_of_these_images(photos: Path, tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 90 60 71 44 31\n")
+    (tmp_path / "points3D.txt").touch()
     images = "1 1 0 0 0 0 0 0 1 {}\n\n2 1 0 0 0 0 0 0 1 others.jpg\n\n"
     (tmp_path / "images.txt").write_text(images.format("c.jpg"))
     initial = InitialCameras(photos, CameraOptions(cameras_path=str(tmp_path)))
     initial.check(NAMES)  # it may have more images
-    with pytest.raises(OptionError, match=r"cameras\.txt, line 1: others\.jpg is not in"):
+    with pytest.raises(OptionError, match=r"camera 1: others\.jpg is not in"):
         initial.check(NAMES[:2])
     (tmp_path / "images.txt").write_text(images.format("side/d.jpg"))
     initial = InitialCameras(photos, CameraOptions(cameras_path=str(tmp_path)))

@@ -49,7 +49,7 @@ def test_option_is_converted_to_pycolmaps_type_and_taken_by_pycolmap(
 @pytest.mark.parametrize(
     ("mapper", "key", "value", "message"),
     [
-        ("incremental", "init_max_eror", "3", "did you mean 'mapper.init_max_error'"),
+        ("incremental", "init_max_eror", "3", "did you mean 'init_max_error'"),
         ("global", "gpu_index", "0", "several sections; give mapper.global_positioning.gpu_index"),
         ("incremental", "min_model_size", "2.5", "min_model_size=2.5: expected int"),
         ("incremental", "min_model_size", "9" * 11, "outside the range of int"),

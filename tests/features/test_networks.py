@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 from kornia import feature
 from kornia.feature import extract_patches_from_pyramid
-from kornia.feature.mkd import Whitening
 from numpy.testing import assert_allclose
 from random_weights import randomized
 from synthetic import texture
@@ -19,15 +17,12 @@ from torch.nn import functional
 
 from colmap_affrect.errors import DeviceError, OptionError, WeightsError
 from colmap_affrect.features import networks
-from colmap_affrect.features.affnet_hardnet import AffNetHardNetOptions
 from colmap_affrect.features.networks import (
-    DESCRIPTOR_NETWORKS,
-    DESCRIPTOR_SIZE,
     OnPatches,
     PatchSampler,
+    hardtfeat,
     load_affnet,
     load_descriptor,
-    load_detector,
     load_orinet,
     resolve_device,
 )
@@ -35,9 +30,6 @@ from colmap_affrect.geometry.affine import rotation
 
 ROUNDING = 1e-5
 """Sums of up to 4096 float32 products of order one, added in another order."""
-
-MKD_WIDTH = 238
-"""Kernels of MKD's ``concat`` embedding (7 x 25 polar and 7 x 9 cartesian)."""
 
 
 @pytest.fixture(autouse=True)
@@ -49,29 +41,22 @@ def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket, "create_connection", refuse)
 
 
-def whitening_model(seed: int = 3) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    vectors = torch.linalg.qr(torch.rand(MKD_WIDTH, MKD_WIDTH, generator=generator))[0]
-    values = torch.linspace(2.0, 0.01, MKD_WIDTH)
-    return {"mean": 0.01 * torch.rand(MKD_WIDTH, generator=generator), "eigvecs": vectors,
-            "eigvals": values}  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file ``<key>.pth`` for each network, of seeded random numbers; not to be changed."""
     tmp_path = tmp_path_factory.mktemp("weights")
     torch.manual_seed(0)
-    networks = {name: build() for name, build in DESCRIPTOR_NETWORKS.items()}
-    networks["affnet"] = feature.LAFAffNetShapeEstimator(pretrained=False)
-    networks["orinet"] = feature.OriNet(pretrained=False)
-    networks["keynet"] = feature.KeyNet(pretrained=False)
+    networks = {
+        "hardnet": feature.HardNet(pretrained=False),
+        "hardtfeat": hardtfeat(),
+        "affnet": feature.LAFAffNetShapeEstimator(pretrained=False),
+        "orinet": feature.OriNet(pretrained=False),
+    }
     for seed, (name, network) in enumerate(networks.items()):
         state = randomized(network, seed).state_dict()
         if name == "hardtfeat":
             state["SIFT.gx.0.weight"] = torch.zeros(1, 1, 1, 3)
         torch.save({"epoch": 7, "state_dict": state}, tmp_path / f"{name}.pth")
-    torch.save({"liberty": {"pca": whitening_model()}}, tmp_path / "mkd.pth")
     return tmp_path
 
 
@@ -107,42 +92,13 @@ def test_resolve_device_of_an_unknown_name_lists_the_known_ones(name: str) -> No
 # Files.
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "name",
-    sorted(
-        set(get_args(AffNetHardNetOptions.model_fields["descriptor"].annotation))
-        - {"mkd", "hardtfeat"}
-    ),
-)
-def test_load_descriptor_computes_what_kornia_does(
-    folder: Path, patches: torch.Tensor, name: str
-) -> None:
-    reference = DESCRIPTOR_NETWORKS[name]()
-    path = folder / f"{name}.pth"
+def test_load_hardnet_computes_what_kornia_does(folder: Path, patches: torch.Tensor) -> None:
+    reference = feature.HardNet(pretrained=False).eval()
+    path = folder / "hardnet.pth"
     reference.load_state_dict(torch.load(path, weights_only=True)["state_dict"])
     with torch.inference_mode():
-        torch.testing.assert_close(
-            load_descriptor(name, path, "cpu")(patches), reference.eval()(patches),
-            rtol=0, atol=ROUNDING,
-        )  # fmt: skip
-
-
-def test_load_mkd_whitens_what_the_kernels_give(folder: Path, patches: torch.Tensor) -> None:
-    kernels = feature.MKDDescriptor(32, whitening=None)
-    whitening = Whitening("pcawt", {"pca": whitening_model()}, MKD_WIDTH, DESCRIPTOR_SIZE)
-    rows = load_descriptor("mkd", folder / "mkd.pth", "cpu")(patches)
-    torch.testing.assert_close(rows, whitening(kernels(patches)).detach())
-    assert not torch.allclose(rows, kernels(patches)[:, :DESCRIPTOR_SIZE], atol=0.01)
-
-
-def test_load_mkd_refuses_other_files(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match=r"affnet\.pth: not the whitening of mkd"):
-        load_descriptor("mkd", folder / "affnet.pth", "cpu")
-    model = whitening_model() | {"eigvecs": torch.eye(63), "eigvals": torch.ones(63)}
-    torch.save({"liberty": {"pca": model}}, tmp_path / "mkd-cart-64.pth")
-    with pytest.raises(WeightsError, match=r"mkd-cart-64\.pth: .*width of 63"):
-        load_descriptor("mkd", tmp_path / "mkd-cart-64.pth", "cpu")
+        rows = load_descriptor("hardnet", path, "cpu")(patches)
+        torch.testing.assert_close(rows, reference(patches), rtol=0, atol=ROUNDING)
 
 
 def test_loaders_refuse_the_file_of_another_network(folder: Path) -> None:
@@ -150,10 +106,8 @@ def test_loaders_refuse_the_file_of_another_network(folder: Path) -> None:
         load_affnet(folder / "orinet.pth", "cpu")
     with pytest.raises(WeightsError, match=r"affnet\.pth: not the weights of OriNet"):
         load_orinet(folder / "affnet.pth", "cpu")
-    with pytest.raises(WeightsError, match=r"hardnet\.pth: not the weights of Key\.Net"):
-        load_detector("keynet", 10, {"keynet": folder / "hardnet.pth"}, "cpu")
-    with pytest.raises(WeightsError, match=r"hardnet8\.pth: not the weights of hardnet \("):
-        load_descriptor("hardnet", folder / "hardnet8.pth", "cpu")
+    with pytest.raises(WeightsError, match=r"hardtfeat\.pth: not the weights of hardnet \("):
+        load_descriptor("hardnet", folder / "hardtfeat.pth", "cpu")
 
 
 @pytest.mark.parametrize(

@@ -84,18 +84,14 @@ def test_pages_that_lie_on_their_side_are_upright(tmp_path: Path, dtype: type) -
         np.testing.assert_array_equal(made, upright)
 
 
-def test_what_is_there_is_not_made_again(scans: Path, tmp_path: Path) -> None:
-    convert_images(scans, tmp_path / "photos")
-    (tmp_path / "photos" / "d.tif-page2.png").unlink()
-    report = convert_images(scans, tmp_path / "photos")
-    assert list(report.written) == ["d.tif"]
-    assert report.kept == ["b.webp", "box/a.jp2", "c.jpg", "truly-webp.png"]
-
-
-def test_new_folder_inside_the_old_one_is_refused(scans: Path) -> None:
-    with pytest.raises(OptionError, match="give a folder beside it"):
-        convert_images(scans, scans / "png")
-    with pytest.raises(OptionError, match="is the folder of the photographs"):
-        convert_images(scans, scans)
+def test_folders_that_are_there_and_those_inside_the_old_one_are_refused(
+    scans: Path, tmp_path: Path
+) -> None:
+    for folder in (scans, scans / "png"):
+        with pytest.raises(OptionError, match=r"lies in the folder of the|exists"):
+            convert_images(scans, folder)
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(OptionError, match="exists, and is left as it is"):
+        convert_images(scans, tmp_path / "mine")
     with pytest.raises(OptionError, match="nowhere: no such folder"):
         convert_images(scans / "nowhere", scans)

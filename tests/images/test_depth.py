@@ -26,8 +26,6 @@ def write_map(path, values):
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".npy":
         np.save(path, values)
-    elif path.suffix == ".npz":
-        np.savez(path, depth=values)
     else:
         write_image(path, values)
     return path
@@ -41,10 +39,9 @@ def source(path, **options):
 
 
 @pytest.mark.parametrize("dtype", [np.float16, ">f4", np.int32])
-@pytest.mark.parametrize("suffix", [".npy", ".npz"])
-def test_arrays_round_trip(tmp_path, suffix, dtype):
+def test_arrays_round_trip(tmp_path, dtype):
     values = np.asfortranarray(asymmetric_map().astype(dtype))
-    write_map(tmp_path / f"a{suffix}", values)
+    write_map(tmp_path / "a.npy", values)
     depth = source(tmp_path).depth(photograph())
     assert depth.dtype == np.float32
     assert_allclose(depth, values, rtol=FLOAT32_RTOL)
@@ -59,25 +56,8 @@ def test_png_of_sixteen_bits_counts_steps_and_zero_is_unknown(tmp_path):
     assert_allclose(depth, expected, rtol=FLOAT32_RTOL)
 
 
-def test_the_only_map_of_a_file_is_taken_or_the_one_named_depth(tmp_path):
-    values = asymmetric_map()
-    contents = {
-        "a": {"inner": values},
-        "b": {"confidence": 2 * values, "depth": values},
-        "c": {"left": values, "right": 2 * values},
-    }
-    for name, arrays in contents.items():
-        np.savez(tmp_path / f"{name}.npz", **arrays)
-    depths = source(tmp_path)
-    for name in ("a", "b"):
-        assert_allclose(depths.depth(photograph(f"{name}.jpg")), values, rtol=FLOAT32_RTOL)
-    message = "expected one array, or one named 'depth', found left, right"
-    with pytest.raises(DepthError, match=message):
-        depths.depth(photograph("c.jpg"))
-
-
 def test_places_are_searched_in_the_documented_order(tmp_path):
-    suffixes = (".npy", ".npz", ".png", ".tif", ".tiff")
+    suffixes = (".npy", ".png", ".tif", ".tiff")
     places = [f"{stem}{suffix}" for stem in ("v1.2/č d.x.jpg", "v1.2/č d.x") for suffix in suffixes]
     for number, place in enumerate(places, 1):
         write_map(tmp_path / place, np.full((4, 6), number, np.uint16))
@@ -137,13 +117,13 @@ def test_missing_map_names_the_places_looked_at(tmp_path):
         source(tmp_path).depth(photograph("side/a.jpg"))
     message = str(error.value)
     assert message.startswith(f"{tmp_path}: no depth map of side/a.jpg; ")
-    assert "side/a.jpg.* and side/a.* with * one of .npy, .npz, .png, .tif, .tiff" in message
+    assert "side/a.jpg.* and side/a.* with * one of .npy, .png, .tif, .tiff" in message
     assert "\n" not in message
     with pytest.raises(DepthError, match="no depth map"):
         source(tmp_path).depth(photograph(""))
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".npz", ".png", ".tif"])
+@pytest.mark.parametrize("suffix", [".npy", ".png", ".tif"])
 def test_file_of_another_format_or_with_pickled_objects_is_unreadable(tmp_path, suffix):
     pickled = tmp_path / "pickled.npy"
     np.save(pickled, np.array([[{}, {}]]), allow_pickle=True)
@@ -167,7 +147,7 @@ def test_array_that_is_no_map_of_numbers_is_refused(tmp_path, values):
         source(tmp_path).depth(photograph())
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".npz", ".png", ".tif"])
+@pytest.mark.parametrize("suffix", [".npy", ".png", ".tif"])
 def test_map_far_larger_than_the_photograph_is_refused_by_its_header(tmp_path, suffix):
     large = np.ones((1800, 2700), np.uint16)
     write_map(tmp_path / f"a{suffix}", large)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import Call
-from exported_model import NAMES, write_model, write_photographs
+from exported_model import write_model, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import ImageError, OptionError
@@ -35,41 +35,6 @@ def test_points_and_text_hold_the_model(tmp_path: Path) -> None:
     ply = (tmp_path / "out" / "points3D.ply").read_bytes()
     assert ply.startswith(b"ply")
     assert b"element vertex 60" in ply
-
-
-@pytest.mark.usefixtures("model")
-def test_bundler_projects_points_where_their_keypoints_are(tmp_path: Path) -> None:
-    path = export(tmp_path / "model", tmp_path / "out", ["bundler"])["bundler"]
-    numbers = [np.fromstring(line, sep=" ") for line in path.read_text().splitlines()[2:]]
-    cameras, points = numbers[: 4 * 5], numbers[4 * 5 :]
-    for place, color, views in zip(*[iter(points)] * 3, strict=True):
-        assert color[2] == 250
-        for view in views[1:].reshape(-1, 4):
-            focal, *rows, shift = cameras[5 * int(view[0]) : 5 * int(view[0]) + 5]
-            x, y, z = np.array(rows) @ place + shift
-            flat = -np.array([x, y]) / z
-            scale = 1.0 + focal[1] * (flat @ flat)
-            np.testing.assert_allclose(focal[0] * scale * flat, view[2:], atol=1e-6)
-    assert (tmp_path / "out" / "bundle.list.txt").read_text().split() == sorted(NAMES)
-
-
-def test_nvm_has_centres_and_keypoints_from_the_principal_point(
-    tmp_path: Path, model: pycolmap.Reconstruction
-) -> None:
-    path = export(tmp_path / "model", tmp_path / "out", ["nvm"])["nvm"]
-    lines = path.read_text().splitlines()
-    assert lines[:3] == ["NVM_V3", "", "4"]
-    name, focal, *values = lines[3].split()
-    w, x, y, z, *center, k, _ = map(float, values)
-    image = model.find_image_with_name(name)
-    assert (float(focal), k) == (150.0, -0.05)
-    np.testing.assert_allclose(center, image.projection_center())
-    np.testing.assert_allclose([x, y, z, w], image.cam_from_world().rotation.quat)
-    point = lines[9].split()
-    assert point[6:8] == ["4", "0"]
-    place = np.array(point[:3], float)
-    keypoint = np.array(point[9:11], float) + np.array([75.0, 66.0])
-    np.testing.assert_allclose(keypoint, projected(model, name, place), atol=1e-6)
 
 
 @pytest.mark.usefixtures("model")
@@ -121,11 +86,8 @@ def test_table_has_harmless_cells_and_map_the_direction_of_view(tmp_path: Path) 
 
 def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
     write_model(tmp_path / "model", "OPENCV")
-    for name in ("nvm", "bundler"):
-        with pytest.raises(OptionError, match=r"OPENCV.*undistorted"):
-            export(tmp_path / "model", tmp_path / "out", [name])
-    with pytest.raises(OptionError, match="did you mean 'bundler'"):
-        export(tmp_path / "model", tmp_path / "out", ["bundle"])
+    with pytest.raises(OptionError, match="did you mean 'nerfstudio'"):
+        export(tmp_path / "model", tmp_path / "out", ["nerfstudios"])
     with pytest.raises(OptionError, match="--image-path: give the folder"):
         export(tmp_path / "model", tmp_path / "out", ["undistorted"])
     (tmp_path / "photos").mkdir()

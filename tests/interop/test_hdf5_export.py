@@ -131,16 +131,6 @@ def test_descriptors_of_a_database_become_real_ones(
         assert "descriptors" not in file["c.png"]
 
 
-def test_half_rounds_everything_and_says_so(tmp_path: Path, targets: tuple[Path, Path]) -> None:
-    make_database(tmp_path / "x.db", {"a.png": [[1500.75, 3.125]]}, {}).close()
-    report = export_h5(*targets, database_path=tmp_path / "x.db", half=True)
-    assert "coordinates are rounded: float16" in report.summary()
-    with h5py.File(targets[0], "r") as file:
-        assert file["a.png/keypoints"].dtype == np.float16
-        assert file["a.png/keypoints"][()].tolist() == [[1500.0, 2.625]]
-        assert file["a.png/image_size"].dtype.kind == "i"
-
-
 def test_second_match_of_a_keypoint_is_left_out_of_hlocs_files_only(
     tmp_path: Path, targets: tuple[Path, Path]
 ) -> None:

@@ -189,7 +189,7 @@ def test_gpu_without_memory_leaves_the_work_to_the_cpu(
     def full(_: object) -> None:
         raise RuntimeError("CUDA out of memory")
 
-    monkeypatch.setattr(matcher, "_network", full)
+    monkeypatch.setattr(matcher._network, "forward", full)
     assert_array_equal(matcher.match(*pair).indices, expected.indices)
     assert len(expected.scores) == 50
 

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.errors import DeviceError
 from colmap_affrect.matchers import nearest_8bit as coarse
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
 from colmap_affrect.matchers.nearest import (
@@ -18,27 +17,14 @@ from colmap_affrect.matchers.nearest import (
     match_features,
     matchable,
 )
-from colmap_affrect.matchers.nearest_8bit import (
-    EightBitDescriptors,
-    HalfDescriptors,
-    MakeCoarse,
-    coarse_descriptors,
-    has_fast_8_bit_products,
-)
-
-KINDS: dict[str, MakeCoarse] = {
-    "8 bit": EightBitDescriptors.of,
-    "16 bit": lambda descriptors: HalfDescriptors.of(descriptors, "cpu"),
-}
+from colmap_affrect.matchers.nearest_8bit import coarse_pays, has_fast_8_bit_products
 
 
-@pytest.fixture(params=KINDS)
-def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> MakeCoarse:
-    """Each kind, on any processor."""
+@pytest.fixture(autouse=True)
+def _on_any_processor(monkeypatch: pytest.MonkeyPatch) -> None:
     if not has_fast_8_bit_products():
         monkeypatch.setattr(coarse, "_packed", coarse._filled_up)
         monkeypatch.setattr(coarse, "_similarity_codes", similarity_codes)
-    return KINDS[request.param]
 
 
 def similarity_codes(
@@ -66,6 +52,16 @@ def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArra
     return views
 
 
+def require_exact(views: list[tuple[NDArray, NDArray]], options: NearestOptions) -> int:
+    """Compare with the matches of exact similarities; return how many there are."""
+    exact = match_features(*(matchable(*view, options) for view in views), options)
+    images = (matchable(*view, options, is_coarse=True) for view in views)
+    found = match_features(*images, options)
+    np.testing.assert_array_equal(found.indices, exact.indices)
+    np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
+    return len(exact.indices)
+
+
 @pytest.mark.parametrize("options", [
     NearestOptions(),
     NearestOptions(max_ratio=0.97, ratio_both_ways=False),
@@ -74,17 +70,12 @@ def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArra
 @pytest.mark.parametrize("noise", [0.3, 1.0])
 @pytest.mark.parametrize("signed", [False, True])
 def test_matches_are_those_of_exact_similarities(
-    kind: MakeCoarse, options: NearestOptions, noise: float, signed: bool
+    options: NearestOptions, noise: float, signed: bool
 ) -> None:
-    views = crowded_views(3, noise, signed=signed)
-    exact = match_features(*(matchable(*view, options) for view in views), options)
-    assert 30 < len(exact.indices) < 260
-    found = match_features(*(matchable(*view, options, kind) for view in views), options)
-    np.testing.assert_array_equal(found.indices, exact.indices)
-    np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
+    assert 30 < require_exact(crowded_views(3, noise, signed=signed), options) < 260
 
 
-def test_ambiguous_copies_do_not_hide_a_match(kind: MakeCoarse) -> None:
+def test_ambiguous_copies_do_not_hide_a_match() -> None:
     # The query is nearest to feature 0 or 1, copies of each other. Feature 2, a bit less similar,
     # is a rival of 1 only: with 1 as the nearest the ratio is small, with 0 it is near 1.
     options = NearestOptions(ratio_both_ways=False, min_contrast_distance_px=10.0)
@@ -97,39 +88,23 @@ def test_ambiguous_copies_do_not_hide_a_match(kind: MakeCoarse) -> None:
     places = np.array([(0.0, 0.0), (8.0, 0.0), (16.0, 0.0), (99.0, 0.0)])
     for order in itertools.permutations(range(4)):
         views = [(query, np.zeros((1, 2))), (others[list(order)], places[list(order)])]
-        exact = match_features(*(matchable(*view, options) for view in views), options)
-        found = match_features(*(matchable(*view, options, kind) for view in views), options)
-        assert len(exact.indices) == 1
-        np.testing.assert_array_equal(found.indices, exact.indices)
-        np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
+        assert require_exact(views, options) == 1
 
 
 @pytest.mark.parametrize("counts", [(0, 5), (5, 0), (1, 1), (1, 7), (300, 1)])
-def test_few_features(kind: MakeCoarse, counts: tuple[int, int]) -> None:
+def test_few_features(counts: tuple[int, int]) -> None:
     rng = np.random.default_rng(7)
-    options = NearestOptions()
     views = [(unit_rows(rng.gamma(0.4, size=(n, 128))), rng.uniform(0, 99, (n, 2))) for n in counts]
-    found = match_features(*(matchable(*view, options, kind) for view in views), options)
-    exact = match_features(*(matchable(*view, options) for view in views), options)
-    np.testing.assert_array_equal(found.indices, exact.indices)
+    require_exact(views, NearestOptions())
 
 
 def test_coarse_descriptors_are_made_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse() -> bool:
-        raise AssertionError("asked")
-
-    monkeypatch.setattr(coarse, "has_fast_8_bit_products", refuse)
     monkeypatch.setattr(coarse, "available_cores", lambda: 3)
-    assert coarse_descriptors(1.7e9) is None
-    assert coarse_descriptors(1.7e9, "cpu") is None
-    with pytest.raises(AssertionError, match="asked"):
-        coarse_descriptors(1.9e9, "cpu")
-    monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: False)
-    assert coarse_descriptors(1e15, "cpu") is None
     monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: True)
-    assert coarse_descriptors(1e15, "cpu") == EightBitDescriptors.of
-    with pytest.raises(DeviceError, match="--device cuda:99"):
-        coarse_descriptors(0, "cuda:99")
+    assert not coarse_pays(1.7e9)
+    assert coarse_pays(1.9e9)
+    monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: False)
+    assert not coarse_pays(1e15)
 
 
 def test_torch_without_the_products_matches_exactly(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,15 +16,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import torch
 from local_cluster import local_cluster
 from random_weights import write_comparing_lightglue
 from results import hdf5_content
 from small_scene import INTRINSICS, write_photographs
-from synthetic import write_image
 
-from colmap_affrect.errors import ClusterError, StaleStoreError, WeightsError
-from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.errors import ClusterError, StaleStoreError
+from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.parallel import cluster as cluster_module
 from colmap_affrect.parallel.cluster import Cluster, WorkerEnvironment, connected
 from colmap_affrect.parallel.executor import Executor, Threads
@@ -36,7 +34,7 @@ from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
-from colmap_affrect.stages.one_pair import CachedMatcher, Matching, iterate_matches
+from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 
 CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
@@ -65,10 +63,9 @@ def run_stages(
     photos: Path,
     executor: Executor | None,
     *,
-    masks: MaskOptions | None = None,
     progress: Progress = SILENT,
 ) -> StageReport:
-    inputs = Inputs.of(photos, cameras=CAMERAS, masks=masks)
+    inputs = Inputs.of(photos, cameras=CAMERAS)
     with Workspace(out).locked() as workspace:
         context = Context(workspace, executor=executor, progress=progress)
         report = extract(context, inputs, RECIPE)
@@ -105,12 +102,6 @@ class KillsOneWorker(Progress):
         os.kill(self._client.run(os.getpid)[victim], signal.SIGKILL)
 
 
-class WithoutSharedStorage(Cluster):
-    def sees(self, paths: Sequence[Path]) -> bool:
-        del paths
-        return False
-
-
 @pytest.mark.long
 def test_cluster_that_loses_a_worker_leaves_what_a_local_run_leaves(
     tmp_path: Path, photos: Path, address: str
@@ -127,28 +118,12 @@ def test_cluster_that_loses_a_worker_leaves_what_a_local_run_leaves(
     assert hdf5_contents(tmp_path / "cluster") == hdf5_contents(tmp_path / "local")
 
 
-@pytest.mark.long
-def test_files_that_workers_do_not_see_are_sent(tmp_path: Path, photos: Path, address: str) -> None:
-    for name in ("a.png", "b c.png", "side/d.png"):  # side/č.png has none
-        mask = np.zeros((240, 320), np.uint8)
-        mask[40:, 30:] = 255
-        path = tmp_path / "masks" / f"{name}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, mask)
-    masks = MaskOptions(path=str(tmp_path / "masks"))
-    expected = run_stages(tmp_path / "local", photos, None, masks=masks)
+def test_files_that_workers_do_not_see_are_named(photos: Path, address: str) -> None:
     with connected(address) as cluster:
-        sending = WithoutSharedStorage(cluster._client, address)
-        report = run_stages(tmp_path / "cluster", photos, sending, masks=masks)
-    assert report.failures == expected.failures
-    assert list(report.failures) == [DAMAGED]
-    assert hdf5_contents(tmp_path / "cluster") == hdf5_contents(tmp_path / "local")
-
-
-def test_files_are_seen_when_their_content_is_the_same(photos: Path, address: str) -> None:
-    with connected(address) as cluster:
-        assert cluster.sees([photos, photos / "a.png"])
-        assert not cluster.sees([Path("relative.png"), Path(os.path.relpath(photos / "a.png"))])
+        assert list(cluster.map(len, ["task"], [photos, photos / "a.png"])) == [4]
+        unseen = Path(os.path.relpath(photos / "a.png"))
+        with pytest.raises(ClusterError, match=rf"does not see {unseen} as this machine does"):
+            list(cluster.map(len, ["task"], [photos, unseen]))
 
 
 def test_cluster_that_is_no_use_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,7 +168,7 @@ def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None
     other = replace(here, host="far", versions=(*here.versions[:-1], ("kornia", "0.1")))
     with pytest.raises(ClusterError, match=r"worker on far: has kornia 0\.1, and the machine"):
         here.require_same(other)
-    (tmp_path / "a.png").write_bytes(b"2")
+    (tmp_path / "a.png").write_bytes(b"22")
     with pytest.raises(ClusterError, match=r"does not see .*a\.png"):
         here.require_same(WorkerEnvironment.of(paths))
 
@@ -271,21 +246,3 @@ def test_cluster_finds_what_threads_find(
     expected = matched(tmp_path / "local", extracted, lightglue, Threads(2))
     with connected(address) as cluster:
         assert matched(tmp_path / "cluster", extracted, lightglue, cluster) == expected
-
-
-def test_workers_with_other_weights_are_refused(
-    tmp_path: Path, extracted: Path, lightglue: Path
-) -> None:
-    folder = tmp_path / "lightglue"
-    shutil.copytree(lightglue, folder)
-    store = Context(Workspace(extracted)).features
-    resources = Resources(folder, "cpu")
-    matching = Matching(store, WITH_NETWORK.matching, resources=resources)
-    rebuild, given = CachedMatcher(matching).__reduce__()
-    rebuild(*given)
-    state = torch.load(folder / "sift_lightglue.pth", weights_only=True)
-    torch.save(
-        state | {"posenc.Wr.weight": state["posenc.Wr.weight"] + 1}, folder / "sift_lightglue.pth"
-    )
-    with pytest.raises(WeightsError, match=r"sift_lightglue\.pth: is another file than"):
-        rebuild(*given)

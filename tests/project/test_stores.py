@@ -30,14 +30,6 @@ def some_features(count: int, seed: int = 0) -> LocalFeatures:
     return LocalFeatures(lafs, responses, descriptors, rng.integers(0, 9, count).astype(np.int32))
 
 
-def assert_same_features(read: LocalFeatures, written: LocalFeatures) -> None:
-    assert_array_equal(read.lafs, written.lafs.astype(np.float32))
-    assert_array_equal(read.responses, written.responses)
-    assert_array_equal(read.rectification_ids, written.rectification_ids)
-    assert read.descriptors.shape == written.descriptors.shape
-    assert_allclose(read.descriptors, written.descriptors, atol=FLOAT16_ROUNDING)
-
-
 def test_levels_of_other_features_are_kept_side_by_side(tmp_path: Path) -> None:
     """Shorter and longer descriptors; the photograph looked at again is no warp."""
     store, first = FeatureStore(tmp_path / "features.h5"), some_features(4)
@@ -80,33 +72,29 @@ def test_store_of_other_options_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 1, 40_000])
-def test_read_returns_what_was_written(store: FeatureStore, count: int) -> None:
+def test_features_are_read_as_written_and_have_the_layout_of_hloc(
+    store: FeatureStore, count: int
+) -> None:
     written = some_features(count)
-    store.write("a.png", written, (320, 240))
-    read = store.read("a.png")
-    assert_same_features(read, written)
-    assert read.descriptors.flags.c_contiguous
-    assert read.descriptors.dtype == np.float32
-    assert read.lafs.dtype == np.float64
-    assert store.num_keypoints() == {"a.png": count}
-    assert_array_equal(store.read_frames("a.png"), written.lafs.astype(np.float32))
-
-
-def test_features_have_the_layout_of_hloc(store: FeatureStore) -> None:
-    written = some_features(7)
     store.write("west wing/a.png", written, (320, 240))
+    read = store.read("west wing/a.png")
+    assert_array_equal(read.lafs, written.lafs.astype(np.float32))
+    assert_array_equal(read.responses, written.responses)
+    assert_array_equal(read.rectification_ids, written.rectification_ids)
+    assert_allclose(read.descriptors, written.descriptors, atol=FLOAT16_ROUNDING)
+    assert read.descriptors.flags.c_contiguous
+    assert (read.descriptors.dtype, read.lafs.dtype) == (np.float32, np.float64)
+    assert store.num_keypoints() == {"west wing/a.png": count}
     with h5py.File(store.path, "r") as file:
         group = file["west wing"]["a.png"]
-        keypoints = group["keypoints"][()]
-        assert (keypoints.shape, keypoints.dtype) == ((7, 2), np.float32)
         # hloc counts from the centre of the first pixel, as we do.
-        assert_array_equal(keypoints, written.keypoints.astype(np.float32))
-        assert group["descriptors"].shape == (128, 7)
-        assert_allclose(group["descriptors"][()], written.descriptors.T, atol=FLOAT16_ROUNDING)
-        assert group["scores"].shape == (7,)
+        assert group["keypoints"].dtype == np.float32
+        assert_array_equal(group["keypoints"][()], written.keypoints.astype(np.float32))
+        assert group["descriptors"].shape == (128, count)
+        assert group["scores"].shape == (count,)
         assert group["image_size"][()].tolist() == [320, 240]
         assert group["image_size"].dtype.kind == "i"
-        assert (group["lafs"].shape, group["lafs"].dtype) == ((7, 2, 3), np.float32)
+        assert (group["lafs"].shape, group["lafs"].dtype) == ((count, 2, 3), np.float32)
         assert all(np.issubdtype(item.dtype, np.number) for item in group.values())
         assert file.attrs["pixel_origin"] == "center"
         assert file.attrs["format"] == "colmap_affrect/features"
@@ -125,19 +113,11 @@ def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) 
         del file[NAMES[1]].attrs["complete"]
         del file[NAMES[3]].attrs["complete"]
         del file[NAMES[3]]["descriptors"]
-    assert store.names() == [NAMES[0], NAMES[2]]
-    assert store.complete(NAMES) == {NAMES[0], NAMES[2]}
-    assert set(store.num_keypoints()) == {NAMES[0], NAMES[2]}
+    assert store.names() == list(store.num_keypoints()) == [NAMES[0], NAMES[2]]
     with pytest.raises(StoreError, match=r"no features of b c\.png; run extract"):
         store.read(NAMES[1])
     store.write(NAMES[3], some_features(6), (4, 3))
-    assert_same_features(store.read(NAMES[3]), some_features(6))
-
-
-def one_line(error: pytest.ExceptionInfo[StoreError]) -> str:
-    text = str(error.value)
-    assert "\n" not in text
-    return text
+    assert len(store.read(NAMES[3])) == 6
 
 
 @pytest.mark.parametrize("access", ["read", "write"])
@@ -157,10 +137,8 @@ def test_foreign_or_newer_file_is_refused_and_left_as_it_is(
         file.attrs.update(attributes)
         file.create_group("a.png").attrs["complete"] = True
     before = store.path.read_bytes()
-    with pytest.raises(StoreError, match=found) as error:
+    with pytest.raises(StoreError, match=rf"{store.path}: .*{found}.*--output-path"):
         store.names() if access == "read" else store.write("b.png", some_features(2), (4, 3))
-    assert str(store.path) in one_line(error)
-    assert "--output-path" in str(error.value)
     assert store.path.read_bytes() == before
 
 
@@ -170,9 +148,8 @@ def test_foreign_or_newer_file_is_refused_and_left_as_it_is(
 def test_damaged_file_is_refused_with_one_line(store: FeatureStore, content: bytes) -> None:
     store.path.write_bytes(content)
     for access in (store.names, lambda: store.write("a.png", some_features(2), (4, 3))):
-        with pytest.raises(StoreError, match=r"damaged .*--overwrite") as error:
+        with pytest.raises(StoreError, match=r"^.*damaged .*--overwrite.*$"):
             access()
-        one_line(error)
     assert store.path.read_bytes() == content
 
 
@@ -188,21 +165,18 @@ def test_values_that_were_not_written_are_damage(
             file[name][0] = 7
             if not has_checksums:
                 del file[name].attrs["crc32"]
-    readers = {
-        f"extract.*{store.path.name}": (lambda: store.read("a.png"), store.check_all),
-        "match --output-path": (
-            lambda: list(matches.read([("a.png", "b.png")])),
-            matches.check_all,
-        ),
-    }
-    for mend, reads in readers.items():
-        for read in reads:
-            if not has_checksums:
-                assert read()
-                continue
-            with pytest.raises(StoreError, match="is not as it was written") as error:
+    reads = (
+        lambda: store.read("a.png"),
+        store.check_all,
+        lambda: list(matches.read([("a.png", "b.png")])),
+        matches.check_all,
+    )
+    for read, mend in zip(reads, ("'extract'",) * 2 + ("match --output-path",) * 2, strict=True):
+        if has_checksums:
+            with pytest.raises(StoreError, match=f"is not as it was written.*{mend}"):
                 read()
-            assert mend.partition(".")[0] in one_line(error)
+        else:
+            assert read()
 
 
 @pytest.mark.parametrize(
@@ -232,16 +206,9 @@ def test_matches_have_the_layout_of_hloc(matches: MatchStore) -> None:
         assert group["matching_scores0"][()].tolist() == [0.0, 0.25, 0.0, 0.0, 0.5, 0.0]
 
 
-def test_matches_beyond_16_bits_are_stored_in_32(matches: MatchStore) -> None:
-    pair = ("a.png", "b.png")
-    matches.write([pair_matches(pair, [[0, 32_768], [39_999, 3]], 40_000)])
-    with h5py.File(matches.path, "r") as file:
-        assert file[pair_key(*pair)]["matches0"].dtype == np.int32
-    (found,) = matches.read([pair])
-    assert found.indices.tolist() == [[0, 32_768], [39_999, 3]]
-
-
-@pytest.mark.parametrize(("indices", "count"), [([], 0), ([], 5), ([[0, 0]], 1)])
+@pytest.mark.parametrize(
+    ("indices", "count"), [([], 0), ([], 5), ([[0, 0]], 1), ([[0, 32_768], [39_999, 3]], 40_000)]
+)
 def test_read_returns_the_matches_that_were_written(
     matches: MatchStore, indices: list[list[int]], count: int
 ) -> None:

@@ -18,7 +18,7 @@ from colmap_affrect.geometry.affine import fit_canvas, image_corners, rectifying
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.report.levels import bounding_box
-from colmap_affrect.report.sheet import DPI, PALETTE, WIDTH_INCHES, printable, tinted
+from colmap_affrect.report.sheet import PALETTE, WIDTH_PX, tinted
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
 SIZE = (300, 200)
@@ -41,9 +41,9 @@ def inspect(extractor: ImageExtractor, path: Path, output_path: Path) -> list[di
     inspect_image(extractor, path, output_path)
     data = np.fromfile(output_path / f"{path.stem}-inspection.png", np.uint8)
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    assert picture.shape[1] == WIDTH_INCHES * DPI
-    assert 300 < picture.shape[0] < 6000
-    assert picture.std() > 10.0
+    assert picture.shape[1] == WIDTH_PX
+    assert 50 < picture.shape[0] < 6000
+    assert picture.std() > 5.0
     plan = json.loads((output_path / f"{path.stem}-plan.json").read_text(encoding="utf-8"))
     assert plan["image"] == path.name
     levels: list[dict[str, Any]] = plan["levels"]
@@ -114,7 +114,6 @@ def test_names_of_every_kind_are_written_and_drawn(
 ) -> None:
     inspect(extractor, photo.rename(tmp_path / "a $x^{$ ü 漢字.png"), tmp_path / "Ausgabe ä")
     assert (tmp_path / "Ausgabe ä" / "a $x^{$ ü 漢字-inspection.png").exists()
-    assert printable("a ü Ж 漢") == "a ü Ж \N{REPLACEMENT CHARACTER}"
 
 
 def test_region_is_tinted_where_it_lies() -> None:

@@ -13,48 +13,82 @@ from __future__ import annotations
 import os
 import random
 import shutil
+import signal
 import sqlite3
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import h5py
+import matplotlib.pyplot  # noqa: F401 - before HOME is another, where it would write its cache
 import pytest
-from attacks import (
-    TRAPS,
-    Scene,
-    assert_clear,
-    assert_no_traceback,
-    assert_whole,
-    differences,
-    empty_folder,
-    ended,
-    exports,
-    folder_commands,
-    foreign_folder,
-    make_scene,
-    make_world,
-    placed,
-    rename_image,
-    tell,
-    tree,
-)
-from damaged import damage
-from results import database_content, results
+from command import CAMERA, FAST, Call, Ended, run_in_process_of_its_own
+from damaged import damage, execute
+from planar_pairs import write_extreme_views
+from results import database_content, differences, results, tree
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.interop.align import Georeference
+from colmap_affrect.interop.export import FORMATS
 
 pytestmark = pytest.mark.long
 
 TIMES = int(os.environ.get("CAMPAIGN", "1"))
+HANGING_S = 60
+PLAIN = ["--recipe", "unrectified-rootsift"]
+COMPARED = ["--methods", PLAIN[1], "--seeds", "0", *CAMERA]
+
+Words = list[object]
 
 
-def trials(count: int) -> pytest.MarkDecorator:
-    """Parametrize a test with the numbers of its trials."""
-    return pytest.mark.parametrize("number", range(count * TIMES))
+@pytest.fixture(autouse=True)
+def _ends_in_time() -> Iterator[None]:
+    """End the process of the tests when a command does not come to an end."""
+    signal.alarm(HANGING_S)
+    yield
+    signal.alarm(0)
+
+
+def run_words(scene: Path, out: Path) -> Words:
+    """Arguments of the run of the scene."""
+    given = ["--image-path", scene / "photos", "--output-path", out]
+    return ["run", "-q", *given, *FAST, "--guided", "always"]
 
 
 @pytest.fixture(scope="session")
-def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return make_scene(photos, tmp_path_factory.mktemp("scene"))
+def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the small scene in ``out``, and what commands need beside it.
+
+    These are ``photos``; the model as it is and with a lens that distorts, both with a place on
+    earth; files of hloc; a dataset.
+    """
+    folder = tmp_path_factory.mktemp("scene")
+    shutil.copytree(photos, folder / "photos")
+    files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+    out = folder / "out"
+    for words in (run_words(folder, out), ["export-h5", "--output-path", out, *files]):
+        assert run_in_process_of_its_own(*words).code == 0
+    shutil.copy(out / "database.db", folder / "any.db")
+    for name in ("plain", "lens"):
+        model = pycolmap.Reconstruction(out / "sparse" / "0")
+        for camera in model.cameras.values() if name == "lens" else ():
+            camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+            camera.params = [300.0, 160.0, 120.0, 0.05]
+        (folder / name).mkdir()
+        model.write(folder / name)
+        Georeference(50.0, 14.0, 200.0).write(folder / name)
+    write_extreme_views(folder / "pairs", ["cafe"])
+    return folder
+
+
+def assert_clear(end: Ended, *codes: int) -> None:
+    """No traceback, one of these exit codes, and one line that says why if it is not 0."""
+    assert "Traceback" not in end.stdout + "".join(end.stderr), end
+    assert end.code in codes, end
+    assert len(end.errors) == bool(end.code), end
+    assert not end.code or len(end.stderr) == 1, end
 
 
 # Part 1: names and links that lead astray.
@@ -67,21 +101,99 @@ NAMES = (
 )  # fmt: skip
 """Of an image in the place of a.png; x.png is harmless. A photograph is where a name leads."""
 
+RESULTS = {
+    "ply": "points3D.ply", "text": "text", "nvm": "model.nvm", "bundler": "bundle.list.txt",
+    "undistorted": "dense", "nerfstudio": "dense", "cameras": "cameras.csv",
+    "geojson": "cameras.geojson",
+}  # fmt: skip
+"""What each format of ``export`` writes."""
+
+
+def exports(base: Path, photograph: str) -> dict[str, tuple[Words, str]]:
+    """All commands that write beside the output folder: arguments, and the name of a result."""
+    files = ["--features-path", base / "features.h5", "--matches-path", base / "matches.h5"]
+    images = ["--image-path", base / "photos"]
+    new_files = ["--features-path", "{out}/features.h5", "--matches-path", "{out}/matches.h5"]
+    assert RESULTS.keys() == FORMATS.keys()
+    found: dict[str, tuple[Words, str]] = {}
+    for form, name in {**RESULTS, "ply,text,cameras,bundler,nerfstudio,geojson": "text"}.items():
+        for model in ("plain", "lens"):
+            given = ["--model-path", base / model, *images, "--format", form]
+            found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)
+    distance = ["--distance", "b c.png,side/d.png,2.0", "--output-path", "{out}/new"]
+    source = ["--database-path", base / "any.db"]
+    image = base / "photos" / photograph
+    listed = ["--image-list-path", base / "list.txt"] if (base / "list.txt").exists() else []
+    to = ["--output-path", "{out}"]
+    return {
+        **found,
+        "align": (["align", "--model-path", base / "plain", *distance], "new"),
+        "export-h5": (["export-h5", *source, *new_files], "features.h5"),
+        "export-database": (["export-database", base / "any.db", "{out}/old.db"], "old.db"),
+        "import-h5": (
+            ["import-h5", *images, *files, *CAMERA, "--database-path", "{out}/new.db"], "new.db"
+        ),
+        "convert": (["convert", *images, *to], "a.png"),
+        "inspect": (["inspect", image, *PLAIN, *to], f"{image.stem}-plan.json"),
+        "compare": (["compare", *images, *listed, *COMPARED, *to], "report.html"),
+    }  # fmt: skip
+
+
+def make_world(scene: Path, folder: Path) -> Path:
+    """Copy what exports read to where a few steps up lead to folders that are watched."""
+    base = folder / "world" / "one" / "two" / "three"
+    shutil.copytree(scene, base, ignore=shutil.ignore_patterns("out", "pairs"))
+    for name in ("one/photos", "photos", "elsewhere", "home"):
+        shutil.copytree(base / "photos", folder / "world" / name, dirs_exist_ok=True)
+    return base
+
+
+def rename_image(base: Path, name: str) -> None:
+    """Give an image a name in all that exports read, and make a photograph where it leads."""
+    world, path = base.parents[2], Path(os.path.normpath(base / "photos" / name))
+    with suppress(OSError):
+        if path.is_relative_to(world) and not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(base / "photos" / "a.png", path)
+    for model_path in (base / "plain", base / "lens"):
+        model = pycolmap.Reconstruction(model_path)
+        model.find_image_with_name("a.png").name = name
+        model.write(model_path)
+    quoted = name.replace("'", "''")
+    execute(base / "any.db", f"UPDATE images SET name = '{quoted}' WHERE name = 'a.png'")
+    with suppress(ValueError, RuntimeError), h5py.File(base / "features.h5", "a") as file:
+        file.copy("a.png", name)
+    (base / "list.txt").write_text(f"{name}\nb c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
+
+
+def assert_whole(label: str, out: Path) -> None:
+    """A command that ended well has all of its results inside of its folder."""
+    found = tree(out)
+    assert not [key for key, value in found.items() if value[0] == "link" or "affrect" in key]
+    assert any(value[0] != "folder" for value in found.values()), "nothing was written"
+    if "undistorted" in label or "nerfstudio" in label:
+        pictures = [path for path in (out / "dense" / "images").rglob("*") if path.is_file()]
+        model = pycolmap.Reconstruction(out / "dense" / "sparse")
+        assert (len(pictures), model.num_reg_images()) == (4, 4)
+    if "text" in label:
+        assert pycolmap.Reconstruction(out / "text").num_reg_images() == 4
+
+
+Prepare = Callable[[Path, str], list[Path]]
+"""Makes the output folder, given the name of a result; returns what may be changed then."""
+
 
 def attack_exports(
-    base: Path, photograph: str, prepare: Callable[[Path, str], list[Path]], *codes: int
+    base: Path, photograph: str, prepare: Prepare, call: Call, *codes: int
 ) -> list[str]:
-    """Call all exports, each into a folder that is prepared; return what went wrong.
-
-    ``prepare`` gets the folder and the name of a result, and returns what may be changed.
-    """
+    """Call all exports, each into a folder that is prepared; return what went wrong."""
     world, wrong = base.parents[2], []
-    for label, (arguments, result) in exports(base, photograph).items():
+    for label, (words, result) in exports(base, photograph).items():
         out = base / "outputs" / label.replace(",", " ")
         allowed = prepare(out, result)
         before = tree(world, *allowed)
         try:
-            end = ended(*placed(arguments, out), HOME=str(world / "home"))
+            end = call(*(str(word).replace("{out}", str(out)) for word in words), "-q")
             harmed = differences(before, tree(world, *allowed))
             assert not harmed, f"{harmed}, exit code {end.code}"
             assert_clear(end, *codes, *((2,) if "nvm" in label else ()))  # spaces in other names
@@ -92,23 +204,64 @@ def attack_exports(
     return wrong
 
 
+def empty_folder(out: Path, _: str) -> list[Path]:
+    out.mkdir(parents=True)
+    return [out]
+
+
 @pytest.mark.parametrize("name", NAMES, ids=lambda name: ascii(name)[1:-1][:24])
-def test_names_of_images_lead_nowhere_else(scene: Scene, tmp_path: Path, name: str) -> None:
+def test_names_of_images_lead_nowhere_else(
+    scene: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     base = make_world(scene, tmp_path)
+    monkeypatch.setenv("HOME", str(base.parents[2] / "home"))
     name = name.format(photos=base / "photos", world=base.parents[2])
     rename_image(base, name)
     photograph = "b c.png"
     with suppress(OSError):
         photograph = name if (base / "photos" / name).is_file() else photograph
     codes = (0,) if name == "x.png" else (0, 1, 2)
-    wrong = attack_exports(base, photograph, empty_folder, *codes)
+    wrong = attack_exports(base, photograph, empty_folder, call, *codes)
     assert not wrong, "\n".join([f"image named {name!r}", *wrong])
 
 
+def link_to(target: str) -> Prepare:
+    """A result is there already as a link; only the rest of the folder may change."""
+
+    def prepare(out: Path, result: str) -> list[Path]:
+        out.mkdir(parents=True)
+        (out / result).symlink_to(out.parents[1] / target)
+        return [out]
+
+    return prepare
+
+
+def linked_folder(out: Path, _: str) -> list[Path]:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.symlink_to(out.parents[1] / "photos")
+    return []
+
+
+def hard_link(out: Path, result: str) -> list[Path]:
+    out.mkdir(parents=True)
+    os.link(out.parents[1] / "photos" / "a.png", out / result)
+    return [out]
+
+
+TRAPS = {
+    "dangling link": link_to("../new.png"),
+    "link to a photograph": link_to("photos/a.png"),
+    "output folder is a link to the photographs": linked_folder,
+    "hard link to a photograph": hard_link,
+}
+
+
 @pytest.mark.parametrize("trap", TRAPS)
-def test_links_in_output_folders_are_not_followed(scene: Scene, tmp_path: Path, trap: str) -> None:
+def test_links_in_output_folders_are_not_followed(
+    scene: Path, tmp_path: Path, call: Call, trap: str
+) -> None:
     base = make_world(scene, tmp_path)
-    wrong = attack_exports(base, "a.png", TRAPS[trap], 0, 1, 2)
+    wrong = attack_exports(base, "a.png", TRAPS[trap], call, 0, 1, 2)
     assert not wrong, "\n".join([trap, *wrong])
 
 
@@ -121,38 +274,24 @@ FILES = (
     "sparse/0/images.bin", "sparse/0/points3D.bin", "sparse/0/summary.json",
 )  # fmt: skip
 READERS = ("run", "map", "export", "align", "doctor")
-WRITTEN = ["--format", "ply,text,cameras,bundler,undistorted"]
 
 
-def reader(name: str, scene: Scene, out: Path, target: Path) -> list[object]:
-    """Arguments of a command that reads an output folder."""
-    model = ["--model-path", out / "sparse" / "0", "--output-path", target, "-q"]
+def reader(name: str, scene: Path, out: Path) -> Words:
+    """Arguments of a command that reads an output folder; results of some are beside it."""
+    model = ["--model-path", out / "sparse" / "0", "--output-path", out.with_name("target"), "-q"]
     return {
-        "run": scene.run(out),
+        "run": run_words(scene, out),
         "map": ["map", "-q", "--output-path", out],
-        "export": ["export", *model, *WRITTEN],
+        "export": ["export", *model, "--format", "ply,text,cameras,bundler,undistorted"],
         "align": ["align", *model, "--distance", "b c.png,side/d.png,2.0"],
         "doctor": ["doctor", "-q", out],
     }[name]
 
 
-@pytest.fixture(scope="session")
-def expected(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What each command leaves when nothing is damaged."""
-    found: dict[str, Any] = {}
-    for name in READERS:
-        folder = tmp_path_factory.mktemp(name)
-        out = scene.copy(folder)
-        end = ended(*reader(name, scene, out, folder / "target"))
-        assert_clear(end, 0)
-        found[name] = outcome(name, out, folder / "target")
-    return found
-
-
-def outcome(name: str, out: Path, target: Path) -> dict[str, Any]:
+def outcome(name: str, out: Path) -> dict[str, Any]:
     """What a command makes, or goes on with: that has to be right."""
     if name in ("export", "align"):
-        return tree(target, times=False)
+        return tree(out.with_name("target"), times=False)
     if name == "doctor":
         return {}
     models = {key: value for key, value in tree(out, times=False).items() if key.endswith(".bin")}
@@ -162,53 +301,73 @@ def outcome(name: str, out: Path, target: Path) -> dict[str, Any]:
     return {key: value for key, value in results(out).items() if key not in kept} | models
 
 
-def assert_right(name: str, out: Path, target: Path, expected: Mapping[str, Any]) -> None:
-    try:
-        found = outcome(name, out, target)
-    except (OSError, RuntimeError, ValueError, KeyError, sqlite3.Error) as error:
-        raise AssertionError(f"success with a result that cannot be read: {error}") from error
-    wrong = differences(expected[name], found)
-    assert not wrong, f"success with a wrong result: {wrong}"
+@pytest.fixture(scope="session")
+def expected(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What each command leaves when nothing is damaged."""
+    found: dict[str, Any] = {}
+    for name in READERS:
+        out = tmp_path_factory.mktemp(name) / "out"
+        shutil.copytree(scene / "out", out)
+        assert_clear(run_in_process_of_its_own(*reader(name, scene, out)), 0)
+        found[name] = outcome(name, out)
+    return found
 
 
-@trials(150)
+@pytest.mark.parametrize("number", range(150 * TIMES))
 def test_damaged_file_is_mended_or_named(
-    scene: Scene, expected: dict[str, Any], tmp_path: Path, number: int
+    scene: Path, expected: dict[str, Any], tmp_path: Path, call: Call, number: int
 ) -> None:
     chance = random.Random(f"damage {number}")
     name, command = FILES[number % len(FILES)], chance.choice(READERS)
-    out, target = scene.copy(tmp_path), tmp_path / "target"
-    done = damage(out / name, chance, others=[scene.out / other for other in FILES])
-    tell(f"{done}; then {command}")
+    out = Path(shutil.copytree(scene / "out", tmp_path / "out"))
+    done = damage(out / name, chance, others=[scene / "out" / other for other in FILES])
     before = tree(out)
-    end = ended(*reader(command, scene, out, target))
-    if command == "doctor":
-        assert_no_traceback(end)
+    end = call(*reader(command, scene, out))
+    sys.stdout.write(f"{done}; then {command}: {end.stderr}\n")  # shown when the test fails
+    if command == "doctor":  # which prints what it finds
         assert end.code in (0, 1), end
         assert differences(before, tree(out)) == []
         return
     assert_clear(end, 0, 1, 2)
     if end.code == 0:
-        assert_right(command, out, target, expected)
+        try:
+            found = outcome(command, out)
+        except (OSError, RuntimeError, ValueError, KeyError, sqlite3.Error) as error:
+            raise AssertionError(f"success with a result that cannot be read: {error}") from error
+        wrong = differences(expected[command], found)
+        assert not wrong, f"success with a wrong result: {wrong}"
     elif command == "run":
-        doctor = ended("doctor", "-q", out)
-        assert_no_traceback(doctor)
-        assert doctor.code == 1, (end.errors, doctor)
-        assert Path(name).name in doctor.stdout, (end.errors, doctor)
+        doctor = call("doctor", "-q", out)
+        assert doctor.code == 1, doctor
+        assert Path(name).name in doctor.stdout, doctor
 
 
 # Part 3: folders that are not ours.
 
-FOLDERS = ("report", "photographs", "above the photographs")
-FILLERS = ("run", "extract", "compare", "evaluate", "inspect", "map", "convert")
+FILLERS: dict[str, Words] = {
+    "run": ["--image-path", "{photos}", *FAST],
+    "extract": ["--image-path", "{photos}", *FAST],
+    "compare": ["--image-path", "{photos}", *COMPARED],
+    "evaluate": ["evd", "--dataset-path", "{scene}/pairs", "--recipes", PLAIN[1]],
+    "inspect": ["{photos}/a.png", *PLAIN],
+    "map": ["--from-database", "{scene}/any.db"],
+    "convert": ["--image-path", "{photos}"],
+}
+"""Commands that fill an output folder."""
 
 
-@pytest.mark.parametrize("kind", FOLDERS)
+@pytest.mark.parametrize("kind", ["report", "photographs", "above the photographs"])
 @pytest.mark.parametrize("name", FILLERS)
-def test_foreign_folder_is_refused(scene: Scene, tmp_path: Path, name: str, kind: str) -> None:
-    photos = Path(shutil.copytree(scene.folder / "photos", tmp_path / "photos"))
-    out = foreign_folder(kind, tmp_path)
+def test_foreign_folder_is_refused(
+    scene: Path, tmp_path: Path, call: Call, name: str, kind: str
+) -> None:
+    photos = Path(shutil.copytree(scene / "photos", tmp_path / "photos"))
+    (tmp_path / "mine").mkdir()
+    for mine in ("notes.txt", "report.html", "database.db", "run.log"):
+        (tmp_path / "mine" / mine).write_text("mine")
+    out = {"report": tmp_path / "mine", "photographs": photos}.get(kind, tmp_path)
     before = tree(tmp_path)
-    end = ended(*folder_commands(scene, photos)[name], "--output-path", out)
+    words = [str(word).format(photos=photos, scene=scene) for word in FILLERS[name]]
+    end = call(name, "-q", *words, "--output-path", out)
     assert not (harmed := differences(before, tree(tmp_path))), (harmed, end.code)
     assert_clear(end, 1, 2)

@@ -15,12 +15,18 @@ from colmap_affrect.geometry.affine import rotation
 SIZE = (1600, 1200)
 
 
-def random_pairs(path: Path, count: int, num_pairs: int, *, prior: bool) -> None:
-    """Write pairs of images with so many uniformly random correspondences each."""
-    rng = np.random.default_rng([count, prior])
+@pytest.mark.parametrize("prior", [False, True], ids=["no prior", "prior"])
+@pytest.mark.parametrize(
+    ("count", "num_pairs"),
+    [(200, 1), (1000, 1), pytest.param(1000, 50, marks=pytest.mark.slow)],
+)
+def test_random_matches_are_rejected(
+    tmp_path: Path, count: int, num_pairs: int, prior: bool
+) -> None:
+    rng, path = np.random.default_rng([count, prior]), tmp_path / "database.db"
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * SIZE[0], *SIZE)
     camera.has_prior_focal_length = prior
-    lafs = np.zeros((count, 2, 3))
+    lafs, same = np.zeros((count, 2, 3)), np.stack([np.arange(count)] * 2, axis=1)
     with open_database(path) as database:
         database.write_camera(camera, use_camera_id=True)
         for image_id in range(1, 2 * num_pairs + 1):
@@ -30,19 +36,6 @@ def random_pairs(path: Path, count: int, num_pairs: int, *, prior: bool) -> None
             lafs[:, :, 2] = rng.uniform(0, np.subtract(SIZE, 1), (count, 2))
             write_keypoints(database, image_id, lafs)
             if image_id % 2 == 0:
-                same = np.stack([np.arange(count)] * 2, axis=1)
                 write_matches(database, image_id - 1, image_id, same)
-
-
-@pytest.mark.parametrize("prior", [False, True], ids=["no prior", "prior"])
-@pytest.mark.parametrize(
-    ("count", "num_pairs"),
-    [(200, 1), (1000, 1), pytest.param(1000, 50, marks=pytest.mark.slow)],
-)
-def test_random_matches_are_rejected(
-    tmp_path: Path, count: int, num_pairs: int, prior: bool
-) -> None:
-    path = tmp_path / "database.db"
-    random_pairs(path, count, num_pairs, prior=prior)
     verify(path, VerificationOptions())
     assert verified_pairs(path, 1) == {}

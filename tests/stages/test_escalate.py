@@ -213,7 +213,7 @@ def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: 
     sizes = extracted_px(Context(workspace))
     for name in HARD:
         first, second, third = features.level_ends(name)
-        origin = features.read_rectification_ids(name)
+        origin = features.read(name).rectification_ids
         assert not origin[:second].any()
         assert (origin[second:] > 0).all()
         scales = features.read(name).scales

@@ -22,10 +22,12 @@ from colmap_affrect.features.base import FeatureOptions
 from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.warping import warp
+from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import ExtractionOptions, load_recipe
-from colmap_affrect.stages import one_image
+from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
+from colmap_affrect.stages import one_image, one_pair
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
@@ -50,13 +52,19 @@ def write_blobs(path: Path) -> None:
     cv2.imwrite(str(path), np.clip(np.rint(image), 0, 255).astype(np.uint8))
 
 
+def extracted(
+    tmp_path: Path, photos: Path, recipe: Recipe, **given: object
+) -> tuple[Workspace, StageReport]:
+    workspace = Workspace(tmp_path / "out")
+    with workspace.locked():
+        return workspace, extract(Context(workspace), Inputs.of(photos, **given), recipe)
+
+
 @pytest.mark.parametrize("max_size", [WIDTH, 360, 240])
 def test_blob_is_half_a_pixel_further_in_the_database_at_every_size(tmp_path, max_size):
     write_blobs(tmp_path / "photos" / "blobs.png")
-    workspace = Workspace(tmp_path / "out")
     recipe = load_recipe("default", [f"max_image_size_px={max_size}"])
-    with workspace.locked():
-        extract(Context(workspace), Inputs.of(tmp_path / "photos"), recipe)
+    workspace, _ = extracted(tmp_path, tmp_path / "photos", recipe)
     with open_database(workspace.database) as database:
         keypoints = database.read_keypoints(image_ids(workspace.database)["blobs.png"])
     assert keypoints.shape[1] == 6
@@ -76,10 +84,8 @@ def test_faded_photograph_is_stretched_and_said_to_be(tmp_path, stretch):
     good = cv2.imread(str(photos / "good.png"), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(photos / "good.png"), cv2.normalize(good, None, 0, 255, cv2.NORM_MINMAX))
     cv2.imwrite(str(photos / "faded.png"), 90 + good // 5)
-    workspace = Workspace(tmp_path / "out")
     recipe = load_recipe("default", [f"stretch_contrast={str(stretch).lower()}"])
-    with workspace.locked():
-        report = extract(Context(workspace), Inputs.of(photos), recipe)
+    workspace, report = extracted(tmp_path, photos, recipe)
     counts = FeatureStore(workspace.features).num_keypoints()
     assert (counts["faded.png"] > 0.9 * counts["good.png"]) == stretch
     said = "is low in 1 of 2 photographs, such as faded.png; it was stretched"
@@ -106,10 +112,8 @@ def courtyard(tmp_path: Path, num_maps: int) -> tuple[Path, Path]:
 @pytest.mark.parametrize("recipe", ["depth-planes-recommended", "depth-affnet-recommended"])
 def test_image_without_its_depth_map_is_extracted_unrectified_with_a_warning(tmp_path, recipe):
     photos, depth = courtyard(tmp_path, 1)
-    workspace = Workspace(tmp_path / "out")
     options = load_recipe(recipe, [*DEPTH, f"depth.path='{depth}'"])
-    with workspace.locked():
-        report = extract(Context(workspace), Inputs.of(photos, cameras=COURTYARD_CAMERA), options)
+    workspace, report = extracted(tmp_path, photos, options, cameras=COURTYARD_CAMERA)
     assert report.failures == {}
     assert report.num_done == 2
     assert list(report.warnings) == ["court_4.jpg"]
@@ -130,27 +134,22 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
         ([f"depth.path='{tmp_path / 'nowhere'}'"], OptionError, "nowhere"),
     ]:
         recipe = load_recipe("depth-planes-recommended", [*DEPTH, *settings])
-        workspace = Workspace(tmp_path / "out")
-        with workspace.locked(), pytest.raises(error, match=re.escape(message)):
-            extract(Context(workspace), Inputs.of(photos, cameras=COURTYARD_CAMERA), recipe)
-        assert not workspace.features.exists()
+        with pytest.raises(error, match=re.escape(message)):
+            extracted(tmp_path, photos, recipe, cameras=COURTYARD_CAMERA)
+        assert not (tmp_path / "out" / "features.h5").exists()
 
 
-class FailingExtractor:
-    """A feature extractor whose device fails."""
-
-    def __init__(self, message):
-        self._message = message
+class OnFullGpu:
+    """A feature extractor whose device has no memory left."""
 
     def detect(self, _):
-        raise RuntimeError(self._message)
+        raise RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB.")
 
 
 def test_features_of_a_gpu_without_memory_are_those_of_the_cpu():
     photo = COURTYARD / "images" / "court_4.jpg"
     extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
-    full = FailingExtractor("CUDA out of memory. Tried to allocate 2.00 GiB.")
-    found = replace(extractor, extractors=(full,)).extract_file(photo)
+    found = replace(extractor, extractors=(OnFullGpu(),)).extract_file(photo)
     assert found.warning == "extracted on the CPU, the memory of the GPU is full"
     assert_array_equal(found.features.lafs, extractor.extract_file(photo).features.lafs)
 
@@ -192,17 +191,22 @@ def test_images_at_once_are_as_many_as_there_are_cores_and_memory_for(
         assert num_images_at_once(learned) == expected
 
 
-def test_extractor_in_another_process_refuses_other_weights(
+def test_work_in_another_process_refuses_other_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = {"affnet": tmp_path / "AffNet.pth"}
     found["affnet"].write_bytes(b"published")
     pickled = pickle.dumps(replace(prepare(ExtractionOptions()), weights=found))
-    monkeypatch.setattr(one_image, "resolve", lambda *_, **__: found)
+    for module in (one_image, one_pair):
+        monkeypatch.setattr(module, "resolve", lambda *_, **__: found)
+    store = FeatureStore(tmp_path / "features.h5")
+    matcher = pickle.dumps(one_pair.CachedMatcher(one_pair.Matching(store, NearestOptions())))
     assert pickle.loads(pickled).options == ExtractionOptions()
+    pickle.loads(matcher)
     found["affnet"].write_bytes(b"of another release")
-    with pytest.raises(WeightsError, match=r"AffNet\.pth: is another file than affnet on the"):
-        pickle.loads(pickled)
+    for content in (pickled, matcher):
+        with pytest.raises(WeightsError, match=r"AffNet\.pth: is another file than affnet on the"):
+            pickle.loads(content)
 
 
 class ColorOptions(FeatureOptions):

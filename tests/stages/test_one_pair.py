@@ -1,23 +1,15 @@
-"""Matching of pairs: what is kept in memory, and what happens when a GPU has no more of it."""
+"""Matching of pairs: what is kept in memory."""
 
 from __future__ import annotations
 
-import logging
-import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
-from colmap_affrect.matchers import base, nearest
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.matchers.nearest_8bit import MakeCoarse
 from colmap_affrect.pairs.lists import exhaustive_pairs
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.stages import one_pair
@@ -56,46 +48,13 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
     expected = matches(store)
     assert min(map(len, expected.values())) > NUM_FEATURES // 2
     reads: list[str] = []
-    read = CachedMatcher.read
+    read = CachedMatcher._prepare
 
-    def counted(cache: CachedMatcher, name: str) -> one_pair.StoredFeatures:
+    def counted(cache: CachedMatcher, name: str) -> one_pair.PreparedImage:
         reads.append(name)
         return read(cache, name)
 
-    monkeypatch.setattr(CachedMatcher, "read", counted)
+    monkeypatch.setattr(CachedMatcher, "_prepare", counted)
     monkeypatch.setattr(one_pair, "CACHE_BYTES", 3 * 800 * NUM_FEATURES)
     assert matches(store) == expected
     assert len(NAMES) < len(reads) <= 3 * len(NAMES)
-
-
-@dataclass(frozen=True)
-class OnFullGpu:
-    """Coarse descriptors that a GPU has no memory to compare."""
-
-    nbytes = 0
-
-    def margin(self, *_: object) -> float:
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-
-
-def made_on_full_gpu(_: NDArray[np.float32]) -> OnFullGpu:
-    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-
-
-@pytest.mark.parametrize("make_coarse", [lambda _: OnFullGpu(), made_on_full_gpu])
-def test_what_a_gpu_has_no_memory_for_is_matched_by_the_cpu(
-    store: FeatureStore,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    make_coarse: MakeCoarse,
-) -> None:
-    expected = matches(store)
-    monkeypatch.setattr(base, "_SAID", threading.Lock())
-    monkeypatch.setattr(nearest, "coarse_descriptors", lambda *_: make_coarse)
-    with caplog.at_level(logging.WARNING):
-        assert matches(store) == expected
-    assert messages(caplog.records) == ["the memory of the GPU is full; the CPU matches the rest"]
-
-
-def messages(records: Sequence[logging.LogRecord]) -> list[str]:
-    return [record.getMessage() for record in records]
