@@ -1,17 +1,19 @@
 """How sure a model is of each of its photographs.
 
-A few numbers say what holds a photograph where it is; a logistic regression makes a probability of
-them that it stands right, within 5 degrees (rotation, and direction to most others). Its
-coefficients are fitted on photographs of known poses (``tests/benchmarks/reliability.py``).
+A few numbers say what holds a photograph where it is. A logistic regression makes of them the
+probability that it stands right: within 5 degrees, in rotation and in direction to at least half of
+the others. ``tests/benchmarks/reliability.py`` fits it on photographs whose poses are known.
 """
 
+import json
+import math
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
-import networkx as nx
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks
@@ -24,10 +26,9 @@ from colmap_affrect.mappers.adjustment import (
     FocalPrior,
     priors_of,
 )
-from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import Evidence, cells, pair_evidence
 from colmap_affrect.mappers.pair_graph import (
-    MIN_SHARE,
     Ids,
     PairGraph,
     VerifiedPair,
@@ -38,7 +39,7 @@ from colmap_affrect.mappers.pair_graph import (
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 FREE_SIGMA = 1.0  # of the logarithm of a focal length that is given, where it is freed
-MIN_MOVE = 0.1  # of the logarithm of a focal length that is told from another
+MIN_MOVE = 0.1  # of the logarithm of a given focal length that is told from another
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
 MAX_NUM_IMAGES = 100  # of models whose focal lengths are tried; larger ones have points of many
 MAX_NUM_POINTS = 2_000  # of a model, for what need not be exact
@@ -48,6 +49,12 @@ MIN_SHARE_MIRRORED = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
 images a tenth by chance."""
 MAX_PAIRS_FOR_COPIES = 1000  # looked at, all of 45 photographs; of more some copies are missed
+MIN_LOSS = 0.7  # of the log odds: what takes less from the odds is no reason to doubt
+NUM_REASONS = 2  # that are said of a photograph
+
+FOCAL_CONTRADICTED = "the given focal length does not fit"
+FOCAL_UNKNOWN = "any focal length fits"
+COEFFICIENTS = Path(__file__).with_suffix(".json")
 
 
 @dataclass(frozen=True)
@@ -55,128 +62,183 @@ class Measures:
     """What holds a photograph in a model.
 
     Attributes:
-        evidence: of its pairs and of its features in three images, in nats.
+        evidence: of its pairs, of its features that two other images match, and of its focal
+            length, in nats.
         agreement: share of the inliers of its pairs that agrees with the model.
-        second: the same of the pair of which second most does; 0 with one pair.
+        second: the same of the pair that agrees second best; 0 with one pair.
+        num_three: points that it and two others see.
+        focal_growth: part by which the cost of adjustment grows with another focal length;
+            1 where somebody knows it.
+        focal_px: of its camera.
+        fitting_px: the focal length that fits, where the one that the user gave does not; else 0.
+        turned: share of the matches of its strongest pairs that a camera explains which only turns.
+        bridge: what it came in by, if that was no track.
+        original: name of the photograph that it may be a mirrored copy of, or empty.
     """
 
     evidence: float
-    three: float
     agreement: float
-    best: float
     second: float
-    num_pairs: int
-    num_points: int
-    num_long: int
-    num_cells: int
-    angle_deg: float
-    nearest_deg: float
+    num_three: int
     focal_growth: float
-    focal_nats: float
-    focal_sigmas: float
-    moved: float
-    rotation: float
-    rotation_min: float
-    single: float
-    bridged: float
-    scale_error: float
-    copy: float
-    twin: float
-    near: float
-    num_images: int
-    distortion: float
-    focal: float
+    focal_px: float
+    fitting_px: float
+    turned: float
+    bridge: Bridge | None
+    original: str
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of the regression.
+
+    Attributes:
+        value: the larger the surer.
+        reason: what to say where it is small.
+    """
+
+    value: Callable[[Measures], float]
+    reason: Callable[[Measures], str]
+
+
+def _scale_error(m: Measures) -> float:
+    return min(m.bridge.scale_error_frac, 0.3) if m.bridge else 0.0
+
+
+def _bridge_reason(m: Measures) -> str:
+    error = f"{_scale_error(m):.0%}"
+    return f"bridged by {m.bridge.pair[0]} at a distance known to +-{error}" if m.bridge else ""
+
+
+TERMS: Mapping[str, Term] = {
+    "evidence": Term(
+        lambda m: math.copysign(math.log1p(abs(m.evidence) / 3.0), m.evidence),
+        lambda m: f"the evidence of its pairs is only {m.evidence:.0f} nats",
+    ),
+    "agreement": Term(
+        lambda m: m.agreement,
+        lambda m: f"only {m.agreement:.0%} of the matches of its pairs agree with the model",
+    ),
+    "second pair": Term(
+        lambda m: m.second,
+        lambda m: (
+            f"of no second pair do more than {m.second:.0%} of the matches agree"
+            if m.second
+            else "one pair alone says where it is"
+        ),
+    ),
+    "points of three": Term(
+        lambda m: math.log1p(min(m.num_three, 300)),
+        lambda m: f"only {m.num_three} of its points are seen by two other photographs",
+    ),
+    "focal length": Term(
+        lambda m: math.log(min(max(m.focal_growth, 0.003), 1.0)),
+        lambda _: f"{FOCAL_UNKNOWN}, and the place of the camera depends on that",
+    ),
+    "given focal length": Term(
+        lambda m: -float(m.fitting_px > 0.0),
+        lambda m: f"{FOCAL_CONTRADICTED}, {m.focal_px:.0f} px: {m.fitting_px:.0f} px does",
+    ),
+    "parallax": Term(
+        lambda m: -max(0.0, m.turned - 0.5),
+        lambda m: f"a camera that only turned explains {m.turned:.0%} of the matches: no parallax",
+    ),
+    "bridge": Term(lambda m: -_scale_error(m), _bridge_reason),
+    "original": Term(
+        lambda m: -float(bool(m.original)), lambda m: f"may be a mirrored copy of {m.original}"
+    ),
+}
+"""The terms, by their names in the file of coefficients."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How sure a model is of a photograph.
+
+    Attributes:
+        probability: that it stands right.
+        reason: what speaks most against that, empty if nothing does.
+    """
+
+    probability: float
+    reason: str
+
+
+@cache
+def _coefficients() -> tuple[float, dict[str, tuple[float, float]]]:
+    """Return the constant, and of each term the weight and what right photographs usually have."""
+    content = json.loads(COEFFICIENTS.read_text(encoding="utf-8"))
+    terms = content["terms"].items()
+    return content["constant"], {name: (term["weight"], term["usual"]) for name, term in terms}
+
+
+def judge(mapped: MappedModel, task: MappingTask) -> dict[str, Judgement]:
+    """Say of each photograph of a model how sure it is that it stands right, by name."""
+    return {name: judged(measures) for name, measures in measure(mapped, task).items()}
+
+
+def judged(measures: Measures) -> Judgement:
+    """Return the probability that a photograph stands right, and what takes most from it."""
+    constant, weights = _coefficients()
+    log_odds, losses = constant, []
+    for name, (weight, usual) in weights.items():
+        value = TERMS[name].value(measures)
+        log_odds += weight * value
+        losses.append((weight * (usual - value), TERMS[name].reason(measures)))
+    worst = sorted((loss for loss in losses if loss[0] >= MIN_LOSS), reverse=True)
+    reasons = [text for _, text in (worst or [max(losses)])[:NUM_REASONS]]
+    return Judgement(1.0 / (1.0 + math.exp(-log_odds)), "; ".join(reasons))
 
 
 def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
     """Measure what holds each photograph of a model, by name."""
     model, graph = mapped.reconstruction, graph_of(task)
-    ids = sorted(model.reg_image_ids())
     poses, cameras = poses_of(model), cameras_of(model)
     used = {camera.camera_id: camera for camera in cameras.values()}
     priors = priors_of(used.values(), task.cameras)
-    priors |= priors_of((c for c in graph.cameras.values() if c.camera_id in used), task.cameras)
     evidence = Evidence(graph, priors)
-    three = evidence.three_view_ratios(model)
-    pairs = graph.pairs_inside(ids)
-    agreement = {pair.ids: graph.agreement(pair, poses, cameras) for pair in pairs}
-    of_image: dict[int, list[VerifiedPair]] = {i: [] for i in ids}
-    for pair in pairs:
-        for image_id in pair.ids:
-            of_image[image_id].append(pair)
-    turned = _rotation_shares(graph, of_image)
-    single = _single(model, graph, pairs, agreement)
-    long, angles = num_long_tracks(model), _angles_deg(model)
-    growth, in_cells = focal_growth(model, task), cells_of(model)
-    freed = freed_focals(model, task)
-    mirrored = _mirrored(graph)
-    support: defaultdict[int, float] = defaultdict(float)
-    unclear = {i for both in mirrored for i in both}
-    for pair in pairs:
-        for image_id, other in (pair.ids, pair.ids[::-1]):
-            support[image_id] += 0 if other in unclear else agreement[pair.ids] * len(pair.matches)
-    copies = {min(both, key=lambda i: support[i]) for both in mirrored}
+    pairs = graph.pairs_inside(poses)
+    agreements = {pair.ids: graph.agreement(pair, poses, cameras) for pair in pairs}
+    pairs_of = {i: [pair for pair in pairs if i in pair.ids] for i in sorted(poses)}
+    three, long = evidence.three_view_ratios(model), num_long_tracks(model)
+    turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
+    growth, fitting_px = _focal_growths(model, task), fitting_focals(model, task)
     bridges = {name: bridge for bridge in mapped.bridges for name in bridge.names}
-    centers = {i: model.images[i].projection_center() for i in ids}
     found = {}
-    for image_id in ids:
-        image, camera = model.images[image_id], cameras[image_id]
-        own = of_image[image_id]
-        weights = [len(pair.matches) for pair in own]
-        shares = [agreement[pair.ids] for pair in own]
-        best = sorted(shares, reverse=True)
-        prior = priors[camera.camera_id]
-        bridge = bridges.get(image.name)
-        rel, nats = growth.get(camera.camera_id, (np.inf, np.inf))
-        depth = _median_distance(model, image)
-        others = [i for i in ids if i != image_id]
-        near = [
-            np.linalg.norm(centers[i] - centers[image_id]) < np.tan(np.deg2rad(1.0)) * depth
-            for i in others
+    for image_id, own in pairs_of.items():
+        shares = [agreements[pair.ids] for pair in own]
+        nats = [
+            pair_evidence(share * num, num)
+            for pair, share in zip(own, shares, strict=True)
+            if (num := evidence.num_cells(pair))
         ]
-        wide, nearest = angles.get(image_id, (0.0, 0.0))
-        f = camera.mean_focal_length()
-        extra = [camera.params[i] for i in camera.extra_params_idxs()]
-        found[image.name] = Measures(
-            evidence=sum(
-                pair_evidence(agreement[p.ids] * n, n) for p in own if (n := evidence.num_cells(p))
-            )
-            + three.get(image_id, 0.0),
-            three=three.get(image_id, 0.0),
-            agreement=float(np.average(shares, weights=weights)) if shares else 1.0,
-            best=best[0] if best else 0.0,
-            second=best[1] if len(best) > 1 else 0.0,
-            num_pairs=len(own),
-            num_points=image.num_points3D,
-            num_long=long[image_id],
-            num_cells=in_cells[image_id],
-            angle_deg=wide,
-            nearest_deg=nearest,
-            focal_growth=rel,
-            focal_nats=nats,
-            focal_sigmas=float(np.sqrt(2.0 * prior.cost(camera.mean_focal_length()))),
-            moved=abs(np.log(freed.get(camera.camera_id, f) / f)),
-            rotation=float(np.mean([turned[p.ids] for p in own if p.ids in turned] or [0.0])),
-            rotation_min=float(min([turned[p.ids] for p in own if p.ids in turned] or [0.0])),
-            single=single.get(image_id, 0.0),
-            bridged=float(bridge is not None),
-            scale_error=bridge.scale_error_frac if bridge else 0.0,
-            copy=float(image_id in copies),
-            twin=float(image_id in unclear),
-            near=float(np.mean(near)) if near else 0.0,
-            num_images=len(ids),
-            distortion=max(map(abs, extra), default=0.0),
-            focal=camera.mean_focal_length() / max(camera.width, camera.height),
+        rotations = [turned[pair.ids] for pair in own if pair.ids in turned]
+        name, camera = graph.names[image_id], cameras[image_id]
+        found[name] = Measures(
+            evidence=sum(nats)
+            + three.get(image_id, 0.0)
+            - priors[camera.camera_id].cost(camera.mean_focal_length()),
+            agreement=float(np.average(shares, weights=[len(p.matches) for p in own]))
+            if shares
+            else 1.0,
+            second=sorted(shares)[-2] if len(shares) > 1 else 0.0,
+            num_three=long[image_id],
+            focal_growth=growth.get(camera.camera_id, 1.0),
+            focal_px=float(camera.mean_focal_length()),
+            fitting_px=fitting_px.get(camera.camera_id, 0.0),
+            turned=float(np.mean(rotations)) if rotations else 0.0,
+            bridge=bridges.get(name),
+            original=graph.names[originals[image_id]] if image_id in originals else "",
         )
     return found
 
 
 def _rotation_shares(
-    graph: PairGraph, of_image: Mapping[int, Sequence[VerifiedPair]]
+    graph: PairGraph, pairs_of: Mapping[int, Sequence[VerifiedPair]]
 ) -> dict[Ids, float]:
     """Return, of the strongest pairs of each image, how much a camera that turns explains."""
-    found = {}
-    for pairs in of_image.values():
+    found: dict[Ids, float] = {}
+    for pairs in pairs_of.values():
         for pair in sorted(pairs, key=lambda pair: -len(pair.matches))[:NUM_TURNED]:
             if pair.ids not in found:
                 sizes = _sizes(graph, pair.ids)
@@ -190,88 +252,36 @@ def _sizes(graph: PairGraph, ids: Ids) -> tuple[Size, Size]:
     return (first.width, first.height), (second.width, second.height)
 
 
-def _mirrored(graph: PairGraph) -> list[Ids]:
-    found = []
+def _originals(
+    graph: PairGraph, pairs: Sequence[VerifiedPair], agreements: Mapping[Ids, float]
+) -> dict[int, int]:
+    """Return the original of each mirrored copy.
+
+    The photograph is the one that more matches of the others agree with, but for those that have a
+    mirrored copy themselves.
+    """
+    mirrored = []
     for pair in graph.pairs[:: max(1, -(-len(graph.pairs) // MAX_PAIRS_FOR_COPIES))]:
-        keypoints = (graph.keypoints[image_id] for image_id in pair.ids)
-        if mirrored_share(*keypoints, _sizes(graph, pair.ids)) >= MIN_SHARE_MIRRORED:
-            found.append(pair.ids)
-    return found
+        first, second = (graph.keypoints[image_id] for image_id in pair.ids)
+        if mirrored_share(first, second, _sizes(graph, pair.ids)) >= MIN_SHARE_MIRRORED:
+            mirrored.append(pair.ids)
+    unclear = {image_id for ids in mirrored for image_id in ids}
+    support: defaultdict[int, float] = defaultdict(float)
+    for pair in pairs:
+        for image_id, other in (pair.ids, pair.ids[::-1]):
+            if other not in unclear:
+                support[image_id] += agreements[pair.ids] * len(pair.matches)
+    copies = {}
+    for ids in mirrored:
+        copy, original = sorted(ids, key=lambda image_id: support[image_id])
+        copies[copy] = original
+    return copies
 
 
-def _single(
-    model: pycolmap.Reconstruction,
-    graph: PairGraph,
-    pairs: Sequence[VerifiedPair],
-    agreement: Mapping[Ids, float],
-) -> dict[int, float]:
-    """Return the images that one pair alone connects with most others; how much of it disagrees."""
-    frame_of = {i: model.images[i].frame_id for i in model.reg_image_ids()}
-    frames = nx.Graph()
-    frames.add_nodes_from(frame_of.values())
-    worst: dict[frozenset[int], float] = {}
-    strong = {pair.ids: pair for pair in pairs}
-    for first, second in (*strong, *(p.ids for p in graph.weak)):
-        if first not in frame_of or second not in frame_of or frame_of[first] == frame_of[second]:
-            continue
-        share = agreement.get((first, second), 1.0)
-        if share >= MIN_SHARE:
-            edge = frozenset((frame_of[first], frame_of[second]))
-            worst[edge] = max(share, worst.get(edge, 0.0))
-            frames.add_edge(*edge)
-    found: dict[int, float] = {}
-    for edge in list(nx.bridges(frames)):
-        frames.remove_edge(*edge)
-        parts = sorted((nx.node_connected_component(frames, node) for node in edge), key=len)
-        smaller = parts if len(parts[0]) == len(parts[1]) else parts[:1]
-        for image_id, frame_id in frame_of.items():
-            if any(frame_id in part for part in smaller):
-                share = 2.0 - worst[frozenset(edge)]
-                found[image_id] = max(share, found.get(image_id, 0.0))
-        frames.add_edge(*edge)
-    parts = sorted(nx.connected_components(frames), key=len)
-    for part in parts[:-1]:
-        for image_id, frame_id in frame_of.items():
-            if frame_id in part:
-                found[image_id] = 2.0
-    return found
+def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+    """Return by what part the cost grows with another focal length, by id of the camera.
 
-
-def _median_distance(model: pycolmap.Reconstruction, image: pycolmap.Image) -> float:
-    points = image.get_observation_points2D()
-    if not points:
-        return 0.0
-    places = np.array([model.point3D(point.point3D_id).xyz for point in points])
-    return float(np.median(np.linalg.norm(places - image.projection_center(), axis=1)))
-
-
-def _angles_deg(model: pycolmap.Reconstruction) -> dict[int, tuple[float, float]]:
-    """Return, of each image, the median angles to the farthest and to the nearest other ray."""
-    ids = sorted(model.point3D_ids())
-    found: dict[int, list[tuple[float, float]]] = {i: [] for i in model.reg_image_ids()}
-    centers = {i: model.images[i].projection_center() for i in found}
-    seen: dict[int, list[tuple[NDArray[np.float64], list[int]]]] = defaultdict(list)
-    for point_id in ids[:: max(1, len(ids) // MAX_NUM_POINTS)]:
-        point = model.point3D(point_id)
-        seen_by = sorted({element.image_id for element in point.track.elements})
-        seen[len(seen_by)].append((point.xyz, seen_by))
-    for num, tracks in seen.items():  # those of one length at once
-        rays = np.array([[centers[i] - xyz for i in seen_by] for xyz, seen_by in tracks])
-        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-        angles = np.rad2deg(np.arccos(np.clip(rays @ np.swapaxes(rays, 1, 2), -1.0, 1.0)))
-        same = np.eye(num, dtype=bool)
-        nearest = np.where(same, 180.0, angles).min(axis=2).ravel().tolist()
-        farthest = np.where(same, 0.0, angles).max(axis=2).ravel().tolist()
-        images = [image_id for _, seen_by in tracks for image_id in seen_by]
-        for image_id, *both in zip(images, farthest, nearest, strict=True):
-            found[image_id].append((both[0], both[1]))
-    return {i: tuple(np.median(both, axis=0).tolist()) for i, both in found.items() if both}
-
-
-def focal_growth(
-    model: pycolmap.Reconstruction, task: MappingTask
-) -> dict[int, tuple[float, float]]:
-    """Return how much the cost of adjustment grows with another focal length, by camera.
+    None of those that somebody knows.
 
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each camera that nobody knows, while all else may move.
@@ -287,21 +297,19 @@ def focal_growth(
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     sparse = _with_fewer_points(model)
     cost = Adjuster(priors, NOISE_PX, refining, fixed).adjust(sparse, FINAL)
-    share = num_cells(sparse) / max(1, sparse.compute_num_observations())
-    found = {}
+    found: dict[int, float] = {}
     for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
         held = Adjuster(priors, NOISE_PX, refining, fixed.union(keys.tolist()))
         least = min(held.adjust(_scaled(sparse, keys, factor), FINAL) for factor in FACTORS)
-        found |= dict.fromkeys(
-            keys.tolist(), (least / max(cost, 1e-9) - 1.0, share * (least - cost))
-        )
+        found |= dict.fromkeys(keys.tolist(), least / max(cost, 1e-9) - 1.0)
     return found
 
 
-def freed_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
-    """Return the focal lengths that fit best, by id of the cameras whose user gave another one.
+def fitting_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+    """Return the focal length that fits, by id of the cameras of which the user gave another one.
 
-    None where freeing them lowers the cost by less than free parameters are worth.
+    None where freeing them lowers the cost by less than free parameters are worth: half the
+    logarithm of the number of observations each, of which those in one cell of an image count once.
     """
     used = {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
     given = {key for key in used & task.cameras.keys() if "focal" in task.cameras[key].given}
@@ -313,26 +321,22 @@ def freed_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int,
     held, freed = _with_fewer_points(model), _with_fewer_points(model)
     before = Adjuster(priors, NOISE_PX, refining, frozenset(given)).adjust(held, FINAL)
     gain = before - Adjuster(free, NOISE_PX, refining).adjust(freed, FINAL)
-    cells = num_cells(held)
-    gain *= cells / max(1, held.compute_num_observations())
-    if gain < 0.5 * len(given) * np.log(max(2, cells)):
+    num = _num_cells(held)
+    gain *= num / max(1, held.compute_num_observations())
+    if gain < 0.5 * len(given) * np.log(max(2, num)):
         return {}
-    return {key: freed.cameras[key].mean_focal_length() for key in given}
+    found = {key: float(freed.cameras[key].mean_focal_length()) for key in sorted(given)}
+    return {k: px for k, px in found.items() if abs(math.log(px / priors[k].focal_px)) > MIN_MOVE}
 
 
-def num_cells(model: pycolmap.Reconstruction) -> int:
-    """Return how many cells of the images of a model hold observations."""
-    return sum(cells_of(model).values())
-
-
-def cells_of(model: pycolmap.Reconstruction) -> dict[int, int]:
-    """Return how many cells of each registered image hold observations."""
-    found = {}
+def _num_cells(model: pycolmap.Reconstruction) -> int:
+    """Return how many cells of all images of a model hold observations."""
+    total = 0
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
         points = np.array([p.xy for p in image.get_observation_points2D()]).reshape(-1, 2)
-        found[image_id] = cells(model.cameras[image.camera_id], points)
-    return found
+        total += cells(model.cameras[image.camera_id], points)
+    return total
 
 
 def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

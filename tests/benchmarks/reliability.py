@@ -10,7 +10,8 @@ regression is fitted to them with one scene after the other left out, and at las
         --diagram-path out/reliability.png
 
 The coefficients go to the file that the package reads. What is found in --work-path is used again:
-after a change of the mapper remove its files ``*.jsonl``, after one of the features all of it.
+after a change of the mapper or of a term remove its files ``*.jsonl``, after one of the features
+all of it.
 """
 
 from __future__ import annotations
@@ -24,22 +25,25 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
-import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.poses import model_poses, pose_errors, read_poses, relative_pose
-from colmap_affrect.mappers.base import MAPPERS, MappingTask
-from colmap_affrect.mappers.reliability import measure
+from colmap_affrect.mappers.base import MAPPERS, MappedModel, MappingTask
+from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS, measure
+from colmap_affrect.project.report import DOUBTFUL, SURE
 
 
 def mirrored(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:
@@ -168,6 +172,7 @@ CAMERAS = ("unknown", "known", "wrong")  # focal lengths: nothing is said, true 
 WRONG_FACTORS = (0.7, 0.8, 1.25, 1.45)
 SIZES = (3, 4, 5, 6, 8, 10)  # photographs of a part
 MAX_CORRECT_ERROR_DEG = 5.0
+MAX_ITERATIONS = 50
 
 
 def truth_of(
@@ -254,7 +259,7 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
         connection = sqlite3.connect(small)
         connection.executescript("DELETE FROM descriptors; DELETE FROM matches; VACUUM;")
         connection.close()
-        for kind in CAMERAS:
+        for kind in CAMERAS:  # and "misplaced": one photograph of a model is moved
             if kind != "unknown" and not true_cameras:
                 continue
             for number, part in enumerate(parts_of(sorted(images), kind, num_parts, rng)):
@@ -264,27 +269,48 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
                 path = Path(folder) / "part.db"
                 write_part(small, path, {images[i] for i in part}, told[1])
                 task = MappingTask(path, None, cameras=told[0], may_share=kind == "unknown")
-                start = time.perf_counter()
-                models = MAPPERS.make(MAPPERS.options("sparse")).map(
-                    task, Path(folder), number, len_
-                )
-                seconds = time.perf_counter() - start
+                mapper = MAPPERS.make(MAPPERS.options("sparse"))
+                models = mapper.map(task, Path(folder), number, lambda _: None)
                 if not models:
                     continue
                 best = max(models, key=lambda m: m.reconstruction.num_reg_images())
-                right = correct_images(model_poses(best.reconstruction), truth)
-                rows += [
-                    {"set": name, "scene": SETS[name].scene, "cameras": kind, "part": number,
-                     "size": len(part), "image": image, "right": right[image], "seconds": seconds,
-                     **asdict(measures)}
-                    for image, measures in measure(best, task).items()
-                    if image in right and len(right) > 1
-                ]  # fmt: skip
+                about = {"set": name, "scene": SETS[name].scene, "cameras": kind, "part": number}
+                rows += [{**about, **row} for row in rows_of(best, task, truth)]
+                if kind == "unknown" and number % 2 == 0:
+                    misplaced = misplace(best.reconstruction, rng)
+                    about["cameras"] = "misplaced"
+                    found = rows_of(best, task, truth)
+                    rows += [{**about, **row} for row in found if row["image"] == misplaced]
     return rows
 
 
-def len_(_: int) -> None:
-    """Tell nobody how far mapping is."""
+def rows_of(
+    mapped: MappedModel, task: MappingTask, truth: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Return the terms of each photograph whose place is known, and whether it is right."""
+    right = correct_images(model_poses(mapped.reconstruction), truth)
+    if len(right) < 2:
+        return []
+    return [
+        {
+            "image": image,
+            "right": right[image],
+            "terms": {key: term.value(measures) for key, term in TERMS.items()},
+        }
+        for image, measures in measure(mapped, task).items()
+        if image in right
+    ]
+
+
+def misplace(model: pycolmap.Reconstruction, rng: np.random.Generator) -> str:
+    """Move a photograph around what it sees, by 20 to 90 degrees; return its name."""
+    image = model.images[int(rng.choice(sorted(model.reg_image_ids())))]
+    seen = [model.point3D(p.point3D_id).xyz for p in image.get_observation_points2D()]
+    middle, axis = np.median(seen, axis=0), rng.normal(size=3)
+    turn = pycolmap.Rotation3d(np.deg2rad(rng.uniform(20, 90)) * axis / np.linalg.norm(axis))
+    around = pycolmap.Rigid3d(turn, middle - turn.matrix() @ middle)
+    image.frame.set_cam_from_world(image.camera_id, image.cam_from_world() * around)
+    return str(image.name)
 
 
 def write_part(source: Path, path: Path, images: set[int], cameras: Mapping[int, Any]) -> None:
@@ -306,3 +332,122 @@ def calibration(some: Set, scenes_path: Path) -> dict[str, Any]:
         return {}
     model = pycolmap.Reconstruction(path)
     return {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+
+
+def fitted(
+    values: NDArray[np.float64], right: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Fit weights of (N, T) terms, none of which is negative, and the constant.
+
+    Maximum likelihood with a normal prior of the weights, by Newton's method; of terms in units of
+    their deviation.
+    """
+    mean, deviation = values.mean(axis=0), values.std(axis=0) + 1e-9
+    scaled = np.column_stack([(values - mean) / deviation, np.ones(len(values))])
+    kept = np.arange(scaled.shape[1])
+    while True:
+        part, weights = scaled[:, kept], np.zeros(len(kept))
+        prior = np.diag([1.0] * (len(kept) - 1) + [0.0])
+        for _ in range(MAX_ITERATIONS):
+            probabilities = 1.0 / (1.0 + np.exp(-part @ weights))
+            gradient = part.T @ (probabilities - right) + prior @ weights
+            curvature = (part.T * (probabilities * (1.0 - probabilities))) @ part + prior
+            step = np.linalg.solve(curvature, gradient)
+            weights -= step * min(1.0, 3.0 / np.abs(step).max())
+        if (weights[:-1] >= 0.0).all():
+            break
+        kept = np.delete(kept, weights[:-1].argmin())
+    found = np.zeros(scaled.shape[1])
+    found[kept] = weights
+    slopes = found[:-1] / deviation
+    return slopes, float(found[-1] - slopes @ mean)
+
+
+def left_out(rows: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
+    """Return the probability of each row by what is fitted to all other scenes."""
+    values = np.array([list(row["terms"].values()) for row in rows])
+    right = np.array([float(row["right"]) for row in rows])
+    scenes = np.array([row["scene"] for row in rows])
+    found = np.zeros(len(rows))
+    for scene in sorted(set(scenes)):
+        out = scenes == scene
+        slopes, constant = fitted(values[~out], right[~out])
+        found[out] = 1.0 / (1.0 + np.exp(-values[out] @ slopes - constant))
+    return found
+
+
+def scores(probabilities: NDArray[np.float64], right: NDArray[np.float64]) -> dict[str, float]:
+    """Return how good probabilities are."""
+    sure, doubtful = probabilities >= SURE, probabilities < DOUBTFUL
+    return {
+        "photographs": len(right),
+        "right": float(right.mean()),
+        "Brier score": float(((probabilities - right) ** 2).mean()),
+        "sure ones right": float(right[sure].mean()),
+        "right ones sure": float(sure[right > 0].mean()),
+        "wrong ones doubtful": float(doubtful[right == 0].mean()),
+        "wrong and sure": int((sure & (right == 0)).sum()),
+    }
+
+
+def draw(
+    probabilities: NDArray[np.float64], right: NDArray[np.float64], path: Path
+) -> list[tuple[str, int, float, float]]:
+    """Draw the reliability diagram; return its bins: number, mean probability, share of right."""
+    edges = [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0]
+    bins = []
+    for low, high in itertools.pairwise(edges):
+        inside = (probabilities >= low) & ((probabilities < high) | (high == 1.0))
+        if inside.any():
+            means = float(probabilities[inside].mean()), float(right[inside].mean())
+            bins.append((f"{low:g} to {high:g}", int(inside.sum()), *means))
+    figure, axes = plt.subplots(figsize=(4.5, 4.5))
+    axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+    axes.plot([b[2] for b in bins], [b[3] for b in bins], "o-", color="#1b6ca8")
+    for _, number, mean, share in bins:
+        axes.annotate(str(number), (mean, share), (6, -10), textcoords="offset points", fontsize=8)
+    axes.set(xlabel="probability that the model states", ylabel="share that is right")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    return bins
+
+
+def main() -> None:
+    """Observe what is missing, fit, write the coefficients and print how good they are."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--scenes-path", type=Path, required=True)
+    parser.add_argument("--work-path", type=Path, required=True)
+    parser.add_argument("--diagram-path", type=Path, required=True)
+    parser.add_argument("--parts", type=int, default=8, help="of each set and kind of cameras")
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for name in SETS:
+        path = options.work_path / f"{name}.jsonl"
+        if not path.exists():
+            found = observe(name, options.scenes_path, options.work_path, options.parts)
+            path.write_text("".join(json.dumps(row) + "\n" for row in found), encoding="utf-8")
+        rows += [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    right = np.array([float(row["right"]) for row in rows])
+    values = np.array([list(row["terms"].values()) for row in rows])
+    slopes, constant = fitted(values, right)
+    usual = values[right > 0].mean(axis=0)
+    terms = {
+        name: {"weight": round(float(weight), 4), "usual": round(float(mean), 4)}
+        for name, weight, mean in zip(TERMS, slopes, usual, strict=True)
+    }
+    content = {
+        "made": f"{datetime.now(UTC):%Y-%m-%d} by tests/benchmarks/reliability.py",
+        "data": f"{len(rows)} photographs of {len(SETS)} sets",
+        "constant": round(constant, 4),
+        "terms": terms,
+    }
+    COEFFICIENTS.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    probabilities = left_out(rows)
+    for key, score in scores(probabilities, right).items():
+        print(f"| {key} | {score:.4g} |")
+    for title, number, mean, share in draw(probabilities, right, options.diagram_path):
+        print(f"| {title} | {number} | {mean:.3f} | {share:.3f} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -15,9 +15,11 @@ from small_scene import write_photographs
 from colmap_affrect import pipeline
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
+from colmap_affrect.colmap.poses import model_poses
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers import mapping
-from colmap_affrect.mappers.doubts import Doubts
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.reliability import Judgement
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 
@@ -367,12 +369,14 @@ def test_finished_model_is_extended_and_another_database_mapped(
 def test_model_that_nobody_can_trust_ends_with_3(
     verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    doubts = Doubts(model=("no parallax",))
-    monkeypatch.setattr(mapping, "find_doubts", lambda *_: doubts)
+    def judge(mapped: MappedModel, _: object) -> dict[str, Judgement]:
+        return dict.fromkeys(model_poses(mapped.reconstruction), Judgement(0.3, "no parallax"))
+
+    monkeypatch.setattr(mapping, "judge", judge)
     assert main(["map", "--output-path", str(verified), "--overwrite"]) == 3
     printed = capfd.readouterr()
     assert "colmap gui" in printed.out
     assert "colmap-affrect export" not in printed.out
-    assert "doubtful    the whole model: no parallax\n" in printed.out
+    assert ": no parallax\n" in printed.out
     assert printed.err.splitlines()[-1].startswith("error: nothing in the model can be trusted;")
     assert json.loads((verified / "report.json").read_text())["status"] == "doubtful"

@@ -136,7 +136,7 @@ def test_the_model_that_is_extended_stays_until_all_is_judged(
 
     (tmp_path / "sparse").mkdir()
     existing = read_existing(Extension(written(old, tmp_path / "sparse" / "0")), database)
-    monkeypatch.setattr(mapping, "summarize", stop)
+    monkeypatch.setattr(mapping, "judge", stop)
     with pytest.raises(KeyboardInterrupt):
         extended(database, existing, tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]
