@@ -178,16 +178,20 @@ MAX_ITERATIONS = 50
 def truth_of(
     name: str, scenes_path: Path, images: Sequence[str]
 ) -> dict[str, tuple[str, Any] | None]:
-    """Return scene and pose of each image, None where it has no place; others are not known."""
+    """Return scene and pose of each image, None where it has no place; others are not known.
+
+    Aged photographs have other extensions.
+    """
     some = SETS[name]
     found: dict[str, tuple[str, Any] | None] = {}
     for prefix, scene in (("", some.scene), ("other-", some.other)):
         for folder in ("ground_truth", "pseudo_ground_truth"):
             if scene and (scenes_path / scene / folder).exists():
                 poses = read_poses(scenes_path / scene / folder)
-                found |= {prefix + image: (scene, pose) for image, pose in poses.items()}
+                found |= {prefix + Path(i).stem: (scene, pose) for i, pose in poses.items()}
     copies = ("mirrored-", "turned-")
-    return {i: found.get(i) for i in images if i in found or i.startswith(copies)}
+    known = {i: found.get(Path(i).stem) for i in images}
+    return {i: place for i, place in known.items() if place or i.startswith(copies)}
 
 
 def correct_images(poses: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, bool]:
@@ -229,7 +233,7 @@ def cameras_of(
         if kind == "unknown":
             changed[key] = replace(record, source="guess", given=())
             continue
-        given = truth.get(record.names[0])
+        given = truth.get(Path(record.names[0]).stem)
         if given is None:
             return None
         camera = copy.copy(given)
@@ -326,12 +330,12 @@ def write_part(source: Path, path: Path, images: set[int], cameras: Mapping[int,
 
 
 def calibration(some: Set, scenes_path: Path) -> dict[str, Any]:
-    """Return the true camera of each photograph, of scenes that have one and whole images."""
+    """Return the true cameras, by photograph without extension, of scenes with whole images."""
     path = scenes_path / some.scene / "ground_truth"
     if not path.exists() or some.spoil not in ("", "aged"):
         return {}
     model = pycolmap.Reconstruction(path)
-    return {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    return {Path(i.name).stem: model.cameras[i.camera_id] for i in model.images.values()}
 
 
 def fitted(
