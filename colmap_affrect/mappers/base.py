@@ -175,7 +175,6 @@ MAPPERS: Registry[Mapper] = Registry(
     built_in={
         "sparse": "colmap_affrect.mappers.sparse:SparseMapper",
         "incremental": "colmap_affrect.mappers.incremental:IncrementalMapper",
-        "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },
     default="sparse",
 )

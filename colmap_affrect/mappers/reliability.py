@@ -113,7 +113,11 @@ def _bridge_reason(m: Measures) -> str:
 TERMS: Mapping[str, Term] = {
     "evidence": Term(
         lambda m: math.copysign(math.log1p(abs(m.evidence) / 3.0), m.evidence),
-        lambda m: f"the evidence of its pairs is only {m.evidence:.0f} nats",
+        lambda m: (
+            "its matches speak against its place"
+            if m.evidence < 0.0
+            else "few matches speak for its place"
+        ),
     ),
     "agreement": Term(
         lambda m: m.agreement,

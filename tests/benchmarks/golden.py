@@ -180,9 +180,9 @@ def scenarios(work: Path) -> dict[str, dict[str, str]]:
         "courtyard depth-affnet-recommended": (
             COURTYARD / "images", court[:5], ["--recipe", "depth-affnet-recommended", *depth],
         ),
-        "courtyard depth-planes, global mapper, descriptors": (
+        "courtyard depth-planes, incremental mapper, descriptors": (
             COURTYARD / "images", court,
-            ["--recipe", "depth-planes-recommended", *depth, "--mapper", "global",
+            ["--recipe", "depth-planes-recommended", *depth, "--mapper", "incremental",
              "--database-descriptors", "--preset", "colmap"],
         ),
         "courtyard retrieval, low resolution": (

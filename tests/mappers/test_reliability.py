@@ -64,7 +64,7 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
     good = measure(mapped, task)[last(mapped).name]
     bridge = Bridge(("a", "b"), ("b",), 11, 39, 0.25)
     bad = {
-        "evidence": (replace(good, evidence=-20.0), "-20 nats"),
+        "evidence": (replace(good, evidence=-20.0), "speak against"),
         "agreement": (replace(good, agreement=0.1), "only 10% of the matches"),
         "second pair": (replace(good, second=0.0), "one pair alone"),
         "points of three": (replace(good, num_three=0), "only 0 of its points"),
