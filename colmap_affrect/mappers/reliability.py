@@ -8,10 +8,11 @@ the others. ``tests/benchmarks/reliability.py`` fits it on photographs whose pos
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
@@ -74,6 +75,8 @@ class Measures:
         turned: share of the matches of its strongest pairs that a camera explains which only turns.
         bridge: what it came in by, if that was no track.
         original: name of the photograph that it may be a mirrored copy of, or empty.
+        zoom: logarithm of its focal length in units of the median one of photographs of its size,
+            where nobody knows them; parts of photographs have longer ones, and no middle.
     """
 
     evidence: float
@@ -86,6 +89,7 @@ class Measures:
     turned: float
     bridge: Bridge | None
     original: str
+    zoom: float
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,13 @@ TERMS: Mapping[str, Term] = {
     "original": Term(
         lambda m: -float(bool(m.original)), lambda m: f"may be a mirrored copy of {m.original}"
     ),
+    "one lens": Term(
+        lambda m: -min(abs(m.zoom), 0.5),
+        lambda m: (
+            f"its focal length is {math.exp(m.zoom):.2f} times that of others of its size: "
+            "parts of photographs have no place"
+        ),
+    ),
 }
 """The terms, by their names in the file of coefficients."""
 
@@ -207,6 +218,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
     three, long = evidence.three_view_ratios(model), num_long_tracks(model)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
     growth, fitting_px = _focal_growths(model, task), fitting_focals(model, task)
+    zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
     bridges = {name: bridge for bridge in mapped.bridges for name in bridge.names}
     found = {}
     for image_id, own in pairs_of.items():
@@ -233,6 +245,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             turned=float(np.mean(rotations)) if rotations else 0.0,
             bridge=bridges.get(name),
             original=graph.names[originals[image_id]] if image_id in originals else "",
+            zoom=zooms.get(camera.camera_id, 0.0),
         )
     return found
 
@@ -280,6 +293,17 @@ def _originals(
         copy, original = sorted(ids, key=lambda image_id: support[image_id])
         copies[copy] = original
     return copies
+
+
+def _zooms(cameras: Iterable[pycolmap.Camera]) -> dict[int, float]:
+    """Compare the focal lengths of cameras with the median of their size, by id."""
+    logs: defaultdict[Size, dict[int, float]] = defaultdict(dict)
+    for camera in cameras:
+        focal_px = max(float(camera.mean_focal_length()), 1e-9)
+        logs[camera.width, camera.height][camera.camera_id] = math.log(focal_px)
+    return {
+        key: value - median(same.values()) for same in logs.values() for key, value in same.items()
+    }
 
 
 def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
