@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 
@@ -75,8 +74,8 @@ class Measures:
         turned: share of the matches of its strongest pairs that a camera explains which only turns.
         bridge: what it came in by, if that was no track.
         original: name of the photograph that it may be a mirrored copy of, or empty.
-        zoom: logarithm of its focal length in units of the median one of photographs of its size,
-            where nobody knows them; parts of photographs have longer ones, and no middle.
+        zoom: longest by shortest focal length of the photographs of its size, where nobody knows
+            them: parts of photographs have longer ones, and their middle is elsewhere.
     """
 
     evidence: float
@@ -156,10 +155,10 @@ TERMS: Mapping[str, Term] = {
         lambda m: -float(bool(m.original)), lambda m: f"may be a mirrored copy of {m.original}"
     ),
     "one lens": Term(
-        lambda m: -min(abs(m.zoom), 0.5),
+        lambda m: -min(math.log(m.zoom), 0.5),
         lambda m: (
-            f"its focal length is {math.exp(m.zoom):.2f} times that of others of its size: "
-            "parts of photographs have no place"
+            f"focal lengths of photographs of its size are up to {m.zoom:.2f} times apart: "
+            "some may be parts of others"
         ),
     ),
 }
@@ -245,7 +244,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             turned=float(np.mean(rotations)) if rotations else 0.0,
             bridge=bridges.get(name),
             original=graph.names[originals[image_id]] if image_id in originals else "",
-            zoom=zooms.get(camera.camera_id, 0.0),
+            zoom=zooms.get((camera.width, camera.height), 1.0),
         )
     return found
 
@@ -295,15 +294,12 @@ def _originals(
     return copies
 
 
-def _zooms(cameras: Iterable[pycolmap.Camera]) -> dict[int, float]:
-    """Compare the focal lengths of cameras with the median of their size, by id."""
-    logs: defaultdict[Size, dict[int, float]] = defaultdict(dict)
+def _zooms(cameras: Iterable[pycolmap.Camera]) -> dict[Size, float]:
+    """Return the longest by the shortest focal length of cameras of each size."""
+    of_size: defaultdict[Size, list[float]] = defaultdict(list)
     for camera in cameras:
-        focal_px = max(float(camera.mean_focal_length()), 1e-9)
-        logs[camera.width, camera.height][camera.camera_id] = math.log(focal_px)
-    return {
-        key: value - median(same.values()) for same in logs.values() for key, value in same.items()
-    }
+        of_size[camera.width, camera.height].append(max(camera.mean_focal_length(), 1e-9))
+    return {size: max(focals) / min(focals) for size, focals in of_size.items()}
 
 
 def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:

@@ -76,7 +76,7 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
         "parallax": (replace(good, turned=1.0), "only turned explains 100% of the matches"),
         "bridge": (replace(good, bridge=bridge), "bridged by a at a distance known to +-25%"),
         "original": (replace(good, original="c.jpg"), "mirrored copy of c.jpg"),
-        "one lens": (replace(good, zoom=0.5), "1.65 times that of others of its size"),
+        "one lens": (replace(good, zoom=1.65), "are up to 1.65 times apart"),
     }
     assert bad.keys() == TERMS.keys()
     for name, (measures, text) in bad.items():
