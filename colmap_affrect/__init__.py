@@ -32,7 +32,6 @@ _PUBLIC = {
     "Extension": "colmap_affrect.mappers.existing",
     "ExtractionOptions": "colmap_affrect.recipes",
     "LocalFeatures": "colmap_affrect.data",
-    "GlobalOptions": "colmap_affrect.mappers.global_mapper",
     "IncrementalOptions": "colmap_affrect.mappers.incremental",
     "SparseOptions": "colmap_affrect.mappers.sparse",
     "NearestOptions": "colmap_affrect.matchers.nearest",

@@ -29,18 +29,17 @@ def small_report(folder: Path) -> ReconstructionReport:
         3.5,
         0.25,
         doubtful={NAMES[3]: "hangs on few <points>"},
-        doubts=("hardly any parallax",),
+        probabilities=dict(zip(NAMES, (0.99, 0.95, 0.7, 0.4), strict=False)),
         arrivals={
             NAMES[0]: Arrival("tracks"),
             NAMES[1]: Arrival("guided"),
             NAMES[2]: Arrival("bridged", NAMES[0], 12, 15, 0.031),
             NAMES[3]: Arrival("tracks"),
         },
-        rival_focals_px={NAMES[2]: (150.0, 260.0)},
     )
     camera = {
         "id": 1, "num_images": 6, "names": list(NAMES), "source": "pairs", "focal_px": 200.0,
-        "refined_px": 204.4, "rival_px": None, "spread_px": [180.0, 230.0], "why": "they vote",
+        "refined_px": 204.4, "spread_px": [180.0, 230.0], "why": "they vote",
     }  # fmt: skip
     failure = f"{folder / 'photographs' / 'f.png'}: not a readable image"
     return ReconstructionReport(

@@ -57,7 +57,6 @@ class CameraRecord:
             "focal_px": self.focal_px,
             "focal_longer_sides": self.focal_px / longer if longer else None,
             "refined_px": model.focals_px[used] if model and used else None,
-            "rival_px": model.rival_focals_px.get(used) if model and used else None,
             "why": self.why,
         }
 

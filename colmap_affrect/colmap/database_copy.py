@@ -2,17 +2,15 @@
 
 import sqlite3
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 
-import numpy as np
-
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database, write_frame
-from colmap_affrect.colmap.tables import DAMAGED, columns_of, open_read_only
+from colmap_affrect.colmap.tables import DAMAGED, open_read_only
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.outputs import remove_database
 
@@ -66,9 +64,9 @@ def copy_database(
     """Copy a database as it is now, including its write-ahead log.
 
     The copy, which appears as a whole, has the schema of the installed pycolmap, and what
-    ``change`` does to it. Positions (GPS) of COLMAP before 3.10 become pose priors. Raises
-    DatabaseError, beside :func:`copy_as_it_is`, when the target exists, and for ``refused`` kinds
-    of problems: databases of anybody are checked before COLMAP sees the copy.
+    ``change`` does to it. COLMAP leaves positions of before 3.10 behind. Raises DatabaseError,
+    beside :func:`copy_as_it_is`, when the target exists, and for ``refused`` kinds of problems:
+    databases of anybody are checked before COLMAP sees the copy.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
@@ -78,46 +76,12 @@ def copy_database(
     remove_database(new)
     try:
         copy_as_it_is(source, new)
-        positions = _old_positions(new)
         with open_database(new) as database:  # COLMAP migrates it
-            _add_positions(database, positions)
             if change:
                 change(database)
         new.replace(target)
     finally:
         remove_database(new)
-
-
-def _old_positions(path: Path) -> dict[int, tuple[float, float, float]]:
-    """Return the positions that COLMAP before 3.10 kept with images, by image id."""
-    with open_read_only(path) as connection:
-        if "prior_tx" not in columns_of(connection, "images"):
-            return {}
-        rows = connection.execute(
-            "SELECT image_id, prior_tx, prior_ty, prior_tz FROM images "
-            "WHERE abs(prior_tx) + abs(prior_ty) + abs(prior_tz) > 0 AND coalesce("
-            "abs(prior_qw) + abs(prior_qx) + abs(prior_qy) + abs(prior_qz), 0) = 0"
-        )
-        return {image_id: (x, y, z) for image_id, x, y, z in rows}
-
-
-def _add_positions(
-    database: pycolmap.Database, positions: Mapping[int, tuple[float, float, float]]
-) -> None:
-    """Make positions pose priors: of GPS if they can be latitudes and longitudes, else metric."""
-    if not positions:
-        return
-    is_gps = all(abs(x) <= 90 and abs(y) <= 180 for x, y, _ in positions.values())
-    systems = pycolmap.PosePriorCoordinateSystem
-    there = {prior.corr_data_id.id for prior in database.read_all_pose_priors()}
-    for image in database.read_all_images():
-        if image.image_id in positions.keys() - there:
-            prior = pycolmap.PosePrior(
-                position=np.array(positions[image.image_id]),
-                coordinate_system=systems.WGS84 if is_gps else systems.CARTESIAN,
-            )
-            prior.corr_data_id = image.data_id
-            database.write_pose_prior(prior)
 
 
 def copy_without_features(source: Path, target: Path) -> None:

@@ -250,7 +250,6 @@ class MethodRun:
             scores=None,
             wall_s=watch.seconds,
             doubtful=largest.doubtful,
-            doubts=largest.doubts,
         )
 
     def _map_recipe(

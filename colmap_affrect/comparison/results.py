@@ -57,7 +57,6 @@ class SeedResult:
     scores: PoseScores | None  # against ground truth; None where there is none
     wall_s: Mapping[str, float]  # seconds of ``verify`` and ``map``
     doubtful: Mapping[str, str] = field(default_factory=dict)  # images that cannot be trusted: why
-    doubts: tuple[str, ...] = ()  # reasons to doubt the model as a whole
 
     @property
     def registered_names(self) -> tuple[str, ...]:
@@ -68,12 +67,6 @@ class SeedResult:
     def correct_names(self) -> tuple[str, ...]:
         """Images registered correctly; without ground truth those registered."""
         return self.registered_names if self.scores is None else self.scores.correct_names
-
-    @property
-    def reasons_to_doubt(self) -> dict[str, str]:
-        """Registered images that cannot be trusted, with the reason: their own or the model's."""
-        doubted = self.registered_names if self.doubts else ()
-        return {**dict.fromkeys(doubted, ", ".join(self.doubts)), **self.doubtful}
 
     @model_serializer(mode="wrap")
     def _with_measures(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -110,7 +103,7 @@ MEASURES = {
         _of_scores(lambda scores: len(scores.correct_names)),
         "Registered correctly, of {images}", 1, max, "correct",
     ),
-    "num_doubtful": Measure(lambda seed: len(seed.reasons_to_doubt), "Doubtful", 1, min),
+    "num_doubtful": Measure(lambda seed: len(seed.doubtful), "Doubtful", 1, min),
     "num_models": Measure(lambda seed: len(seed.model_names), "Models", 1),
     "verified_pairs": Measure(
         lambda seed: len(seed.pair_inliers), "Verified pairs, of {pairs}", 1, None, "verified"
@@ -185,7 +178,7 @@ class MethodResult:
     @cached_property
     def usually_doubted(self) -> dict[str, str]:
         """Images that cannot be trusted in more than half of the seeds, with a reason."""
-        seeds = [seed.reasons_to_doubt for seed in self.seeds]
+        seeds = [dict(seed.doubtful) for seed in self.seeds]
         names = in_most([list(reasons) for reasons in seeds])
         return {name: next(r[name] for r in seeds if name in r) for name in sorted(names)}
 

@@ -154,10 +154,8 @@ def _doubts(comparison: Comparison) -> list[str]:
         names = defaultdict(list)
         for name in sorted(in_most([list(seed.doubtful) for seed in method.seeds])):
             names[reasons[name]].append(name)
-        texts = [f"{_listed(same)} ({why})" for why, same in names.items()]
-        of_model = sorted(in_most([seed.doubts for seed in method.seeds]))
-        for text in [*texts, *(f"the whole model ({why})" for why in of_model)]:
-            methods[text].append(method.name)
+        for why, same in names.items():
+            methods[f"{_listed(same)} ({why})"].append(method.name)
     return [f"Doubtful in {_listed(names)}: {text}." for text, names in methods.items()]
 
 

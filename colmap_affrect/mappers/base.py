@@ -130,15 +130,13 @@ class MappedModel:
     Attributes:
         reconstruction: the model.
         bridges: in the order in which they were made.
-        taken_out: images that were certainly wrong and had to leave, with the reason.
-        rival_focals_px: see :class:`~colmap_affrect.project.report.ModelSummary`.
+        taken_out: images that were surely wrong and had to leave, with the reason.
         moves: what made the model, in the words of a report.
     """
 
     reconstruction: pycolmap.Reconstruction
     bridges: tuple[Bridge, ...] = ()
     taken_out: Mapping[str, str] = field(default_factory=dict)
-    rival_focals_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     moves: tuple[str, ...] = ()
 
 
@@ -177,7 +175,6 @@ MAPPERS: Registry[Mapper] = Registry(
     built_in={
         "sparse": "colmap_affrect.mappers.sparse:SparseMapper",
         "incremental": "colmap_affrect.mappers.incremental:IncrementalMapper",
-        "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },
     default="sparse",
 )

@@ -40,7 +40,7 @@ class Evidence:
         poses, cameras = poses_of(model), cameras_of(model)
         total = self.of_three_views(model)
         for pair in self.graph.pairs_inside(poses):
-            num = self._num_cells(pair)
+            num = self.num_cells(pair)
             total += pair_evidence(self.graph.agreement(pair, poses, cameras) * num, num)
         used = {camera.camera_id: camera for camera in cameras.values()}
         costs = (self.priors[key].cost(camera.mean_focal_length()) for key, camera in used.items())
@@ -52,18 +52,17 @@ class Evidence:
 
     def of_three_views(self, model: pycolmap.Reconstruction) -> float:
         """Return what the features that are matched in two other images add to the evidence."""
-        return sum(_log_ratio(*counts, RIGHT_OF_THREE) for counts in self._three_views(model))
+        return sum(self.three_view_ratios(model).values())
 
     def is_confirmed(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether features of three images confirm each image of a model."""
-        counts = self._three_views(model)
-        return all(_log_ratio(*count, RIGHT_OF_THREE) >= MIN_GAIN for count in counts)
+        return min(self.three_view_ratios(model).values(), default=MIN_GAIN) >= MIN_GAIN
 
-    def _three_views(self, model: pycolmap.Reconstruction) -> list[tuple[float, int]]:
-        """Return, of each image, how many cells with features of three images agree, and all.
+    def three_view_ratios(self, model: pycolmap.Reconstruction) -> dict[int, float]:
+        """Return the log-likelihood ratio of each image's features that two others match.
 
-        The first is the share of these features that are in a point which three images see, times
-        the second.
+        Cells of the image that hold such features count as often as is the share of these that are
+        in a point which three images see.
         """
         inside = self.graph.keypoints.keys() & set(model.reg_image_ids())
         partners = {i: np.zeros(len(self.graph.keypoints[i]), np.int64) for i in sorted(inside)}
@@ -73,24 +72,24 @@ class Evidence:
         points = {image_id: seen_points(model.images[image_id]) for image_id in partners}
         ids, lengths = np.unique(np.concatenate([*points.values(), [-1]]), return_counts=True)
         long = ids[(lengths > 2) & (ids >= 0)]
-        counts = []
+        ratios = {}
         for image_id, number in partners.items():
             features = np.flatnonzero(number > 1)
-            num = self._cells(image_id, self.graph.keypoints[image_id][features])
+            num = cells(self.graph.cameras[image_id], self.graph.keypoints[image_id][features])
             share = np.isin(points[image_id][features], long).mean() if num else 0.0
-            counts.append((float(share * num), num))
-        return counts
+            ratios[image_id] = _log_ratio(float(share * num), num, RIGHT_OF_THREE)
+        return ratios
 
-    def _num_cells(self, pair: VerifiedPair) -> int:
+    def num_cells(self, pair: VerifiedPair) -> int:
         """Return how many cells hold inliers, in that image of a pair which has fewer."""
         both = zip(pair.ids, self.graph.points(pair), strict=True)
-        return min(self._cells(image_id, points) for image_id, points in both)
+        return min(cells(self.graph.cameras[image_id], points) for image_id, points in both)
 
-    def _cells(self, image_id: int, points: NDArray[np.floating]) -> int:
-        """Return how many cells of a grid over an image hold points, (N, 2) px."""
-        camera = self.graph.cameras[image_id]
-        cells = (points / [camera.width, camera.height] * GRID).astype(int)
-        return len(np.unique(np.clip(cells, 0, GRID - 1) @ [1, GRID]))
+
+def cells(camera: pycolmap.Camera, points: NDArray[np.floating]) -> int:
+    """Return how many cells of a grid over an image hold points, (N, 2) px."""
+    numbers = (points / [camera.width, camera.height] * GRID).astype(int)
+    return len(np.unique(np.clip(numbers, 0, GRID - 1) @ [1, GRID]))
 
 
 def pair_evidence(num_agreeing: float, num: float) -> float:

@@ -13,7 +13,7 @@ from colmap_affrect.mappers.adjustment import FAST, FINAL, MEDIUM, Adjuster
 from colmap_affrect.mappers.base import Bridge
 from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
 from colmap_affrect.mappers.evidence import Evidence
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.pair_graph import CameraById, PairGraph, PoseById
 
 MIN_POINTS = 10  # of a first pair
 ALWAYS = 10  # images up to which everything is adjusted after each one
@@ -98,22 +98,27 @@ class Grower:
         self, hypothesis: Hypothesis, model: pycolmap.Reconstruction
     ) -> pycolmap.Reconstruction:
         """Return a copy of a model with the images of a bridge, grown and adjusted from there."""
-        model = copy.deepcopy(model)
+        return self.placed(hypothesis.poses, hypothesis.cameras, copy.deepcopy(model))
+
+    def placed(
+        self, poses: PoseById, cameras: CameraById, model: pycolmap.Reconstruction
+    ) -> pycolmap.Reconstruction:
+        """Register images where they are said to be; grow and adjust the model from there."""
         known = {model.images[i].camera_id for i in model.reg_image_ids()}
         model.load(self.cache)
-        for image_id, (rotation, translation) in hypothesis.poses.items():
+        for image_id, (rotation, translation) in poses.items():
             image = model.images[image_id]
             if image.has_pose or image.frame is None:
                 continue
             if image.camera_id not in known:
-                parameters = hypothesis.cameras[image_id].params.tolist()
+                parameters = cameras[image_id].params.tolist()
                 model.cameras[image.camera_id].params = parameters
             pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
             image.frame.set_cam_from_world(image.camera_id, pose)
             model.register_frame(image.frame_id)
         mapper = pycolmap.IncrementalMapper(self.cache)
         mapper.begin_reconstruction(model)
-        for image_id in hypothesis.poses:
+        for image_id in poses:
             mapper.triangulate_image(self.triangulation, image_id)
         self.complete(mapper)
         mapper.end_reconstruction(False)

@@ -1,22 +1,24 @@
 """From a verified database to a folder of models, by any mapper."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import SUMMARY, read_given_model, write_model
 from colmap_affrect.mappers.arrivals import arrivals
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
-from colmap_affrect.mappers.doubts import FOCAL_DOUBT, find_doubts, without_impossible
 from colmap_affrect.mappers.existing import require_extends
-from colmap_affrect.mappers.loose_cameras import contradicted_focals, loose_images
+from colmap_affrect.mappers.reliability import Judgement, judge
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.summaries import model_folders, read_summary, write_summary
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.report import DOUBTFUL, ModelSummary
 
 logger = logging.getLogger(__name__)
+
+WRONG = 0.1  # probability below which an image leaves its model: nine of ten are wrong
 
 
 def map_database(
@@ -24,8 +26,8 @@ def map_database(
 ) -> list[ModelSummary]:
     """Map a verified database and write the models to ``sparse_path``/0, /1, ..., largest first.
 
-    Images that are certainly wrong are taken out (:mod:`colmap_affrect.mappers.doubts`), but for
-    those of a model that is extended. ``sparse_path`` appears only once all models are written, and
+    Images that are surely wrong are taken out (:mod:`colmap_affrect.mappers.reliability`), but not
+    of a model that is extended. ``sparse_path`` appears only once all models are written, and
     what was in it, perhaps the model that is extended, stays there until then.
 
     Args:
@@ -61,11 +63,11 @@ def map_database(
             found = mapper.map(kept, raw, mapper.options.random_seed, show)
             remove_own([raw])
         if not task.extend:  # whose images stay, whatever they are
-            found = [model for each in found if (model := without_impossible(each, task))]
+            found = [model for each in found if (model := _without_wrong(each, task))]
         summaries = []
         for index, model in enumerate(sorted(found, key=_size, reverse=True)):
             write_model(model.reconstruction, partial / str(index))
-            summaries.append(summarize(model, task, is_largest=index == 0))
+            summaries.append(_summary(model, judge(model, task), task))
             write_summary(summaries[-1], partial / str(index))
         remove_own([sparse_path])
         partial.rename(sparse_path)
@@ -88,15 +90,34 @@ def read_models(sparse_path: Path, task: MappingTask) -> list[ModelSummary]:
 
 def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
     logger.warning("%s: %s is missing or damaged; the model is judged anew", folder, SUMMARY)
-    return summarize(MappedModel(read_given_model(folder)), task, is_largest=folder.name == "0")
+    model = MappedModel(read_given_model(folder))
+    return _summary(model, judge(model, task), task)
 
 
-def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> ModelSummary:
-    """Count what a model holds, and judge it."""
+def _without_wrong(mapped: MappedModel, task: MappingTask) -> MappedModel | None:
+    """Take out the images that are surely wrong, the worst one first; None if two are not left.
+
+    The reconstruction itself is changed. Of a rig all images leave that were taken at once.
+    """
+    model, taken = mapped.reconstruction, dict[str, str]()
+    while model.num_reg_images() > 1:
+        found = judge(mapped, task)
+        name = min(found, key=lambda name: found[name].probability)
+        if found[name].probability >= WRONG:
+            return replace(mapped, taken_out=taken)
+        frame_id = model.find_image_with_name(name).frame_id
+        for image in model.images.values():
+            if image.frame_id == frame_id and image.has_pose:
+                taken[image.name] = found[name].reason
+        model.deregister_frame(frame_id)
+    return None
+
+
+def _summary(
+    mapped: MappedModel, found: Mapping[str, Judgement], task: MappingTask
+) -> ModelSummary:
+    """Count what a model holds, and say how sure it is of each photograph."""
     model = mapped.reconstruction
-    loose = loose_images(model, task) if is_largest and not task.extend else ()
-    fitting_px = {} if task.extend else contradicted_focals(model, task)
-    doubts = find_doubts(mapped, task, loose, fitting_px)
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
     focals = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
     return ModelSummary(
@@ -104,12 +125,10 @@ def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> Mo
         num_points3D=model.num_points3D(),
         mean_track_length=float(model.compute_mean_track_length()),
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
-        doubtful=dict(doubts.images),
-        doubts=doubts.model,
+        probabilities={name: round(one.probability, 3) for name, one in found.items()},
+        doubtful={name: one.reason for name, one in found.items() if one.probability < DOUBTFUL},
         arrivals=arrivals(mapped, task),
         taken_out=dict(mapped.taken_out),
         focals_px=focals,
-        rival_focals_px=dict(mapped.rival_focals_px),
         moves=mapped.moves,
-        loose=tuple(name for name, why in doubts.images.items() if why == FOCAL_DOUBT),
     )

@@ -16,7 +16,7 @@ from colmap_affrect.mappers.adjustment import EXIF_SIGMA, MEDIUM, Adjuster, Foca
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.growing import Grower, Joiner, Models
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 
 ZOOMS = 1.0, 1.4, 0.7, 2.0
 """Factors of the usual focal length near which unknown ones begin: all lenses from wide to long."""
@@ -26,7 +26,6 @@ these images do not tell it, and models that are to be joined must agree."""
 SAME_FOCAL = 0.03  # of the logarithm: bridges built with one are right with the other
 FACTORS = 1.25, 0.8  # of a focal length, from which another adjustment starts
 NUM_STARTS = 3
-MIN_RIVAL = 1.15  # factor between two focal lengths that are told apart
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Search:
         if start:
             return self._beyond(graph, start)
         best: list[MappedModel] = []
-        most, rivals = -math.inf, []
+        most = -math.inf
         usual = [self._near(zoom) for zoom in ZOOMS] if self._shared else [self.adjuster]
         left = usual.copy()
         while left:
@@ -73,19 +72,24 @@ class Search:
             found = [replace(found[0], reconstruction=model), *found[1:]]
             agrees = self._agrees(adjuster, model)
             evidence += MIN_GAIN * agrees  # with others, bridges are of the wrong length
-            rivals.append((evidence, model))
             if evidence > most:
                 most, best = evidence, found
                 if adjuster in usual and not agrees:
                     left.insert(0, self._as_found(model))
             if self.is_certain(model, graph, agrees=agrees):
                 break
-        if not best:
-            return []
         for mapped in best:
             self.grower(graph).finish(mapped.reconstruction)
-        spreads = _spreads([model for evidence, model in rivals if evidence > most - MIN_GAIN])
-        return [replace(best[0], rival_focals_px=spreads), *best[1:]]
+        return best
+
+    def with_own_cameras(
+        self, graph: PairGraph, model: pycolmap.Reconstruction
+    ) -> pycolmap.Reconstruction:
+        """Return a model with the cameras of the graph that begins with those of another one."""
+        grower = self.grower(graph)
+        own = grower.placed(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
+        grower.finish(own)
+        return own
 
     def _beyond(self, graph: PairGraph, start: pycolmap.Reconstruction) -> list[MappedModel]:
         near = replace(self, adjuster=self._as_found(start))
@@ -219,13 +223,3 @@ class Search:
                 break
         ordered = sorted(models.values(), key=lambda found: -found[0])
         return [model for _, model in ordered]
-
-
-def _spreads(rivals: Sequence[pycolmap.Reconstruction]) -> dict[str, tuple[float, float]]:
-    """Return lowest and highest focal length of images for which models differ."""
-    focals: dict[str, list[float]] = {}
-    for model in rivals:
-        for image_id, camera in cameras_of(model).items():
-            focals.setdefault(model.images[image_id].name, []).append(camera.mean_focal_length())
-    spreads = {name: (min(known), max(known)) for name, known in sorted(focals.items())}
-    return {name: ends for name, ends in spreads.items() if ends[1] > MIN_RIVAL * ends[0]}

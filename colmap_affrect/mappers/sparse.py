@@ -17,6 +17,7 @@ from colmap_affrect.mappers.search import Search
 from colmap_affrect.options import within
 
 SOME_TRACKS = "from some of the tracks"  # the move that makes easy models
+OWN_CAMERAS = "with a camera for each photograph"
 LARGE = 100  # images from which on COLMAP's own pipeline maps
 
 
@@ -65,7 +66,7 @@ class SparseMapper(IncrementalMapper):
                     task.extend.restore(model.reconstruction)
         else:
             native.mapper.init_max_forward_motion = 1.0  # the evidence decides on such pairs
-            best = self._with_or_without_sharing(task, graph, native, shown)
+            best = self._best(task, graph, native, shown)
             for model in best:
                 model.reconstruction.normalize()  # as COLMAP does
         if native.extract_colors and task.image_path:
@@ -101,40 +102,28 @@ class SparseMapper(IncrementalMapper):
         )
         return Search(adjuster, Evidence(graph, priors), native, self.options.num_seeds, show)
 
-    def _with_or_without_sharing(
-        self,
-        task: MappingTask,
-        graph: PairGraph,
-        native: pycolmap.IncrementalPipelineOptions,
-        show: Callable[[int], None],
-    ) -> list[MappedModel]:
-        """Let images of one size share unknown cameras, unless the evidence is against that."""
-        cameras = with_shared_cameras(task.cameras)
-        if not task.may_share or len(cameras) == len(task.cameras):
-            return self._best(task, graph, native, show)[0]
-        sharing = replace(task, cameras=cameras)
-        shared, evidence = self._best(sharing, graph.with_cameras(cameras), native, show)
-        if not shared or not graph.is_explained_by(shared[0].reconstruction):
-            free, most = self._best(task, graph, native, show)
-            if evidence < most - MIN_GAIN:
-                return free
-        return shared
-
     def _best(
         self,
         task: MappingTask,
         graph: PairGraph,
         native: pycolmap.IncrementalPipelineOptions,
         show: Callable[[int], None],
-    ) -> tuple[list[MappedModel], float]:
-        """Return what has most evidence, and how much, after all moves."""
+    ) -> list[MappedModel]:
+        """Return what has most evidence after all moves.
+
+        Images of one size share unknown cameras at first. Cameras of their own are one more move,
+        which the evidence is for where they differ, or some images are parts of others.
+        """
+        cameras = with_shared_cameras(task.cameras) if task.may_share else task.cameras
+        is_sharing = len(cameras) < len(task.cameras)
+        own = graph, self._search(task, graph, native, show)
+        if is_sharing:
+            graph = graph.with_cameras(cameras)
+        search = self._search(replace(task, cameras=cameras), graph, native, show)
         ids = {name: image_id for image_id, name in graph.names.items()}
         measured = {(ids[a], ids[b]): inliers for (a, b), inliers in task.measured.items()}
-        search = self._search(task, graph, native, show)
-        if easy := self._of_some_tracks(task, graph, graph.with_inliers(measured), search):
-            return easy, search.evidence_of(easy)
-        best: list[MappedModel] = []
-        most, tried = 0.0, set[frozenset[tuple[Ids, int]]]()
+        best, most = list[MappedModel](), 0.0
+        tried = set[frozenset[tuple[Ids, int]]]()
         for name, move in MOVES.items():
             start = best[0].reconstruction if best else None
             if start and search.is_certain(start, graph):
@@ -147,27 +136,36 @@ class SparseMapper(IncrementalMapper):
             if pairs in tried or (start and reduced.is_explained_by(start)):
                 continue
             tried.add(pairs)
-            models = search.best(reduced, start)
+            models = [] if start else _of_some_tracks(search, reduced, graph)
+            models = models or search.best(reduced, start)
             evidence = search.evidence_of(models)
-            if not best or evidence > most:
-                moves = (*(best[0].moves if best else ()), name)
-                best, most = [replace(model, moves=moves) for model in models], evidence
-        return best, most
+            if not models or (best and evidence <= most):
+                continue
+            moves = (*(best[0].moves if best else ()), name, *models[0].moves)
+            best, most = [replace(model, moves=moves) for model in models], evidence
+            if is_sharing:
+                model = own[1].with_own_cameras(reduction(own[0]), best[0].reconstruction)
+                if own[1].evidence.of(model) > most + MIN_GAIN:
+                    is_sharing, (graph, search) = False, own
+                    best = [replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))]
+                    most = search.evidence_of(best)
+        return best or (
+            self._best(replace(task, may_share=False), own[0], native, show) if is_sharing else []
+        )
 
-    def _of_some_tracks(
-        self, task: MappingTask, graph: PairGraph, reduced: PairGraph, search: Search
-    ) -> list[MappedModel]:
-        """Return a model of all images if some tracks make one that is certain.
 
-        It has the points of all tracks of ``reduced``.
-        """
-        thin = reduced.thinned()
-        if thin is reduced:
-            return []
-        quick = self._search(task, thin, search.native, search.show)
-        models = replace(quick, num_starts=0).best(thin)
-        has_all = models and models[0].reconstruction.num_reg_images() == len(graph.keypoints)
-        if not has_all or not quick.is_certain(models[0].reconstruction, graph):
-            return []
-        search.grower(reduced).fill(models[0].reconstruction, FAST)  # poses are right
-        return [replace(models[0], moves=(SOME_TRACKS,))]
+def _of_some_tracks(search: Search, reduced: PairGraph, graph: PairGraph) -> list[MappedModel]:
+    """Return a model of all images if some tracks of a reduced graph make one that is certain.
+
+    It has the points of all tracks.
+    """
+    thin = reduced.thinned()
+    if thin is reduced:
+        return []
+    quick = replace(search, evidence=replace(search.evidence, graph=thin), num_starts=0)
+    models = quick.best(thin)
+    has_all = models and models[0].reconstruction.num_reg_images() == len(graph.keypoints)
+    if not has_all or not quick.is_certain(models[0].reconstruction, graph):
+        return []
+    search.grower(reduced).fill(models[0].reconstruction, FAST)  # poses are right
+    return [replace(models[0], moves=(SOME_TRACKS,))]

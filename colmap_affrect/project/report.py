@@ -25,8 +25,8 @@ SOURCES = {
 """How a summary calls where focal lengths are from; others are called by their own names."""
 
 OF_LARGEST = (
-    "registered_names", "doubtful", "doubts", "mean_track_length", "mean_reprojection_error_px",
-    "moves",
+    "registered_names", "probabilities", "doubtful", "mean_track_length",
+    "mean_reprojection_error_px", "moves",
 )  # fmt: skip
 OF_RUN = (
     "unregistered", "advice", "extended", "added", "num_pairs", "num_verified_pairs", "pair_levels",
@@ -34,6 +34,8 @@ OF_RUN = (
     "versions",
 )  # fmt: skip
 """What ``report.json`` has of the largest model and of the run under its own name."""
+
+SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
 
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
@@ -169,14 +171,11 @@ class ModelSummary:
     """One COLMAP model; the error is the mean over observations in px.
 
     Attributes:
-        doubtful: images whose pose or camera is doubtful, with the reason.
-        loose: of these the ones that nothing speaks against but that any focal length fits.
-        doubts: reasons to doubt the model as a whole.
+        probabilities: how probable it is that an image stands right, within 5 degrees.
+        doubtful: images that are rather wrong than right, with the reason.
         arrivals: how each image came in.
-        taken_out: images that were certainly wrong, with the reason.
+        taken_out: images that were surely wrong, with the reason.
         focals_px: focal length of each image's camera.
-        rival_focals_px: lowest and highest of models that agree as well with the pairs, of images
-            for which these differ.
         moves: what made the model, by the sparse mapper.
     """
 
@@ -184,45 +183,33 @@ class ModelSummary:
     num_points3D: int
     mean_track_length: float
     mean_reprojection_error_px: float
+    probabilities: dict[str, float] = field(default_factory=dict)
     doubtful: dict[str, str] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
     arrivals: dict[str, Arrival] = field(default_factory=dict)
     taken_out: dict[str, str] = field(default_factory=dict)
     focals_px: dict[str, float] = field(default_factory=dict)
-    rival_focals_px: dict[str, tuple[float, float]] = field(default_factory=dict)
-    loose: tuple[str, ...] = ()
     moves: tuple[str, ...] = ()
 
     @property
     def is_trustworthy(self) -> bool:
         """Whether two images or more are left that are not doubtful."""
-        return not self.doubts and len(self.registered_names) - len(self.doubtful) > 1
+        return len(self.registered_names) - len(self.doubtful) > 1
 
     @property
-    def num_contradicted(self) -> int:
-        """Number of images that something speaks against."""
-        return len(self.doubtful) - len(self.loose)
-
-    def rival_lines(self) -> list[str]:
-        """Say which focal lengths fit as well as those of the model."""
-        return by_story(
-            {
-                name: f"focal lengths from {low:.0f} to {high:.0f} px fit as well"
-                for name, (low, high) in self.rival_focals_px.items()
-            }
-        )
+    def sure(self) -> tuple[str, ...]:
+        """Names of the images that are right with a probability of ``SURE`` or more."""
+        return tuple(name for name, share in self.probabilities.items() if share >= SURE)
 
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
-        lines = _some(f"            {line}" for line in self.rival_lines())
-        lines += _some(
+        lines = _some(
             f"came in     {name} {item.text()}"
             for name, item in self.arrivals.items()
             if item.how != "tracks"
         )
         lines += _some(f"doubtful    {line}" for line in by_story(self.doubtful))
-        lines += [f"doubtful    the whole model: {why}" for why in self.doubts]
         return [
+            f"sure        {len(self.sure)}, right with a probability of {SURE:.0%} or more",
             *lines,
             f"points      {self.num_points3D}, each in {self.mean_track_length:.2f} images",
             f"error       {self.mean_reprojection_error_px:.2f} px on average",

@@ -117,6 +117,8 @@ def _fate(number: int, name: str, report: ReconstructionReport, model: ModelSumm
     if name in report.extended:
         kind, text = "existing", KINDS["existing"]
     groups = ["all", kind, *(["added"] if name in report.added else [])]
+    if name in model.probabilities:
+        text += f", right with a probability of {model.probabilities[name]:.0%}"
     is_doubtful = name in model.doubtful
     if is_doubtful:
         kind, text = "doubtful", f"{text}; doubtful: {model.doubtful[name]}"
@@ -125,10 +127,9 @@ def _fate(number: int, name: str, report: ReconstructionReport, model: ModelSumm
 
 
 def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
-    """Return what cannot be trusted, the model as a whole first."""
+    """Return what cannot be trusted."""
     texts = [] if report.models else _why_no_model(report)
-    texts += [f"The whole model: {why}." for why in model.doubts]
-    texts += [*by_story(model.doubtful), *model.rival_lines()]
+    texts += by_story(model.doubtful)
     if report.contradicting_pairs:
         total = sum(report.contradicting_pairs.values())
         texts.append(f"The model contradicts {total} of the verified pairs.")
@@ -167,14 +168,13 @@ def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
 def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
     rows = []
     for camera in report.cameras[:MAX_NUM_CAMERAS]:
-        spread, refined = camera["rival_px"], camera["refined_px"]
+        refined = camera["refined_px"]
         names = (f"{index[name] + 1} {name}" for name in camera["names"] if name in index)
         rows.append(
             {
                 "photographs": such_as(names),
                 "focal": f"{camera['focal_px']:,.0f}",
                 "refined": f"{refined:,.0f}" if refined else "-",
-                "spread": "{:,.0f} to {:,.0f}".format(*spread) if spread else "-",
                 "source": f"{SOURCES[camera['source']]}{camera['why'] and ': '}{camera['why']}",
             }
         )

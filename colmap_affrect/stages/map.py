@@ -14,10 +14,10 @@ from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.features.weights import install_hint
 from colmap_affrect.features.weights import missing as missing_weights
 from colmap_affrect.mappers.base import Mapper, MappingTask
-from colmap_affrect.mappers.doubts import FOCAL_CONTRADICTED
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.mapping import map_database, read_models
 from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.mappers.summaries import refuse_edited
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
@@ -193,25 +193,24 @@ def advice(
     context: Context, missing: Collection[str], models: Sequence[ModelSummary]
 ) -> tuple[str, ...]:
     """Say what may help when images are missing or the largest model is doubtful, best first."""
-    is_doubtful = bool(models and (models[0].doubtful or models[0].doubts))
-    if not missing and not is_doubtful:
+    doubts = "; ".join(models[0].doubtful.values()) if models else ""
+    if not missing and not doubts:
         return ()
     workspace = context.workspace
     num_keypoints = colmap_database.keypoint_counts(workspace.database)
     if sum(map(bool, num_keypoints.values())) < 2:
         return (TOO_FEW,)
     missing = [name for name in missing if name in num_keypoints]  # nothing helps unreadable ones
-    if not missing and not is_doubtful:
+    if not missing and not doubts:
         return ()
-    is_inconsistent = bool(models and (models[0].doubts or models[0].num_contradicted))
     recipes = [] if workspace.is_copy else _other_recipes(context)
     texts = []
-    if models and any(FOCAL_CONTRADICTED in why for why in models[0].doubtful.values()):
+    if FOCAL_CONTRADICTED in doubts:
         texts.append("run again without the given focal lengths, or with others: they do not fit")
     if missing:
         texts += recipes
     has_cameras = workspace.is_copy or Context(workspace).inputs.from_database
-    if models and (models[0].rival_focals_px or models[0].loose) and not has_cameras:
+    if FOCAL_UNKNOWN in doubts and not has_cameras:
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
             "several focal lengths fit"
@@ -220,12 +219,12 @@ def advice(
         texts.append("run --from-database, with --image-path, makes new features for its images")
     else:
         masks = Context(workspace).inputs.masks
-        if (missing or is_inconsistent) and not (masks.path or masks.camera_path):
+        if not (masks.path or masks.camera_path):
             texts.append(
                 "run again with --mask-path, if things move, repeat or are written on the "
                 "photographs"
             )
-    if models and models[0].num_contradicted and not missing:
+    if doubts and not missing:
         texts += recipes
     if missing:
         texts.append(f"more photographs {_missing_places(workspace, missing)}")

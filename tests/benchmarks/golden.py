@@ -174,15 +174,15 @@ def jobs() -> dict[str, Job]:
     """Return photographs, names and options of runs by what they are called."""
     court, images = sorted(path.name for path in COURTYARD.glob("images/*")), COURTYARD / "images"
     depth = ["--depth-path", str(COURTYARD / "depth")]
-    globally = ["--mapper", "global", "--database-descriptors", "--preset", "colmap"]
+    preset = ["--mapper", "incremental", "--database-descriptors", "--preset", "colmap"]
     few = ["--pairs", "retrieval,low-resolution,sequence", "--num-neighbors", "2"]
     demand, with_depth = ["--recipe", "on-demand"], "depth-affnet-recommended"
     found: dict[str, Job] = {
         "courtyard default": (images, court, []),
         "courtyard on-demand": (images, court, demand),
         f"courtyard {with_depth}": (images, court[:5], ["--recipe", with_depth, *depth]),
-        "courtyard depth-planes, global mapper, descriptors": (
-            images, court, ["--recipe", "depth-planes-recommended", *depth, *globally]
+        "courtyard depth-planes, incremental mapper, descriptors": (
+            images, court, ["--recipe", "depth-planes-recommended", *depth, *preset]
         ),
         "courtyard retrieval, low resolution": (images, court, few),
     }  # fmt: skip

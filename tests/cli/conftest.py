@@ -20,13 +20,13 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def verified(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run with COLMAP's preset and its global mapper."""
+    """A finished run with COLMAP's preset and its mapper."""
     out = tmp_path_factory.mktemp("verified") / "out"
     given = [
         "run", *on_photographs(photos, out), "-q",
-        "--preset", "colmap", "--mapper", "global",
-        "--mapper-options", "track_min_num_views_per_track=2", "multiple_models=false",
-        "--mapper-options", "mapper.bundle_adjustment.min_track_length=2",
+        "--preset", "colmap", "--mapper", "incremental",
+        "--mapper-options", "init_min_num_inliers=40", "min_model_size=3",
+        "--mapper-options", "triangulation.min_angle=1.25",
     ]  # fmt: skip
     assert main(given) == 0
     return out

@@ -15,9 +15,11 @@ from small_scene import write_photographs
 from colmap_affrect import pipeline
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
+from colmap_affrect.colmap.poses import model_poses
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers import mapping
-from colmap_affrect.mappers.doubts import Doubts
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.reliability import Judgement
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 
@@ -144,26 +146,25 @@ def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(
     verified: Path, call: Call
 ) -> None:
     given = {
-        "mapper.track_min_num_views_per_track": 2,
-        "multiple_models": False,
-        "mapper.bundle_adjustment.min_track_length": 2,
+        "mapper.init_min_num_inliers": 40,
+        "min_model_size": 3,
+        "triangulation.min_angle": 1.25,
     }
     report = json.loads((verified / "report.json").read_text(encoding="utf-8"))
     assert report["images_registered"] == 3
-    assert (report["preset"], report["mapper"]) == ("colmap", "global")
+    assert (report["preset"], report["mapper"]) == ("colmap", "incremental")
     assert report["mapper_options"] == given
     assert report["verification"]["min_num_inliers"] == 15
-    assert report["mapping"]["min_model_size"] == 3
     differs = report["differs_from_colmap"]
     assert differs["verification"] == {"ransac.random_seed": 0}
     assert {key: differs["mapping"].get(key) for key in given} == given
-    assert "mapper.retriangulation.ignore_two_view_tracks" not in differs["mapping"]
     record = Workspace(verified).recorded()["map"]
-    assert record["name"] == "global"
-    assert record["mapper_options"]["mapper.bundle_adjustment.min_track_length"] == 2
-    done = call("map", "--output-path", verified, "-q", "--preset", "colmap", "--mapper", "global")
+    assert record["name"] == "incremental"
+    assert record["mapper_options"]["triangulation.min_angle"] == 1.25
+    again = ["map", "--output-path", verified, "-q", "--preset", "colmap", "--mapper"]
+    done = call(*again, "incremental")
     assert (done.code, done.stdout) == (1, "")
-    assert "min_track_length=2, and it is None now" in done.errors[0]
+    assert "init_min_num_inliers=40, and it is None now" in done.errors[0]
 
 
 SELECTED = "--image-list-path --mask-path --camera-mask-path --from-database --cameras-path"
@@ -355,8 +356,6 @@ def test_finished_model_is_extended_and_another_database_mapped(
     mapped = call(*copied, "--extend", model, "-q")
     assert (mapped.code, mapped.errors) == (0, [])
     assert "extended    2 were there, 1 came in" in mapped.stdout
-    wrong = call(*copied, "--mapper", "global", "--extend", model, "-q", "--overwrite")
-    assert "the global mapper cannot" in wrong.errors[-1]
     wrong = call("run", *on_photographs(photos, tmp_path / "no"), "--extend", photos, "-q")
     assert "not a COLMAP model" in wrong.errors[-1]
     assert not (tmp_path / "no" / "features.h5").exists()
@@ -365,12 +364,14 @@ def test_finished_model_is_extended_and_another_database_mapped(
 def test_model_that_nobody_can_trust_ends_with_3(
     verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    doubts = Doubts(model=("no parallax",))
-    monkeypatch.setattr(mapping, "find_doubts", lambda *_: doubts)
+    def judge(mapped: MappedModel, _: object) -> dict[str, Judgement]:
+        return dict.fromkeys(model_poses(mapped.reconstruction), Judgement(0.3, "no parallax"))
+
+    monkeypatch.setattr(mapping, "judge", judge)
     assert main(["map", "--output-path", str(verified), "--overwrite"]) == 3
     printed = capfd.readouterr()
     assert "colmap gui" in printed.out
     assert "colmap-affrect export" not in printed.out
-    assert "doubtful    the whole model: no parallax\n" in printed.out
+    assert ": no parallax\n" in printed.out
     assert printed.err.splitlines()[-1].startswith("error: nothing in the model can be trusted;")
     assert json.loads((verified / "report.json").read_text())["status"] == "doubtful"

@@ -144,15 +144,14 @@ def test_damaged_records_are_one_clear_line(tmp_path: Path, text: str) -> None:
         read_camera_records(path)
 
 
-def test_report_has_the_focal_length_in_longer_sides_and_those_that_fit() -> None:
-    model = ModelSummary((), 0, 0.0, 0.0, focals_px={"c.jpg": 470.0, "z": 9.0},
-                         rival_focals_px={"c.jpg": (460.0, 560.0)})  # fmt: skip
+def test_report_has_the_focal_length_in_longer_sides_and_the_refined_one() -> None:
+    model = ModelSummary((), 0, 0.0, 0.0, focals_px={"c.jpg": 470.0, "z": 9.0})
     entry = VOTED.to_report(12, model)
-    assert (entry["refined_px"], entry["rival_px"]) == (470.0, (460.0, 560.0))
+    assert entry["refined_px"] == 470.0
     assert (entry["id"], entry["num_images"], entry["source"]) == (12, 1, "pairs")
     assert entry["focal_longer_sides"] == pytest.approx(1.25)
     known = FROM_EXIF.to_report(3, None)
-    assert known["refined_px"] is known["rival_px"] is None
+    assert known["refined_px"] is None
 
 
 def test_only_cameras_with_a_story_are_named_and_not_all() -> None:

@@ -1,6 +1,6 @@
 """Databases of other people and of other versions of COLMAP are copied, never opened.
 
-Those of COLMAP 3.8 are written from newer ones, and their positions are read.
+Those of COLMAP 3.8 are written from newer ones.
 """
 
 from __future__ import annotations
@@ -61,21 +61,6 @@ def add_position(
 def rows(path: Path, query: str) -> list[tuple[object, ...]]:
     with closing(sqlite3.connect(path)) as connection:
         return connection.execute(query).fetchall()
-
-
-def write_old(path: Path, positions: list[tuple[float | None, ...]]) -> None:
-    """Write images as COLMAP 3.8 does, with (qw, qx, qy, qz, tx, ty, tz) each."""
-    with open_database(path.with_suffix(".new")):
-        pass
-    export_database(path.with_suffix(".new"), path)
-    with closing(sqlite3.connect(path)) as connection:
-        params = np.array([500.0, 320.0, 240.0]).tobytes()
-        connection.execute("DROP TABLE pose_priors")
-        connection.execute("INSERT INTO cameras VALUES (3, 0, 640, 480, ?, 1)", (params,))
-        for number, values in enumerate(positions, start=7):
-            images = (number, f"{number}.jpg", 3, *values)
-            connection.execute(f"INSERT INTO images VALUES ({','.join('?' * 10)})", images)
-        connection.commit()
 
 
 def test_content_and_ids_are_those_of_the_source(source: Path, tmp_path: Path) -> None:
@@ -160,40 +145,22 @@ def test_what_the_old_colmap_has_no_place_for(source: Path, tmp_path: Path) -> N
     assert not (tmp_path / "other.db").exists()
 
 
-NONE = (None,) * 4
-
-
-@pytest.mark.parametrize(
-    ("last", "system"),
-    [((47.6, -170.0, 1.0), "WGS84"), ((47.6, 191.0, 1.0), "CARTESIAN")],
-)
-def test_positions_of_old_databases_are_pose_priors_of_the_copy(
-    tmp_path: Path, last: tuple[float, ...], system: str
-) -> None:
-    old = tmp_path / "old.db"
-    positions = [(*NONE, *GPS), (*NONE, None, None, None), (0.0,) * 7, (*NONE, *last)]
-    write_old(old, [*positions, (0.5, 0.5, 0.5, 0.5, 1.0, 2.0, 3.0)])
-    before = old.read_bytes()
-    copy_without_features(old, tmp_path / "copy.db")
-    with open_database(tmp_path / "copy.db") as copy:
-        priors = copy.read_all_pose_priors()
-        assert copy.num_frames() == 5
-    assert {prior.corr_data_id.id: tuple(prior.position) for prior in priors} == {
-        7: tuple(GPS), 10: last,
-    }  # fmt: skip
-    assert {prior.coordinate_system.name for prior in priors} == {system}
-    assert old.read_bytes() == before
-
-
 @pytest.fixture
 def old_database(tmp_path: Path) -> Path:
     """A database as COLMAP 3.8 left it, of two images of one camera."""
     folder = tmp_path / "old #1?"
     folder.mkdir()
-    write_old(folder / "database.db", [(None,) * 7] * 2)
-    (folder / "database.new").unlink()
+    with open_database(tmp_path / "empty.db"):
+        pass
+    export_database(tmp_path / "empty.db", folder / "database.db")
+    params = np.array([500.0, 320.0, 240.0]).tobytes()
     points = np.array([[10.5, 20.5], [30.5, 40.5]], np.float32).tobytes()
     with closing(sqlite3.connect(folder / "database.db")) as connection, connection:
+        connection.execute("DROP TABLE pose_priors")
+        connection.execute("INSERT INTO cameras VALUES (3, 0, 640, 480, ?, 1)", [params])
+        for image in ((7, "7.jpg"), (8, "8.jpg")):
+            columns = "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, 3)"
+            connection.execute(columns, image)
         connection.execute("INSERT INTO keypoints VALUES (7, 2, 2, ?)", [points])
     return folder / "database.db"
 

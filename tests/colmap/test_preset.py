@@ -92,7 +92,6 @@ def test_options_are_passed_on_to_pycolmap() -> None:
 NATIVE = {
     "sparse": pycolmap.IncrementalPipelineOptions,
     "incremental": pycolmap.IncrementalPipelineOptions,
-    "global": pycolmap.GlobalPipelineOptions,
 }
 
 
@@ -117,5 +116,5 @@ def test_unknown_preset_and_mapper_are_refused() -> None:
     for make in (VerificationOptions.preset, IncrementalOptions.preset):
         with pytest.raises(OptionError, match="preset 'dense' is not one of sparse, colmap"):
             make("dense")
-    with pytest.raises(OptionError, match=r"unknown mapper 'glomap' .did you mean 'global'"):
-        MAPPERS.options("glomap")
+    with pytest.raises(OptionError, match=r"unknown mapper 'sparce' .did you mean 'sparse'"):
+        MAPPERS.options("sparce")

@@ -136,7 +136,7 @@ def test_the_model_that_is_extended_stays_until_all_is_judged(
 
     (tmp_path / "sparse").mkdir()
     existing = read_existing(Extension(written(old, tmp_path / "sparse" / "0")), database)
-    monkeypatch.setattr(mapping, "summarize", stop)
+    monkeypatch.setattr(mapping, "judge", stop)
     with pytest.raises(KeyboardInterrupt):
         extended(database, existing, tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]
@@ -262,12 +262,14 @@ def test_model_that_does_not_fit_is_one_clear_line(
 
 
 def test_mapper_that_cannot_extend_says_so(
-    database: Path, old: pycolmap.Reconstruction, tmp_path: Path
+    database: Path, old: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     existing = read_existing(Extension(written(old, tmp_path / "old")), database)
     task = MappingTask(database, None, extend=existing)
-    with pytest.raises(OptionError, match=r"the global mapper cannot .* use --mapper sparse"):
-        map_database(mapper_of("global"), task, tmp_path / "sparse", lambda _: None)
+    mapper = mapper_of("incremental")
+    monkeypatch.setattr(type(mapper.options), "extends", False)
+    with pytest.raises(OptionError, match=r"the incremental mapper cannot .* use --mapper sparse"):
+        map_database(mapper, task, tmp_path / "sparse", lambda _: None)
 
 
 def stop_after(number: int, token: pycolmap.CancellationToken) -> Any:

@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from mapping_tasks import ALL_GIVEN, NOTHING_KNOWN, task_with_given_cameras
 from small_scene import INTRINSICS, NAMES, write_photographs
@@ -23,7 +16,6 @@ from colmap_affrect.colmap.native_options import differences, set_values
 from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper
-from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions, map_globally
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.guided import GuidedOptions
@@ -47,18 +39,12 @@ ROTATION_ERROR_DEG = 0.05
 """Keypoints are exact; what is left are float32 coordinates and the optimiser's tolerance."""
 
 
-def options_of(mapper: str) -> object:
-    if mapper == "global":
-        return pycolmap.GlobalPipelineOptions()
-    return pycolmap.IncrementalPipelineOptions()
-
-
 @pytest.mark.parametrize("mapper", MAPPERS.names())
 def test_differences_say_all_that_another_process_must_know(mapper: str) -> None:
     values = {"min_num_matches": 16, "ignore_watermarks": True}
     made = mapper_of(mapper, mapper_options=values)
     told = made.differences(ALL_GIVEN)
-    native = options_of(mapper)
+    native = pycolmap.IncrementalPipelineOptions()
     set_values(native, json.loads(json.dumps(told)))
     ours = made.native(ALL_GIVEN, SEED)
     assert differences(native, ours) == {}
@@ -74,10 +60,6 @@ def test_mapper_options_win_over_the_preset(preset: str) -> None:
     assert native.triangulation.ignore_two_view_tracks is True
     assert native.random_seed == SEED
     assert mapper.options.preset_name == preset
-    given = {"min_model_size": 5, "track_min_num_views_per_track": 4}
-    global_mapper = GlobalMapper(GlobalOptions.preset(preset, mapper_options=given))
-    native = global_mapper.native(NOTHING_KNOWN, SEED)
-    assert (native.min_model_size, native.mapper.track_min_num_views_per_track) == (5, 4)
 
 
 def test_values_that_colmap_does_not_accept_are_named() -> None:
@@ -110,60 +92,14 @@ def reconstruct(path: Path, mapper: Mapper) -> tuple[list[ModelSummary], int]:
     return found, sum(shown)
 
 
-@pytest.mark.long
-def test_global_mapper_registers_all_images_in_place_and_repeatably(tmp_path: Path) -> None:
-    path = tmp_path / "database.db"
-    truth = synthesize(path, 5)
-    files = []
-    for _ in range(2):
-        (model,), num_shown = reconstruct(path, mapper_of("global"))
-        assert len(model.registered_names) == num_shown == 5
-        files.append((tmp_path / "sparse" / "0" / "images.bin").read_bytes())
-    assert files[0] == files[1]
-    found = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
-    for id1, id2 in combinations(sorted(found.reg_image_ids()), 2):
-        relative = [
-            scene.images[id2].cam_from_world().rotation
-            * scene.images[id1].cam_from_world().rotation.inverse()
-            for scene in (found, truth)
-        ]
-        angle = np.rad2deg((relative[0] * relative[1].inverse()).angle())
-        assert angle < ROTATION_ERROR_DEG
-
-
-@pytest.mark.long
-def test_global_mapper_has_a_model_of_two_images_by_our_preset_only(tmp_path: Path) -> None:
-    path = tmp_path / "database.db"
-    synthesize(path, 2, 400)
-    (model,), num_shown = reconstruct(path, mapper_of("global"))
-    assert len(model.registered_names) == num_shown == 2
-    assert reconstruct(path, GlobalMapper(GlobalOptions.preset("colmap"))) == ([], 0)
-    assert list((tmp_path / "sparse").iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("mapper", "key", "message"),
-    [
-        ("incremental", "ba_global_function_tolerance", r"incremental mapper failed: .*tolerance"),
-        ("global", "function_tolerance", r"global mapper failed \(exit code 1\): .*tolerance"),
-    ],
-)
-def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(
-    tmp_path: Path, mapper: str, key: str, message: str
-) -> None:
+def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     synthesize(path, 3)
-    with pytest.raises(MappingError, match=message) as error:
-        reconstruct(path, mapper_of(mapper, mapper_options={key: -1}))
+    wrong = mapper_of("incremental", mapper_options={"ba_global_function_tolerance": -1})
+    with pytest.raises(MappingError, match=r"incremental mapper failed: .*tolerance") as error:
+        reconstruct(path, wrong)
     assert "\n" not in str(error.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
-
-
-@pytest.mark.long
-def test_global_mapper_that_dies_is_one_clear_line(tmp_path: Path) -> None:
-    (tmp_path / "database.db").write_bytes(b"no database" * 100)
-    with pytest.raises(MappingError, match=r"^COLMAP's global mapper failed \(exit code -?\d+\)"):
-        map_globally(tmp_path / "database.db", tmp_path, tmp_path, {})
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
@@ -185,59 +121,6 @@ def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
     (model,), _ = reconstruct(path, mapper_of("incremental"))
     assert len(model.registered_names) == 3
-
-
-KILLED = """
-import sys
-from pathlib import Path
-from colmap_affrect.mappers.global_mapper import map_globally
-
-out = Path(sys.argv[1])
-print("begin", flush=True)
-endless = {"max_num_irls_iterations": 2**31 - 1, "irls_step_convergence_threshold": -1.0}
-values = {f"mapper.rotation_averaging.{key}": value for key, value in endless.items()}
-map_globally(out / "database.db", out, out, values)
-"""
-
-
-def processes_that_name(text: str) -> list[str]:
-    """Command lines of the processes with a text among their arguments."""
-    commands = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            command = path.read_bytes().decode(errors="replace")
-        except OSError:
-            continue
-        if text in command and "global_mapper" in command.split("{")[0]:
-            commands.append(command)
-    return commands
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_global_mapper_ends_with_the_process_that_started_it(
-    tmp_path: Path, number: signal.Signals
-) -> None:
-    synthesize(tmp_path / "database.db", 5)
-    with subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(tmp_path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # noqa: PLW1509
-    ) as process:
-        assert process.stdout.readline() == b"begin\n"
-        deadline = time.monotonic() + TIMEOUT_S
-        while not (running := processes_that_name(f'"{tmp_path}"')):
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        assert len(running) == 1
-        os.kill(process.pid, number)
-        process.wait(timeout=TIMEOUT_S)
-    assert process.returncode == -number
-    while processes_that_name(f'"{tmp_path}"'):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,10 @@ MODEL = ModelSummary(
     mean_track_length=2.25,
     mean_reprojection_error_px=0.512,
     doubtful={"č.jpg": "held by only 9 points"},
-    doubts=("no parallax",),
+    probabilities={"a.jpg": 0.98, "č.jpg": 0.4},
     arrivals={"a.jpg": Arrival("tracks"), "č.jpg": Arrival("bridged", "a.jpg", 32, 36, 0.031)},
     taken_out={"d.jpg": "held by only 3 points"},
     focals_px={"a.jpg": 812.5, "č.jpg": 900.0},
-    rival_focals_px={"a.jpg": (700.0, 900.0)},
 )
 
 

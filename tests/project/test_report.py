@@ -49,7 +49,7 @@ REPORT = ReconstructionReport(
 )
 
 SHAKY = replace(LARGE, doubtful={"a.png": "held by only 9 points"})
-TURNED = replace(LARGE, doubts=("no parallax",))
+TURNED = replace(LARGE, doubtful={"a.png": "no parallax", "č d.png": "no parallax"})
 EMPTY = replace(REPORT, models=(), unregistered={"a.png": "no verified pair"}, images_total=1)
 
 
@@ -66,7 +66,8 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
     assert read == {
         "status": "partial", "images_total": 5, "images_registered": 2, "num_models": 2,
         "registered_names": ["a.png", "č d.png"], "unregistered": REPORT.unregistered,
-        "doubtful": {}, "doubts": [], "moves": [], "advice": ["--recipe on-demand"], "guided": {},
+        "doubtful": {}, "probabilities": {}, "moves": [], "guided": {},
+        "advice": ["--recipe on-demand"],
         "cameras": list(REPORT.cameras), "points3D": 120, "mean_track_length": 2.25,
         "mean_reprojection_error_px": 0.512, "models": [["a.png", "č d.png"], ["e.png", "f.png"]],
         "extended": [], "added": [], "num_pairs": 10, "num_verified_pairs": 3,
@@ -121,16 +122,11 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         assert part in text
 
 
-def test_a_model_whose_focal_length_anything_fits_is_not_trustworthy() -> None:
-    fits = dict.fromkeys(("a.png", "č d.png"), "any focal length fits")
-    loose = replace(REPORT.models[0], doubtful=fits, loose=tuple(fits))
-    assert not loose.is_trustworthy
-
-
 def test_summary_says_what_cannot_be_trusted() -> None:
-    text = replace(REPORT, models=(replace(SHAKY, doubts=TURNED.doubts),)).summary()
+    shaky = replace(SHAKY, probabilities={"a.png": 0.31, "č d.png": 0.9})
+    text = replace(REPORT, models=(shaky,)).summary()
     assert "doubtful    a.png: held by only 9 points\n" in text
-    assert "doubtful    the whole model: no parallax\n" in text
+    assert "sure        1, right with a probability of 90% or more\n" in text
 
 
 def test_long_lists_end_where_the_screen_does() -> None:

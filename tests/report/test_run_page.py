@@ -27,8 +27,8 @@ def html(folder: Path) -> str:
 
 def test_everything_of_the_report_is_told(html: str) -> None:
     for text in (
-        "<title>4 of 6 photographs registered</title>", "The whole model: hardly any parallax.",
-        "d.png: hangs on few &lt;points&gt;", "c.png: focal lengths from 150 to 260 px fit as well",
+        "<title>4 of 6 photographs registered</title>", "right with a probability of 95%",
+        "d.png: hangs on few &lt;points&gt;", "right with a probability of 40%; doubtful: hangs",
         "--camera-mode single", "no verified pair", "unreadable: f.png: not a readable image",
         "12 of 15 depths agree, scale +-3.1%",
         "1 camera, focal lengths: 1 by verified pairs.", "they vote",

@@ -23,7 +23,7 @@ from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.doubts import FOCAL_DOUBT
+from colmap_affrect.mappers.reliability import FOCAL_UNKNOWN
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ReconstructionReport
@@ -145,16 +145,13 @@ def test_advice_is_about_what_is_wrong(finished: tuple[Workspace, Reconstruction
     workspace, report = finished
     context, (model, *_) = Context(workspace), report.models
     assert advice(context, ["unreadable.png"], [model]) == ()
-    loose = replace(model, doubtful={NAMES[0]: FOCAL_DOUBT}, loose=(NAMES[0],))
-    assert not any("--mask-path" in text for text in advice(context, [], [loose]))
     masks = "run again with --mask-path, if things move, repeat or are written on the photographs"
-    contradicted = replace(loose, loose=())
-    assert masks in advice(context, ["unreadable.png"], [contradicted])
+    doubtful = replace(model, doubtful={NAMES[0]: FOCAL_UNKNOWN})
+    assert masks in advice(context, ["unreadable.png"], [doubtful])
     stronger = "run again with --recipe on-demand,"
-    assert any(text.startswith(stronger) for text in advice(context, [], [contradicted]))
-    assert not any(text.startswith(stronger) for text in advice(context, [], [loose]))
+    assert any(text.startswith(stronger) for text in advice(context, [], [doubtful]))
     assert masks in advice(context, [NAMES[0]], [model])
-    first, *_, last = advice(context, [NAMES[0]], [loose])
+    first, *_, last = advice(context, [NAMES[0]], [doubtful])
     assert first.startswith(stronger)
     assert last.startswith("more photographs between")
 

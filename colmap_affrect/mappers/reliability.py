@@ -1,0 +1,386 @@
+"""How sure a model is of each of its photographs.
+
+A few numbers say what holds a photograph where it is. A logistic regression makes of them the
+probability that it stands right: within 5 degrees, in rotation and in direction to at least half of
+the others. ``tests/benchmarks/reliability.py`` fits it on photographs whose poses are known.
+"""
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
+from colmap_affrect.mappers.adjustment import (
+    EXIF_SIGMA,
+    FINAL,
+    NOISE_PX,
+    Adjuster,
+    FocalPrior,
+    priors_of,
+)
+from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+from colmap_affrect.mappers.evidence import Evidence, cells, pair_evidence
+from colmap_affrect.mappers.pair_graph import (
+    Ids,
+    PairGraph,
+    VerifiedPair,
+    cameras_of,
+    graph_of,
+    poses_of,
+)
+
+FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
+FREE_SIGMA = 1.0  # of the logarithm of a focal length that is given, where it is freed
+MIN_MOVE = 0.1  # of the logarithm of a given focal length that is told from another
+MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
+MAX_NUM_IMAGES = 100  # of models whose focal lengths are tried; larger ones have points of many
+MAX_NUM_POINTS = 2_000  # of a model, for what need not be exact
+NUM_TURNED = 4  # pairs of an image that are compared with a camera that only turns
+MAX_ERROR = 0.003  # of a match that a rotation explains, in longer sides, as in verification
+MIN_SHARE_MIRRORED = 0.5
+"""Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
+images a tenth by chance."""
+MAX_PAIRS_FOR_COPIES = 1000  # looked at, all of 45 photographs; of more some copies are missed
+MIN_LOSS = 0.7  # of the log odds: what takes less from the odds is no reason to doubt
+NUM_REASONS = 2  # that are said of a photograph
+
+FOCAL_CONTRADICTED = "the given focal length does not fit"
+FOCAL_UNKNOWN = "any focal length fits"
+COEFFICIENTS = Path(__file__).with_suffix(".json")
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What holds a photograph in a model.
+
+    Attributes:
+        evidence: of its pairs, of its features that two other images match, and of its focal
+            length, in nats.
+        agreement: share of the inliers of its pairs that agrees with the model.
+        second: the same of the pair that agrees second best; 0 with one pair.
+        num_three: points that it and two others see.
+        focal_growth: part by which the cost of adjustment grows with another focal length;
+            1 where somebody knows it.
+        focal_px: of its camera.
+        fitting_px: the focal length that fits, where the one that the user gave does not; else 0.
+        turned: share of the matches of its strongest pairs that a camera explains which only turns.
+        bridge: what it came in by, if that was no track.
+        original: name of the photograph that it may be a mirrored copy of, or empty.
+        zoom: longest by shortest focal length of the photographs of its size, where nobody knows
+            them: parts of photographs have longer ones, and their middle is elsewhere.
+    """
+
+    evidence: float
+    agreement: float
+    second: float
+    num_three: int
+    focal_growth: float
+    focal_px: float
+    fitting_px: float
+    turned: float
+    bridge: Bridge | None
+    original: str
+    zoom: float
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of the regression.
+
+    Attributes:
+        value: the larger the surer.
+        reason: what to say where it is small.
+    """
+
+    value: Callable[[Measures], float]
+    reason: Callable[[Measures], str]
+
+
+def _scale_error(m: Measures) -> float:
+    return min(m.bridge.scale_error_frac, 0.3) if m.bridge else 0.0
+
+
+def _bridge_reason(m: Measures) -> str:
+    error = f"{_scale_error(m):.0%}"
+    return f"bridged by {m.bridge.pair[0]} at a distance known to +-{error}" if m.bridge else ""
+
+
+TERMS: Mapping[str, Term] = {
+    "evidence": Term(
+        lambda m: math.copysign(math.log1p(abs(m.evidence) / 3.0), m.evidence),
+        lambda m: (
+            "its matches speak against its place"
+            if m.evidence < 0.0
+            else "few matches speak for its place"
+        ),
+    ),
+    "agreement": Term(
+        lambda m: m.agreement,
+        lambda m: f"only {m.agreement:.0%} of the matches of its pairs agree with the model",
+    ),
+    "second pair": Term(
+        lambda m: m.second,
+        lambda m: (
+            f"of no second pair do more than {m.second:.0%} of the matches agree"
+            if m.second
+            else "one pair alone says where it is"
+        ),
+    ),
+    "points of three": Term(
+        lambda m: math.log1p(min(m.num_three, 300)),
+        lambda m: f"only {m.num_three} of its points are seen by two other photographs",
+    ),
+    "focal length": Term(
+        lambda m: math.log(min(max(m.focal_growth, 0.003), 1.0)),
+        lambda _: f"{FOCAL_UNKNOWN}, and the place of the camera depends on that",
+    ),
+    "given focal length": Term(
+        lambda m: -float(m.fitting_px > 0.0),
+        lambda m: f"{FOCAL_CONTRADICTED}, {m.focal_px:.0f} px: {m.fitting_px:.0f} px does",
+    ),
+    "parallax": Term(
+        lambda m: -max(0.0, m.turned - 0.5),
+        lambda m: f"a camera that only turned explains {m.turned:.0%} of the matches: no parallax",
+    ),
+    "bridge": Term(lambda m: -_scale_error(m), _bridge_reason),
+    "original": Term(
+        lambda m: -float(bool(m.original)), lambda m: f"may be a mirrored copy of {m.original}"
+    ),
+    "one lens": Term(
+        lambda m: -min(math.log(m.zoom), 0.5),
+        lambda m: (
+            f"focal lengths of photographs of its size are up to {m.zoom:.2f} times apart: "
+            "some may be parts of others"
+        ),
+    ),
+}
+"""The terms, by their names in the file of coefficients."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How sure a model is of a photograph.
+
+    Attributes:
+        probability: that it stands right.
+        reason: what speaks most against that, empty if nothing does.
+    """
+
+    probability: float
+    reason: str
+
+
+@cache
+def _coefficients() -> tuple[float, dict[str, tuple[float, float]]]:
+    """Return the constant, and of each term the weight and what right photographs usually have."""
+    content = json.loads(COEFFICIENTS.read_text(encoding="utf-8"))
+    terms = content["terms"].items()
+    return content["constant"], {name: (term["weight"], term["usual"]) for name, term in terms}
+
+
+def judge(mapped: MappedModel, task: MappingTask) -> dict[str, Judgement]:
+    """Say of each photograph of a model how sure it is that it stands right, by name."""
+    return {name: judged(measures) for name, measures in measure(mapped, task).items()}
+
+
+def judged(measures: Measures) -> Judgement:
+    """Return the probability that a photograph stands right, and what takes most from it."""
+    constant, weights = _coefficients()
+    log_odds, losses = constant, []
+    for name, (weight, usual) in weights.items():
+        value = TERMS[name].value(measures)
+        log_odds += weight * value
+        losses.append((weight * (usual - value), TERMS[name].reason(measures)))
+    worst = sorted((loss for loss in losses if loss[0] >= MIN_LOSS), reverse=True)
+    reasons = [text for _, text in (worst or [max(losses)])[:NUM_REASONS]]
+    return Judgement(1.0 / (1.0 + math.exp(-log_odds)), "; ".join(reasons))
+
+
+def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
+    """Measure what holds each photograph of a model, by name."""
+    model, graph = mapped.reconstruction, graph_of(task)
+    poses, cameras = poses_of(model), cameras_of(model)
+    used = {camera.camera_id: camera for camera in cameras.values()}
+    priors = priors_of(used.values(), task.cameras)
+    evidence = Evidence(graph, priors)
+    pairs = graph.pairs_inside(poses)
+    agreements = {pair.ids: graph.agreement(pair, poses, cameras) for pair in pairs}
+    pairs_of = {i: [pair for pair in pairs if i in pair.ids] for i in sorted(poses)}
+    three, long = evidence.three_view_ratios(model), num_long_tracks(model)
+    turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
+    growth, fitting_px = _focal_growths(model, task), fitting_focals(model, task)
+    zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
+    bridges = {name: bridge for bridge in mapped.bridges for name in bridge.names}
+    found = {}
+    for image_id, own in pairs_of.items():
+        shares = [agreements[pair.ids] for pair in own]
+        nats = [
+            pair_evidence(share * num, num)
+            for pair, share in zip(own, shares, strict=True)
+            if (num := evidence.num_cells(pair))
+        ]
+        rotations = [turned[pair.ids] for pair in own if pair.ids in turned]
+        name, camera = graph.names[image_id], cameras[image_id]
+        found[name] = Measures(
+            evidence=sum(nats)
+            + three.get(image_id, 0.0)
+            - priors[camera.camera_id].cost(camera.mean_focal_length()),
+            agreement=float(np.average(shares, weights=[len(p.matches) for p in own]))
+            if shares
+            else 1.0,
+            second=sorted(shares)[-2] if len(shares) > 1 else 0.0,
+            num_three=long[image_id],
+            focal_growth=growth.get(camera.camera_id, 1.0),
+            focal_px=float(camera.mean_focal_length()),
+            fitting_px=fitting_px.get(camera.camera_id, 0.0),
+            turned=float(np.mean(rotations)) if rotations else 0.0,
+            bridge=bridges.get(name),
+            original=graph.names[originals[image_id]] if image_id in originals else "",
+            zoom=zooms.get((camera.width, camera.height), 1.0),
+        )
+    return found
+
+
+def _rotation_shares(
+    graph: PairGraph, pairs_of: Mapping[int, Sequence[VerifiedPair]]
+) -> dict[Ids, float]:
+    """Return, of the strongest pairs of each image, how much a camera that turns explains."""
+    found: dict[Ids, float] = {}
+    for pairs in pairs_of.values():
+        for pair in sorted(pairs, key=lambda pair: -len(pair.matches))[:NUM_TURNED]:
+            if pair.ids not in found:
+                sizes = _sizes(graph, pair.ids)
+                error = MAX_ERROR * max(map(max, sizes))
+                found[pair.ids] = rotation_share(*graph.points(pair), sizes, error)
+    return found
+
+
+def _sizes(graph: PairGraph, ids: Ids) -> tuple[Size, Size]:
+    first, second = (graph.cameras[image_id] for image_id in ids)
+    return (first.width, first.height), (second.width, second.height)
+
+
+def _originals(
+    graph: PairGraph, pairs: Sequence[VerifiedPair], agreements: Mapping[Ids, float]
+) -> dict[int, int]:
+    """Return the original of each mirrored copy.
+
+    The photograph is the one that more matches of the others agree with, but for those that have a
+    mirrored copy themselves.
+    """
+    mirrored = []
+    for pair in graph.pairs[:: max(1, -(-len(graph.pairs) // MAX_PAIRS_FOR_COPIES))]:
+        first, second = (graph.keypoints[image_id] for image_id in pair.ids)
+        if mirrored_share(first, second, _sizes(graph, pair.ids)) >= MIN_SHARE_MIRRORED:
+            mirrored.append(pair.ids)
+    unclear = {image_id for ids in mirrored for image_id in ids}
+    support: defaultdict[int, float] = defaultdict(float)
+    for pair in pairs:
+        for image_id, other in (pair.ids, pair.ids[::-1]):
+            if other not in unclear:
+                support[image_id] += agreements[pair.ids] * len(pair.matches)
+    copies = {}
+    for ids in mirrored:
+        copy, original = sorted(ids, key=lambda image_id: support[image_id])
+        copies[copy] = original
+    return copies
+
+
+def _zooms(cameras: Iterable[pycolmap.Camera]) -> dict[Size, float]:
+    """Return the longest by the shortest focal length of cameras of each size."""
+    of_size: defaultdict[Size, list[float]] = defaultdict(list)
+    for camera in cameras:
+        of_size[camera.width, camera.height].append(max(camera.mean_focal_length(), 1e-9))
+    return {size: max(focals) / min(focals) for size, focals in of_size.items()}
+
+
+def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+    """Return by what part the cost grows with another focal length, by id of the camera.
+
+    None of those that somebody knows.
+
+    A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
+    focal length of each camera that nobody knows, while all else may move.
+    """
+    images = [model.images[image_id] for image_id in model.reg_image_ids()]
+    used = {image.camera_id for image in images}
+    priors = priors_of((model.cameras[key] for key in sorted(used)), task.cameras)
+    unknown = [key for key, p in priors.items() if p.sigma > EXIF_SIGMA and key in task.cameras]
+    if not unknown or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
+        return {}
+    fixed = frozenset(key for key in used & task.cameras.keys() if task.cameras[key].is_fixed)
+    is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
+    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
+    sparse = _with_fewer_points(model)
+    cost = Adjuster(priors, NOISE_PX, refining, fixed).adjust(sparse, FINAL)
+    found: dict[int, float] = {}
+    for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
+        held = Adjuster(priors, NOISE_PX, refining, fixed.union(keys.tolist()))
+        least = min(held.adjust(_scaled(sparse, keys, factor), FINAL) for factor in FACTORS)
+        found |= dict.fromkeys(keys.tolist(), least / max(cost, 1e-9) - 1.0)
+    return found
+
+
+def fitting_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+    """Return the focal length that fits, by id of the cameras of which the user gave another one.
+
+    None where freeing them lowers the cost by less than free parameters are worth: half the
+    logarithm of the number of observations each, of which those in one cell of an image count once.
+    """
+    used = {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
+    given = {key for key in used & task.cameras.keys() if "focal" in task.cameras[key].given}
+    if not given or model.num_reg_images() > MAX_NUM_IMAGES or model.num_points3D() == 0:
+        return {}
+    priors = priors_of(model.cameras.values(), task.cameras)
+    free = priors | {key: FocalPrior(priors[key].focal_px, FREE_SIGMA) for key in given}
+    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=False)
+    held, freed = _with_fewer_points(model), _with_fewer_points(model)
+    before = Adjuster(priors, NOISE_PX, refining, frozenset(given)).adjust(held, FINAL)
+    gain = before - Adjuster(free, NOISE_PX, refining).adjust(freed, FINAL)
+    num = _num_cells(held)
+    gain *= num / max(1, held.compute_num_observations())
+    if gain < 0.5 * len(given) * np.log(max(2, num)):
+        return {}
+    found = {key: float(freed.cameras[key].mean_focal_length()) for key in sorted(given)}
+    return {k: px for k, px in found.items() if abs(math.log(px / priors[k].focal_px)) > MIN_MOVE}
+
+
+def _num_cells(model: pycolmap.Reconstruction) -> int:
+    """Return how many cells of all images of a model hold observations."""
+    total = 0
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        points = np.array([p.xy for p in image.get_observation_points2D()]).reshape(-1, 2)
+        total += cells(model.cameras[image.camera_id], points)
+    return total
+
+
+def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return a copy with every n-th point, of ``MAX_NUM_POINTS`` at most."""
+    fewer = pycolmap.Reconstruction(model)
+    ids = sorted(fewer.point3D_ids())
+    kept = set(ids[:: max(1, -(-len(ids) // MAX_NUM_POINTS))])
+    for point_id in ids:
+        if point_id not in kept:
+            fewer.delete_point3D(point_id)
+    return fewer
+
+
+def _scaled(
+    model: pycolmap.Reconstruction, cameras: Collection[int], factor: float
+) -> pycolmap.Reconstruction:
+    """Return a copy with other focal lengths of some cameras."""
+    copy = pycolmap.Reconstruction(model)
+    for key in cameras:
+        camera = copy.cameras[key]
+        for index in camera.focal_length_idxs():
+            camera.params[index] *= factor
+    return copy
