@@ -24,7 +24,6 @@ from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import lafs_from_keypoints, project, transform_frames
 from colmap_affrect.geometry.conventions import camera_matrix
-from colmap_affrect.images.depth import DepthSource
 from colmap_affrect.matchers.base import ImageFeatures, Matcher
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.base import Rectifier
@@ -221,26 +220,3 @@ def assert_same_plan(first: RectificationPlan, second: RectificationPlan) -> Non
         assert one.canvas_size == other.canvas_size
         assert one.region_origin == other.region_origin
         np.testing.assert_equal(one.region, other.region)
-
-
-class DepthContract(Contract):
-    """Of a source of depth maps; change :meth:`photograph` if a file is needed."""
-
-    def photograph(self) -> Photograph:
-        """Return a photograph whose depth the source knows."""
-        return photograph_of(IMAGES["textured"])
-
-    def test_map_is_positive_or_unknown_and_the_same_every_time(self) -> None:
-        photograph = self.photograph()
-        source: DepthSource = self.make()
-        depth = source.depth(photograph)
-        assert depth.dtype == np.float32
-        known = np.isfinite(depth)
-        assert known.any()
-        assert (depth[known] > 0).all()
-        assert np.isnan(depth[~known]).all()
-        width, height = photograph.size
-        rows, columns = depth.shape
-        assert abs(columns / rows / (width / height) - 1.0) < 0.1
-        again: DepthSource = self.make()
-        assert_array_equal(again.depth(photograph), depth)

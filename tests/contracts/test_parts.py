@@ -7,34 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contracts.contracts import (
-    IMAGES,
-    DepthContract,
-    ExtractorContract,
-    MatcherContract,
-    RectifierContract,
-)
+from contracts.contracts import IMAGES, ExtractorContract, MatcherContract, RectifierContract
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from random_weights import write_comparing_lightglue, write_random_weights
 
 from colmap_affrect.data import Photograph
-from colmap_affrect.features.base import (
-    EXTRACTORS,
-    SHAPES,
-    FeatureExtractor,
-    NetworkContext,
-)
+from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.shapes import STEP_PX
-from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions, DepthSource
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
-from colmap_affrect.rectifiers.base import (
-    RECTIFIERS,
-    Rectifier,
-    RectifierInputs,
-    RectifierOptions,
-)
+from colmap_affrect.rectifiers.base import RECTIFIERS, Rectifier, RectifierInputs, RectifierOptions
 from colmap_affrect.rectifiers.depth_planes import DepthPlanesOptions
 from colmap_affrect.rectifiers.whole_image import AsiftOptions
 
@@ -61,9 +44,8 @@ LONG = ["aliked", "disk"]
 class TestExtractors(ExtractorContract):
     @pytest.fixture(autouse=True)
     def _case(self, case: str, weights: dict[str, Path]) -> None:
-        self.extractor = EXTRACTORS.make(
-            EXTRACTORS.options(FEATURES[case]), NetworkContext(weights)
-        )
+        options = EXTRACTORS.options(FEATURES[case])
+        self.extractor = EXTRACTORS.make(options, NetworkContext(weights))
 
     def make(self) -> FeatureExtractor:
         return self.extractor
@@ -159,19 +141,3 @@ def test_shapes_are_unit_metrics_by_block_and_by_sample(
     assert not flat.textured.any()
     assert_allclose(flat.metrics, np.broadcast_to([1.0, 1.0, 0.0], flat.metrics.shape))
     assert len(source.samples(IMAGES["flat"]).points) == 0
-
-
-@pytest.mark.parametrize("kind", ["z", "ray", "inverse"])
-class TestDepthFiles(DepthContract):
-    @pytest.fixture(autouse=True)
-    def _maps(self, tmp_path: Path, kind: str) -> None:
-        """One map of half the size of the image, with a hole."""
-        height, width = IMAGES["textured"].shape
-        depth = np.random.default_rng(3).uniform(0.5, 4.0, (height // 2, width // 2))
-        depth[3:9, 5:20] = 0.0
-        (tmp_path / "folder").mkdir()
-        np.save(tmp_path / "folder" / "name.npy", depth)
-        self.folder, self.kind = tmp_path, kind
-
-    def make(self) -> DepthSource:
-        return DepthFiles(DepthFilesOptions(path=str(self.folder), kind=self.kind))
