@@ -44,6 +44,7 @@ MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
 MAX_NUM_IMAGES = 100  # of models whose focal lengths are tried; larger ones have points of many
 MAX_NUM_POINTS = 2_000  # of a model, for what need not be exact
 NUM_TURNED = 4  # pairs of an image that are compared with a camera that only turns
+USUAL_TURNED = 0.5  # share of matches that a rotation may explain of views of any two places
 MAX_ERROR = 0.003  # of a match that a rotation explains, in longer sides, as in verification
 MIN_SHARE_MIRRORED = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
@@ -65,7 +66,6 @@ class Measures:
         evidence: of its pairs, of its features that two other images match, and of its focal
             length, in nats.
         agreement: share of the inliers of its pairs that agrees with the model.
-        second: the same of the pair that agrees second best; 0 with one pair.
         num_three: points that it and two others see.
         focal_growth: part by which the cost of adjustment grows with another focal length;
             1 where somebody knows it.
@@ -80,7 +80,6 @@ class Measures:
 
     evidence: float
     agreement: float
-    second: float
     num_three: int
     focal_growth: float
     focal_px: float
@@ -104,13 +103,11 @@ class Term:
     reason: Callable[[Measures], str]
 
 
-def _scale_error(m: Measures) -> float:
-    return min(m.bridge.scale_error_frac, 0.3) if m.bridge else 0.0
-
-
 def _bridge_reason(m: Measures) -> str:
-    error = f"{_scale_error(m):.0%}"
-    return f"bridged by {m.bridge.pair[0]} at a distance known to +-{error}" if m.bridge else ""
+    if not m.bridge:
+        return ""
+    error = f"{m.bridge.scale_error_frac:.0%}"
+    return f"bridged by {m.bridge.pair[0]} alone, at a distance known to +-{error}"
 
 
 TERMS: Mapping[str, Term] = {
@@ -126,14 +123,6 @@ TERMS: Mapping[str, Term] = {
         lambda m: m.agreement,
         lambda m: f"only {m.agreement:.0%} of the matches of its pairs agree with the model",
     ),
-    "second pair": Term(
-        lambda m: m.second,
-        lambda m: (
-            f"of no second pair do more than {m.second:.0%} of the matches agree"
-            if m.second
-            else "one pair alone says where it is"
-        ),
-    ),
     "points of three": Term(
         lambda m: math.log1p(min(m.num_three, 300)),
         lambda m: f"only {m.num_three} of its points are seen by two other photographs",
@@ -147,10 +136,10 @@ TERMS: Mapping[str, Term] = {
         lambda m: f"{FOCAL_CONTRADICTED}, {m.focal_px:.0f} px: {m.fitting_px:.0f} px does",
     ),
     "parallax": Term(
-        lambda m: -max(0.0, m.turned - 0.5),
+        lambda m: -max(m.turned, USUAL_TURNED),
         lambda m: f"a camera that only turned explains {m.turned:.0%} of the matches: no parallax",
     ),
-    "bridge": Term(lambda m: -_scale_error(m), _bridge_reason),
+    "bridge": Term(lambda m: -float(m.bridge is not None), _bridge_reason),
     "original": Term(
         lambda m: -float(bool(m.original)), lambda m: f"may be a mirrored copy of {m.original}"
     ),
@@ -236,7 +225,6 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             agreement=float(np.average(shares, weights=[len(p.matches) for p in own]))
             if shares
             else 1.0,
-            second=sorted(shares)[-2] if len(shares) > 1 else 0.0,
             num_three=long[image_id],
             focal_growth=growth.get(camera.camera_id, 1.0),
             focal_px=float(camera.mean_focal_length()),

@@ -66,7 +66,6 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
     bad = {
         "evidence": (replace(good, evidence=-20.0), "speak against"),
         "agreement": (replace(good, agreement=0.1), "only 10% of the matches"),
-        "second pair": (replace(good, second=0.0), "one pair alone"),
         "points of three": (replace(good, num_three=0), "only 0 of its points"),
         "focal length": (replace(good, focal_growth=0.001), "any focal length fits"),
         "given focal length": (
@@ -74,7 +73,10 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
             "the given focal length does not fit, 720 px: 910 px does",
         ),
         "parallax": (replace(good, turned=1.0), "only turned explains 100% of the matches"),
-        "bridge": (replace(good, bridge=bridge), "bridged by a at a distance known to +-25%"),
+        "bridge": (
+            replace(good, bridge=bridge),
+            "bridged by a alone, at a distance known to +-25%",
+        ),
         "original": (replace(good, original="c.jpg"), "mirrored copy of c.jpg"),
         "one lens": (replace(good, zoom=1.65), "are up to 1.65 times apart"),
     }
