@@ -16,11 +16,11 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
-    "lines of the package": 29_500,
-    "lines of the tests": 24_700,
+    "lines of the package": 26_950,
+    "lines of the tests": 22_350,
     "lines of the longest file": 435,
     "lines of the longest function": 60,
-    "imports between folders": 168,
+    "imports between folders": 164,
     "words of ARCHITECTURE.md": 2_500,
     "words of BENCHMARKS.md": 2_500,
 }
