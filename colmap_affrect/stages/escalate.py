@@ -3,7 +3,7 @@
 Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015) images get the
 features that the level adds, and pairs are matched again. New matches take the place of the old
 ones only when their two-view geometry has more inliers, or, where neither is verified, when more of
-them confirm each other. Which pairs climb is decided anew after every step, by what the database
+them confirm each other. Which pairs escalate is decided anew after every step, by what the database
 holds then, and the lowest level that has something to do comes first; the step that has begun is on
 record, so that a killed run goes on in the same way:
 
@@ -39,8 +39,12 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images, weakly_connected_images
 from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.escalation_graph import (
+    EscalationGraph,
+    insecure_images,
+    weakly_connected_images,
+)
 from colmap_affrect.stages.extract import (
     extract_images,
     prepared_recipe,
@@ -75,7 +79,7 @@ these: of what changes, such as a sitter, few gradients match, and their geometr
 def escalate(
     context: Context, options: EscalateOptions | None = None, *, overwrite: bool = False
 ) -> StageReport:
-    """Climb the levels of the recipe; nothing happens when it has none.
+    """Go through the levels of the recipe; nothing happens when it has none.
 
     ``options`` are by default those on record; ``overwrite`` brings all pairs back to level 0
     first, features that are there are kept. ``num_done`` counts the pairs that were matched again
@@ -93,13 +97,13 @@ def escalate(
         escalation.undo()
     if len(colmap_database.unverified_pairs(context.workspace.database)):
         escalation.write()  # it was killed there
-    climbed: set[Pair] = set()
+    escalated: set[Pair] = set()
     while work := escalation.next_work():
         level, todo = work
-        escalation.climb(todo, level)
-        climbed |= set(todo)
+        escalation.match_at(todo, level)
+        escalated |= set(todo)
     escalation.write()
-    return StageReport("escalate", time.perf_counter() - start, len(climbed))
+    return StageReport("escalate", time.perf_counter() - start, len(escalated))
 
 
 def pair_levels(context: Context) -> dict[str, int]:
@@ -143,7 +147,7 @@ def measured_inliers(context: Context) -> dict[Pair, Indices]:
 
 
 class Escalation:
-    """Lets pairs of a workspace climb to a level, with the options on record."""
+    """Lets pairs of a workspace escalate to a level, with the options on record."""
 
     def __init__(self, context: Context, options: EscalateOptions) -> None:
         self.context, self.options = context, options
@@ -180,7 +184,7 @@ class Escalation:
                 counts[first, second] = verified.get((low, high), 0)
         return counts
 
-    def graph(self) -> ClimbingGraph:
+    def graph(self) -> EscalationGraph:
         """Return the pairs as the database has them; tracks count where there are three images."""
         num_inliers = self.num_inliers()
         weakly_connected: set[str] = set()
@@ -193,7 +197,7 @@ class Escalation:
         reached, tried = self.matches.levels(failed), self.matches.tried_levels(failed)
         stalled = {pair for pair in failed if reached[pair] < tried[pair]}
         num_consistent, num_raw = self._num_matches(failed)
-        return ClimbingGraph(num_inliers, num_consistent, insecure, stalled, num_raw)
+        return EscalationGraph(num_inliers, num_consistent, insecure, stalled, num_raw)
 
     def _num_matches(self, pairs: Sequence[Pair]) -> tuple[dict[Pair, int], dict[Pair, int]]:
         """Return how many raw matches of pairs confirm each other, and how many there are."""
@@ -237,7 +241,7 @@ class Escalation:
                 return level, todo
         return None
 
-    def climb(self, pairs: Sequence[Pair], level: int) -> None:
+    def match_at(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers.
 
         What is to be done is on record meanwhile: a killed run could not tell it else.

@@ -22,8 +22,8 @@ from colmap_affrect.pairs.lists import ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import GuidedPair
-from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.escalation_graph import weakly_connected_images
 from colmap_affrect.stages.match import PAIRS_PER_WRITE
 from colmap_affrect.stages.one_guided_pair import GuidedMatcher, GuidedTask, guided_task
 from colmap_affrect.stages.stationary import StationaryFilter

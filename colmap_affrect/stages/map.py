@@ -236,7 +236,7 @@ def _other_recipes(context: Context) -> list[str]:
     if recipe not in (STRONGER_RECIPE, LEARNED_RECIPE):
         texts.append(
             f"run again with --recipe {STRONGER_RECIPE}, which tries more warps where photographs "
-            "are missing or hang loosely"
+            "are missing or weakly connected"
         )
     if recipe != LEARNED_RECIPE:
         weights = load_recipe(LEARNED_RECIPE).weights

@@ -1,4 +1,4 @@
-"""On demand: only pairs that fail climb, what succeeded stays, and a killed run goes on."""
+"""On demand: only pairs that fail escalate, what succeeded stays, and a killed run goes on."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import escalate as escalation
-from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation
+from colmap_affrect.stages.escalation_graph import weakly_connected_images
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
@@ -76,10 +76,10 @@ def plain(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 
 
 @pytest.fixture(scope="module")
-def climbed(
+def escalated(
     before: Workspace, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Workspace, StageReport]:
-    workspace = copy(before, tmp_path_factory.mktemp("climbed"))
+    workspace = copy(before, tmp_path_factory.mktemp("escalated"))
     return workspace, escalate(workspace)
 
 
@@ -121,9 +121,9 @@ def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path, cal
 
 @pytest.mark.long
 def test_other_thresholds_than_before_need_no_new_features(
-    climbed: tuple[Workspace, StageReport], tmp_path: Path, call: Call
+    escalated: tuple[Workspace, StageReport], tmp_path: Path, call: Call
 ) -> None:
-    workspace = copy(climbed[0], tmp_path)
+    workspace = copy(escalated[0], tmp_path)
     setting = ["--set", "escalate.min_num_tracks=5"]
     digest = workspace.options_digest("extract", "match")
     refused = call("escalate", "--output-path", tmp_path, *setting)
@@ -137,9 +137,9 @@ def test_other_thresholds_than_before_need_no_new_features(
 
 
 def test_device_that_is_not_there_discards_nothing(
-    climbed: tuple[Workspace, StageReport], tmp_path: Path, call: Call
+    escalated: tuple[Workspace, StageReport], tmp_path: Path, call: Call
 ) -> None:
-    workspace = copy(climbed[0], tmp_path)
+    workspace = copy(escalated[0], tmp_path)
     before = database_content(workspace.database)
     for stage in ("match", "escalate"):
         ended = call(stage, "--output-path", tmp_path, "--device", "cuda:99", "--overwrite")
@@ -158,8 +158,8 @@ def test_first_level_is_the_unrectified_recipe(before: Workspace, plain: Workspa
     assert len(geometry(before, HARD)) < VerificationOptions().min_num_inliers
 
 
-def test_hard_pair_climbs_and_succeeds(climbed: tuple[Workspace, StageReport]) -> None:
-    workspace, report = climbed
+def test_hard_pair_escalates_and_succeeds(escalated: tuple[Workspace, StageReport]) -> None:
+    workspace, report = escalated
     assert len(geometry(workspace, HARD)) >= VerificationOptions().min_num_inliers
     store = MatchStore(workspace.matches)
     level = store.levels([HARD])[HARD]
@@ -170,9 +170,9 @@ def test_hard_pair_climbs_and_succeeds(climbed: tuple[Workspace, StageReport]) -
 
 
 def test_trial_of_a_pair_is_what_the_database_then_holds(
-    climbed: tuple[Workspace, StageReport],
+    escalated: tuple[Workspace, StageReport],
 ) -> None:
-    workspace = climbed[0]
+    workspace = escalated[0]
     size_px = Context(workspace).extraction.max_image_size_px
     verifier = PairVerifier(workspace.database, VerificationOptions(), size_px)
     store = FeatureStore(workspace.features)
@@ -265,21 +265,23 @@ def test_images_with_few_features_in_tracks_of_three_are_weakly_connected(matche
         assert weakly_connected_images(matches, limit) == expected
 
 
-def test_strong_pairs_without_a_track_of_three_climb(
+def test_strong_pairs_without_a_track_of_three_escalate(
     before: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    climb = Escalation(Context(before), EscalateOptions())
+    work = Escalation(Context(before), EscalateOptions())
     chain = {EASY: 200, (NAMES[1], NAMES[2]): 150}
     matches = {pair: np.arange(80).reshape(40, 2) for pair in chain}
     apart = {**matches, (NAMES[1], NAMES[2]): np.arange(1, 81).reshape(40, 2)}
-    monkeypatch.setattr(climb, "num_inliers", lambda: chain)
+    monkeypatch.setattr(work, "num_inliers", lambda: chain)
     monkeypatch.setattr(escalation, "verified_inliers", lambda _: apart)
-    assert climb.next_work() is None
+    assert work.next_work() is None
     monkeypatch.setattr(escalation, "verified_inliers", lambda _: matches)
-    assert climb.next_work() == (1, list(chain))
+    assert work.next_work() == (1, list(chain))
 
 
-def test_each_climb_has_a_bar_of_its_own_that_ends_full(before: Workspace, tmp_path: Path) -> None:
+def test_each_escalate_has_a_bar_of_its_own_that_ends_full(
+    before: Workspace, tmp_path: Path
+) -> None:
     workspace, shown = copy(before, tmp_path), io.StringIO()
     with workspace.locked():
         escalation.escalate(Context(workspace, progress=Progress(shown)))
@@ -290,12 +292,12 @@ def test_each_climb_has_a_bar_of_its_own_that_ends_full(before: Workspace, tmp_p
 
 
 def test_no_pair_that_verifies_unrectified_loses_inliers(
-    climbed: tuple[Workspace, StageReport], plain: Workspace
+    escalated: tuple[Workspace, StageReport], plain: Workspace
 ) -> None:
-    assert len(geometry(climbed[0], EASY)) >= len(geometry(plain, EASY))
+    assert len(geometry(escalated[0], EASY)) >= len(geometry(plain, EASY))
 
 
-def test_pairs_that_verify_well_climb_nowhere(
+def test_pairs_that_verify_well_escalate_nowhere(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "easy"
@@ -310,9 +312,9 @@ def test_pairs_that_verify_well_climb_nowhere(
 
 
 def test_features_of_levels_follow_one_another(
-    climbed: tuple[Workspace, StageReport], before: Workspace
+    escalated: tuple[Workspace, StageReport], before: Workspace
 ) -> None:
-    store, earlier = FeatureStore(climbed[0].features), FeatureStore(before.features)
+    store, earlier = FeatureStore(escalated[0].features), FeatureStore(before.features)
     for name in NAMES:
         ends = store.level_ends(name)
         first = store.read(name).select(store.level_indices(name, 0))
@@ -322,33 +324,33 @@ def test_features_of_levels_follow_one_another(
             assert (ids[: ends[0]] == 0).all()
             assert (ids[ends[0] :] > 0).all()
             assert ends == sorted(ends)
-    ids = image_ids(climbed[0].database)
-    with open_database(climbed[0].database) as database:
+    ids = image_ids(escalated[0].database)
+    with open_database(escalated[0].database) as database:
         for name in NAMES:
             assert database.num_keypoints_for_image(ids[name]) == len(store.read(name))
 
 
-def test_count_of_pairs_by_level_adds_up(climbed: tuple[Workspace, StageReport]) -> None:
-    counts = escalation.pair_levels(Context(climbed[0]))
+def test_count_of_pairs_by_level_adds_up(escalated: tuple[Workspace, StageReport]) -> None:
+    counts = escalation.pair_levels(Context(escalated[0]))
     assert list(counts) == ["identity", "dense-shapes", "affnet-shapes", "asift", "none"]
     assert sum(counts.values()) == 3
     assert counts["none"] <= 1
 
 
 def test_again_does_nothing(
-    climbed: tuple[Workspace, StageReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    escalated: tuple[Workspace, StageReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    workspace = copy(climbed[0], tmp_path / "again")
+    workspace = copy(escalated[0], tmp_path / "again")
     monkeypatch.setattr(escalation, "prepared_recipe", None)  # no features, so nothing to prepare
     assert escalate(workspace).num_done == 0
-    same_state(workspace, climbed[0])
+    same_state(workspace, escalated[0])
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("where", ["write_images_and_keypoints", "verify_new"])
 def test_killed_run_goes_on_to_the_same_result(
     before: Workspace,
-    climbed: tuple[Workspace, StageReport],
+    escalated: tuple[Workspace, StageReport],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     where: str,
@@ -363,14 +365,14 @@ def test_killed_run_goes_on_to_the_same_result(
         with pytest.raises(KeyboardInterrupt):
             escalate(workspace)
     escalate(workspace)
-    same_state(workspace, climbed[0])
+    same_state(workspace, escalated[0])
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_run_killed_between_two_changes_of_its_matches_goes_on_to_the_same_result(
     before: Workspace,
-    climbed: tuple[Workspace, StageReport],
+    escalated: tuple[Workspace, StageReport],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     number: int,
@@ -389,20 +391,20 @@ def test_run_killed_between_two_changes_of_its_matches_goes_on_to_the_same_resul
         with pytest.raises(KeyboardInterrupt):
             escalate(workspace)
     escalate(workspace)
-    same_state(workspace, climbed[0])
+    same_state(workspace, escalated[0])
 
 
 @pytest.mark.long
-def test_overwrite_climbs_anew_to_the_same_result(
-    climbed: tuple[Workspace, StageReport], tmp_path: Path
+def test_overwrite_escalates_anew_to_the_same_result(
+    escalated: tuple[Workspace, StageReport], tmp_path: Path
 ) -> None:
-    workspace = copy(climbed[0], tmp_path / "overwritten")
+    workspace = copy(escalated[0], tmp_path / "overwritten")
     report = escalate(workspace, overwrite=True)
-    assert report.num_done == climbed[1].num_done
-    same_state(workspace, climbed[0])
+    assert report.num_done == escalated[1].num_done
+    same_state(workspace, escalated[0])
 
 
-def test_photographs_without_a_feature_climb_nowhere(tmp_path: Path) -> None:
+def test_photographs_without_a_feature_escalate_nowhere(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     for name in NAMES[:2]:
@@ -412,7 +414,7 @@ def test_photographs_without_a_feature_climb_nowhere(tmp_path: Path) -> None:
     assert set(Context(workspace).features.num_keypoints().values()) == {0}
 
 
-def test_recipe_without_levels_has_nothing_to_climb(plain: Workspace, tmp_path: Path) -> None:
+def test_recipe_without_levels_has_nothing_to_escalate(plain: Workspace, tmp_path: Path) -> None:
     workspace = copy(plain, tmp_path / "plain")
     assert escalate(workspace).num_done == 0
     assert escalation.pair_levels(Context(workspace)) == {}

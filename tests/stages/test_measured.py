@@ -58,9 +58,9 @@ def _shapeless() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def climbed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Workspace, Counts]:
-    """All pairs have climbed to the level without measured frames; what they had before."""
-    folder = tmp_path_factory.mktemp("climbed")
+def escalated(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Workspace, Counts]:
+    """All pairs have escalated to the level without measured frames; what they had before."""
+    folder = tmp_path_factory.mktemp("escalated")
     (folder / "recipe.toml").write_text(RECIPE)
     workspace = Workspace(folder / "out")
     cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
@@ -77,8 +77,8 @@ def climbed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Wor
 
 
 @pytest.fixture
-def context(climbed: tuple[Workspace, Counts], tmp_path: Path) -> Context:
-    return Context(Workspace(Path(shutil.copytree(climbed[0].path, tmp_path / "out"))))
+def context(escalated: tuple[Workspace, Counts], tmp_path: Path) -> Context:
+    return Context(Workspace(Path(shutil.copytree(escalated[0].path, tmp_path / "out"))))
 
 
 def escalation_of(context: Context) -> Escalation:
@@ -95,9 +95,9 @@ def shapeless_only(escalation: Escalation, *pairs: tuple[str, str]) -> None:
 
 
 def test_matches_of_both_kinds_of_frames_are_united(
-    climbed: tuple[Workspace, Counts], context: Context
+    escalated: tuple[Workspace, Counts], context: Context
 ) -> None:
-    before, escalation = climbed[1], escalation_of(context)
+    before, escalation = escalated[1], escalation_of(context)
     assert set(escalation.matches.levels(escalation.pairs).values()) == {1}
     after = verified_pairs(context.workspace.database, 1)
     assert len(after) == len(before) == 6
@@ -107,7 +107,7 @@ def test_matches_of_both_kinds_of_frames_are_united(
     assert all(after[ids] > 1.5 * before[ids] for ids in before)
 
 
-def test_pairs_that_nothing_hints_at_climb_to_features_of_another_kind(
+def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those of an image that no measured frames match, and not those of the others."""
@@ -132,11 +132,11 @@ def test_pairs_that_nothing_hints_at_climb_to_features_of_another_kind(
     with monkeypatch.context() as patch:
         patch.setattr(escalation.matches, "write", killed)
         with pytest.raises(KeyboardInterrupt):
-            escalation.climb(own, 1)
+            escalation.match_at(own, 1)
     # The matches that are stored look different now; what is left of the step is not decided anew.
     escalation = Escalation(context, options)
     assert escalation.next_work() == (1, own[2:])
-    escalation.climb(own[2:], 1)
+    escalation.match_at(own[2:], 1)
     assert min(escalation.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_work() is None
 

@@ -1,4 +1,4 @@
-"""Which pairs of a set may climb: those that would tie an image that mapping may well lose."""
+"""Which pairs of a set may escalate: those that would tie an image that mapping may well lose."""
 
 import heapq
 from collections import defaultdict
@@ -26,7 +26,7 @@ def insecure_images(
 
 
 @dataclass(frozen=True)
-class ClimbingGraph:
+class EscalationGraph:
     """The pairs of a set as they are now."""
 
     num_inliers: Mapping[Pair, int]  # of each pair, 0 where it is not verified
@@ -50,7 +50,7 @@ class ClimbingGraph:
         """Return the promising pairs between images that no verified pairs connect.
 
         And the best of each image outside the largest part, where no level brought nothing to them;
-        the best pair of each part climbs in any case.
+        the best pair of each part escalates in any case.
         """
         parts = self.components
         between = [pair for pair in self.num_inliers if parts[pair[0]] != parts[pair[1]]]

@@ -1,4 +1,4 @@
-"""Which pairs may climb: what joins parts first, then what ties images that hang loosely."""
+"""Which pairs may escalate: what joins parts first, then what ties images that hang loosely."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images
+from colmap_affrect.stages.escalation_graph import EscalationGraph, insecure_images
 
 PROMISING = EscalateOptions().min_num_consistent
 BEST_ONE = EscalateOptions(num_best_pairs=1)
@@ -41,9 +41,11 @@ def test_parts_come_by_size_with_lone_images() -> None:
     assert parts == [set("abc"), set("de"), set("f"), set("g")]
 
 
-def graph(inliers: dict[str, int], consistent: dict[str, int], insecure: str = "") -> ClimbingGraph:
+def graph(
+    inliers: dict[str, int], consistent: dict[str, int], insecure: str = ""
+) -> EscalationGraph:
     failed = {tuple(pair): consistent.get(pair, 0) for pair, n in inliers.items() if not n}
-    return ClimbingGraph({tuple(pair): n for pair, n in inliers.items()}, failed, set(insecure))
+    return EscalationGraph({tuple(pair): n for pair, n in inliers.items()}, failed, set(insecure))
 
 
 INLIERS = {"ab": 200, "ac": 150, "bc": 120, "ad": 0, "bd": 0, "cd": 0, "ce": 0, "de": 0, "be": 30}
@@ -70,13 +72,13 @@ def test_pairs_that_a_level_brought_nothing_stop_but_for_the_best_of_each_part()
     assert pairs.hanging(BEST_ONE) == [("d", "e"), ("a", "e")]
 
 
-def test_verified_and_promising_pairs_of_loose_images_climb() -> None:
+def test_verified_and_promising_pairs_of_loose_images_escalate() -> None:
     consistent = {"ce": PROMISING, "de": PROMISING - 1, "ad": 9}
     assert graph(INLIERS, consistent, "e").hanging(EscalateOptions()) == [("c", "e"), ("b", "e")]
     assert graph(INLIERS, consistent).hanging(EscalateOptions()) == []
 
 
-def test_pairs_of_loose_images_climb_blindly_to_features_of_another_kind() -> None:
+def test_pairs_of_loose_images_escalate_blindly_to_features_of_another_kind() -> None:
     """The best of each image that is not secure, by matches that agree, then by all."""
     tried = dict.fromkeys(map(tuple, INLIERS), 1)
     raw = {("a", "d"): 5, ("b", "d"): 7, ("c", "d"): 9, ("d", "e"): 3, ("c", "e"): 80}
