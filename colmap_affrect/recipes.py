@@ -97,10 +97,7 @@ class ExtractionOptions(Options):
         """Refuse rectifiers that read depth maps where none are given; OptionError says how."""
         needing = [x.rectifier.name for x in self.levels if x.rectifier.uses_depth]
         if needing and not self.depth.is_given:
-            raise OptionError(
-                f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER, or "
-                "--depth-model NAME for a monocular depth network"
-            )
+            raise OptionError(f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER")
 
     def require_matching(self, matching: MatcherOptions) -> None:
         """Refuse a matcher, of all levels without one of their own, for features of others."""

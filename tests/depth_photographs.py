@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from planar_scenes import Room, rays, unit
 
 from colmap_affrect.data import Photograph
-from colmap_affrect.geometry.conventions import pixel_from_colmap
-from colmap_affrect.images.reading import read_gray
-
-COURTYARD = Path(__file__).parents[1] / "sample_scenes" / "courtyard"
 
 FLOAT32_RTOL = 1e-6
 """Rounding to float32 after float64 arithmetic."""
@@ -31,10 +25,3 @@ def slanted_plane(size, camera_matrix):
     z_depth, _ = wall.depth(size)
     directions = rays(camera_matrix, np.arange(size[0]), np.arange(size[1]))
     return z_depth, z_depth * np.linalg.norm(directions, axis=-1)
-
-
-def courtyard_photograph(name):
-    camera = np.diag([1080.0, 1080.0, 1.0])
-    camera[:2, 2] = pixel_from_colmap(np.array([360.0, 270.0]))
-    path = COURTYARD / "images" / name
-    return Photograph(read_gray(path), name, path, camera)

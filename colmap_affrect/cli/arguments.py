@@ -151,12 +151,8 @@ SCHEDULER = _value("--scheduler", "ADDRESS",
     "tcp://10.0.0.1:8786 (pip install 'colmap-affrect[cluster]'); default: on this "
     "machine")  # fmt: skip
 DEPTH = (
-    OneOf(
-        _path("--depth-path", "FOLDER",
-            "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
-        _value("--depth-model", "NAME",
-            "monocular depth network: name or local folder for Hugging Face transformers"),
-    ),
+    _path("--depth-path", "FOLDER",
+        "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
     _choice("--depth-kind", ["z", "ray", "inverse"],
         "what depth maps hold: z, distance from the camera, or inverse depth (default: z)"),
 )  # fmt: skip

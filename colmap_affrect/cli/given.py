@@ -39,7 +39,7 @@ SECTIONS = {
     },
     "matching": {"matcher": "name"},
     "guided": {"guided": "enabled"},
-    "depth": {"depth_path": "path", "depth_model": "model", "depth_kind": "kind"},
+    "depth": {"depth_path": "path", "depth_kind": "kind"},
 }  # fmt: skip
 """Options of the command line that are fields of an options class."""
 
@@ -160,10 +160,8 @@ def _settings(options: argparse.Namespace, *names: str) -> list[str]:
 def depth_settings(options: argparse.Namespace) -> list[str]:
     """Return the changes of a recipe that the options of depth maps ask for."""
     folder("--depth-path", options.depth_path)
-    depth = section(options, "depth")
-    chosen = {"model": "monocular", "path": "files"}
-    names = [f'depth.name="{name}"' for key, name in chosen.items() if key in depth]
-    return [*names, *_settings(options, "depth")]
+    files = ['depth.name="files"'] if options.depth_path else []
+    return [*files, *_settings(options, "depth")]
 
 
 def resources(options: argparse.Namespace) -> Resources:

@@ -1,34 +1,27 @@
-"""Depth maps of photographs: from ``.npy``, 16-bit ``.png`` or ``.tif`` files, or from a network.
+"""Depth maps of photographs: ``.npy``, 16-bit ``.png`` or ``.tif``, or of another package.
 
 A depth map is (h, w) float32: depth along the optical axis, > 0, NaN where it is unknown. It
 covers the whole image at any resolution, so that ``conventions.resized_from_original`` relates
 its pixels to those of the photograph. The unit is free: normals do not depend on it.
 """
 
-import hashlib
-import io
-import threading
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log, prod
 from pathlib import Path
 from posixpath import splitext
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
-from zipfile import BadZipFile
+from typing import Any, ClassVar, Literal, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import Photograph
-from colmap_affrect.errors import DepthError, OptionError, WorkspaceError
-from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Singles
+from colmap_affrect.errors import DepthError, OptionError
+from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.headers import header_size
-from colmap_affrect.images.reading import read_color, shrink_to
 from colmap_affrect.options import PartOptions, Registry
-from colmap_affrect.project.atomic_files import replace_bytes
 
 SUFFIXES = (".npy", ".png", ".tif", ".tiff")  # in the order in which they are looked for
 MAX_NUM_VALUES_PER_PX = 4  # of a map, for each pixel of its photograph; more is taken for damage
@@ -36,11 +29,6 @@ MIN_LARGEST_MAP = 1 << 22  # a map of so many values is read whatever the size o
 PNG_STEP = 0.001  # depth of one step of 16 bits; only the ratio of depths matters
 MAX_ASPECT_RATIO = 1.05  # of aspects of map and photograph: networks round sizes to 32 px
 MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
-MIN_DISPARITY_FRAC = 0.01  # inverse depth below this share of the largest is sky, i.e. unknown
-NETWORK_IMAGE_SIZE_PX = 1024  # longer side; most networks work at about 384 to 784 px
-
-DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error)
-"""What numpy raises for a kept prediction that is missing or damaged."""
 
 
 class _UnusableMap(Exception):
@@ -117,21 +105,11 @@ class DepthFilesOptions(DepthOptions):
         return next((path for path in paths if path.is_file()), None)
 
 
-class MonocularOptions(DepthOptions):
-    """A monocular depth network."""
-
-    name: Literal["monocular"] = "monocular"
-    uses_network: ClassVar[bool] = True
-    model: str
-    """A name or local folder for Hugging Face transformers."""
-
-
 DEPTH_SOURCES: Registry[DepthSource] = Registry(
     kind="depth source",
     group="colmap_affrect.depth",
     built_in={
         "files": "colmap_affrect.images.depth:DepthFiles",
-        "monocular": "colmap_affrect.images.depth:MonocularDepth",
     },
     default="files",
 )
@@ -220,116 +198,6 @@ def _picture(path: Path, max_num: int) -> NDArray[Any]:
     return np.asarray(values)
 
 
-class _Prediction(NamedTuple):
-    values: Singles  # (h, w) depth or inverse depth
-    inverse: bool  # whether the network predicts relative inverse depth
-
-
-class MonocularDepth:
-    """Depth from one image by a network of Hugging Face transformers (``depth-estimation``).
-
-    Relative inverse depth is known up to scale and shift: 0 is taken for infinitely far, and less
-    than ``MIN_DISPARITY_FRAC`` of the largest value for unknown. Normals from such depth are
-    approximate.
-
-    Predictions are kept as ``<image name>.npz`` and used again for the same pixels and the same
-    name of a model. Threads may share one instance: they take turns at the network.
-    """
-
-    Options = MonocularOptions
-
-    def __init__(self, options: MonocularOptions, context: DepthContext) -> None:
-        """Choose a network; it is loaded for the first prediction."""
-        self._model, self._kind = options.model, options.kind
-        self._cache_path, self._device = context.cache_path, context.device
-        self._network: Any = None
-        self._lock = threading.Lock()
-
-    def require_some(self, names: Sequence[str]) -> None:
-        """Load the network now unless all predictions are kept; DepthError if it cannot be."""
-        files = [self._cache_file(name) for name in names]
-        if not all(file is not None and file.exists() for file in files):
-            with self._lock:
-                self._load()
-
-    def depth(self, photograph: Photograph) -> Singles:
-        """Predict the (h, w) float32 z-depth of a photograph, NaN where it is unknown."""
-        prediction = self._prediction(photograph)
-        kind = "inverse" if self._kind == "z" and prediction.inverse else self._kind
-        values = prediction.values
-        if kind == "inverse":
-            largest = np.nanmax(values, initial=0.0)
-            far = values <= MIN_DISPARITY_FRAC * largest
-            values = np.asarray(np.where(far, np.nan, values) / largest, dtype=np.float32)
-        try:
-            return _z_depth(values, kind, photograph)
-        except _UnusableMap as error:
-            raise DepthError(f"{photograph.name}: depth by {self._model}: {error}") from error
-
-    def _prediction(self, photograph: Photograph) -> _Prediction:
-        if photograph.path is None:
-            gray = shrink_to(photograph.gray, NETWORK_IMAGE_SIZE_PX)
-            image = np.stack([gray] * 3, axis=-1)
-        else:
-            image = read_color(photograph.path, NETWORK_IMAGE_SIZE_PX)
-        pixels = hashlib.sha256(image.tobytes() + str(image.shape).encode()).hexdigest()
-        file = self._cache_file(photograph.name)
-        kept = _read_prediction(file, self._model, pixels) if file else None
-        if kept is not None:
-            return kept
-        with self._lock:
-            self._load()
-            prediction = self._predict(image)
-        if file:
-            _write_prediction(file, prediction, self._model, pixels)
-        return prediction
-
-    def _cache_file(self, name: str) -> Path | None:
-        return self._cache_path / f"{name}.npz" if self._cache_path else None
-
-    def _load(self) -> None:
-        if self._network is not None:
-            return
-        try:
-            from PIL import Image
-            from transformers import pipeline
-        except ImportError as error:
-            raise DepthError(
-                'depth from a network needs transformers: pip install "colmap-affrect[depth]"'
-            ) from error
-        try:
-            network = pipeline(
-                "depth-estimation", model=self._model, device=self._device, trust_remote_code=False
-            )
-        except Exception as error:  # a model's files can fail in any way
-            reason = next(iter(str(error).splitlines()), type(error).__name__).strip()
-            raise DepthError(
-                f"{self._model}: cannot be loaded as a depth network ({reason}); give the name of "
-                "a depth-estimation model on the Hugging Face hub, or a local folder that has one"
-            ) from error
-        network.model.float()  # weights that are stored as float16 would give coarse depth
-        self._network, self._pillow_from_array = network, Image.fromarray
-
-    def _predict(self, image: Bytes) -> _Prediction:
-        # The pipeline also makes a preview, for which it divides by a range that may be 0.
-        with np.errstate(all="ignore"):
-            output = self._network(self._pillow_from_array(image))["predicted_depth"]
-        values = output.detach().cpu().float().numpy()
-        values = values.reshape(values.shape[-2:])
-        return _Prediction(values, _predicts_inverse_depth(self._network.model.config))
-
-
-def _predicts_inverse_depth(config: Any) -> bool:
-    """Return whether a model predicts relative inverse depth, by its configuration.
-
-    Depth Anything says so. DPT does but for metric heads, those with ``add_projection``.
-    """
-    estimation_type = getattr(config, "depth_estimation_type", None)
-    if estimation_type is not None:
-        return bool(estimation_type == "relative")
-    return bool(config.model_type == "dpt" and not config.add_projection)
-
-
 def _z_depth(values: Floats, kind: str, photograph: Photograph) -> Singles:
     """Turn (h, w) values of a kind of depth into float32 z-depth, NaN where it is unknown."""
     with np.errstate(all="ignore"):  # unknown values may be anything, and become NaN below
@@ -364,26 +232,3 @@ def _require_same_aspect(values: Floats, photograph: Photograph) -> None:
             "height): not of this photograph, or turned; map and photograph must have the same "
             "aspect as stored, EXIF orientation is not applied"
         )
-
-
-def _read_prediction(file: Path, model: str, pixels: str) -> _Prediction | None:
-    """Read a prediction that was kept; None if it is not of this model and these pixels."""
-    try:
-        with file.open("rb") as stream:
-            kept = np.load(stream, allow_pickle=False)
-            if (str(kept["model"]), str(kept["pixels"])) != (model, pixels):
-                return None
-            return _Prediction(kept["values"], bool(kept["inverse"]))
-    except DAMAGED:
-        return None
-
-
-def _write_prediction(file: Path, prediction: _Prediction, model: str, pixels: str) -> None:
-    """Keep a prediction; the file appears under its name only when it is complete."""
-    content = io.BytesIO()
-    np.savez(content, **prediction._asdict(), model=model, pixels=pixels)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        replace_bytes(file, content.getvalue())
-    except (OSError, WorkspaceError) as error:
-        raise DepthError(f"{file}: depth cannot be kept there ({error})") from error

@@ -238,7 +238,7 @@ def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
     ("arguments", "message"),
     [
         ("--device gpu", "--device gpu: not one of auto, cpu, cuda"),
-        ("--recipe depth-planes", "give --depth-path FOLDER, or --depth-model"),
+        ("--recipe depth-planes", "give --depth-path FOLDER"),
         ("--recipe defalt", "did you mean 'default'"),
         ("--pairs vocab", "pairs: methods='vocab' is not one of"),
         ("--refine-existing", "--refine-existing: only with --extend MODEL"),
