@@ -2,7 +2,7 @@
 
 import copy
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -26,6 +26,7 @@ from colmap_affrect.geometry.two_views import (
     triangulated_depths,
 )
 from colmap_affrect.mappers.base import DepthLookup, MappingTask
+from colmap_affrect.mappers.thinning import matches_of_best_tracks
 
 Ids = tuple[int, int]  # of two images
 PoseById = Mapping[int, Pose]
@@ -48,9 +49,6 @@ MAX_PAIRS_OF_IMAGE = 15
 
 MIN_NUM_MATCHES = 15
 """Pairs with fewer inliers are left out, as by COLMAP's mappers."""
-
-NUM_TRACKS, NUM_MATCHES_OF_PAIR = 500, 100
-"""Tracks of an image, and matches of a pair, that tell poses as well as all of them do."""
 
 MIN_SHARE = 0.5
 """A pair speaks for poses when at least this share of its inliers agrees."""
@@ -193,11 +191,11 @@ class PairGraph:
     def thinned(self) -> Self:
         """Leave out tracks where the others tell the poses as well; itself where they are few.
 
-        Each image keeps its ``NUM_TRACKS`` tracks of most images, each pair
-        ``NUM_MATCHES_OF_PAIR`` matches at least.
+        See :mod:`colmap_affrect.mappers.thinning`.
         """
         pairs = self._verified
-        kept = _kept_matches(pairs, {i: len(points) for i, points in self.keypoints.items()})
+        numbers = {i: len(points) for i, points in self.keypoints.items()}
+        kept = matches_of_best_tracks([(pair.ids, pair.matches) for pair in pairs], numbers)
         if 2 * sum(map(np.sum, kept)) > sum(map(len, kept)):
             return self
         some = (replace(p, matches=p.matches[k]) for p, k in zip(pairs, kept, strict=True))
@@ -387,41 +385,3 @@ def _empty_copy(
     for prior in cache.pose_priors:
         new.add_pose_prior(prior)
     return new
-
-
-def _kept_matches(
-    pairs: Sequence[VerifiedPair], num_keypoints: Mapping[int, int]
-) -> list[NDArray[np.bool_]]:
-    """Return for each pair which of its matches are of tracks that are kept, (M,)."""
-    if not pairs:
-        return []
-    ids = sorted(num_keypoints)
-    starts = dict(zip(ids, np.cumsum([0, *(num_keypoints[i] for i in ids)]), strict=False))
-    total = sum(num_keypoints.values())
-    matches = [pair.matches + [starts[i] for i in pair.ids] for pair in pairs]
-    edges = np.concatenate(matches)
-    track_of = np.arange(total)
-    while True:  # the lowest number in reach becomes that of the track
-        before = track_of.copy()
-        lowest = track_of[edges].min(axis=1)
-        np.minimum.at(track_of, edges[:, 0], lowest)
-        np.minimum.at(track_of, edges[:, 1], lowest)
-        track_of = track_of[track_of]
-        if np.array_equal(track_of, before):
-            break
-    image_of = np.repeat(np.arange(len(ids)), [num_keypoints[i] for i in ids])
-    nodes = np.unique(edges)
-    sizes = np.bincount(track_of[nodes], minlength=total)
-    both = np.unique(np.stack([track_of[nodes], image_of[nodes]]), axis=1)
-    num_images = np.bincount(both[0], minlength=total)
-    order = np.lexsort((np.random.default_rng(0).random(total), -num_images, sizes > num_images))
-    rank = np.empty(total, np.int64)
-    rank[order] = np.arange(total)
-    kept = np.zeros(total, bool)
-    for index in range(len(ids)):
-        tracks = both[0][both[1] == index]
-        kept[tracks[np.argsort(rank[tracks])[:NUM_TRACKS]]] = True
-    of_pairs = [track_of[nodes_of_pair[:, 0]] for nodes_of_pair in matches]
-    for tracks in of_pairs:
-        kept[tracks[np.argsort(rank[tracks])[:NUM_MATCHES_OF_PAIR]]] = True
-    return [kept[tracks] for tracks in of_pairs]

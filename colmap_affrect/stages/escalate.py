@@ -51,17 +51,10 @@ from colmap_affrect.stages.extract import (
     write_images_and_keypoints,
 )
 from colmap_affrect.stages.guide import restore_exact
-from colmap_affrect.stages.match import (
-    PAIRS_PER_WRITE,
-    match_pairs,
-    matched_at_level,
-)
+from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, matched_at_level
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.pairs import listed_pairs
-from colmap_affrect.stages.verify import (
-    verified_inliers,
-    verify_new,
-)
+from colmap_affrect.stages.verify import verified_inliers, verify_new
 
 MIN_SHARE_KEPT = 0.9
 """Of the inliers of measured frames in one geometry with others. Right ones keep 95 per cent and

@@ -12,8 +12,9 @@ from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.poses import model_poses
 from colmap_affrect.geometry.arrays import rows_in
-from colmap_affrect.mappers.pair_graph import NUM_MATCHES_OF_PAIR, NUM_TRACKS, PairGraph
+from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
+from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS
 
 NUM_IMAGES = 5
 
