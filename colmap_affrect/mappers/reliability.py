@@ -43,7 +43,8 @@ MIN_MOVE = 0.1  # of the logarithm of a given focal length that is told from ano
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
 MAX_NUM_IMAGES = 100  # of models whose focal lengths are tried; larger ones have points of many
 MAX_NUM_POINTS = 2_000  # of a model, for what need not be exact
-NUM_TURNED = 4  # pairs of an image that are compared with a camera that only turns
+NUM_TURNED, MAX_PAIRS_TURNED = 4, 300
+"""Pairs of an image, and of a model, that are compared with a camera that only turns."""
 USUAL_TURNED = 0.5  # share of matches that a rotation may explain of views of any two places
 MAX_ERROR = 0.003  # of a match that a rotation explains, in longer sides, as in verification
 MIN_SHARE_MIRRORED = 0.5
@@ -202,7 +203,10 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
     evidence = Evidence(graph, priors)
     pairs = graph.pairs_inside(poses)
     agreements = {pair.ids: graph.agreement(pair, poses, cameras) for pair in pairs}
-    pairs_of = {i: [pair for pair in pairs if i in pair.ids] for i in sorted(poses)}
+    pairs_of: dict[int, list[VerifiedPair]] = {image_id: [] for image_id in sorted(poses)}
+    for pair in pairs:
+        for image_id in pair.ids:
+            pairs_of[image_id].append(pair)
     three, long = evidence.three_view_ratios(model), num_long_tracks(model)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
     growth, fitting_px = _focal_growths(model, task), fitting_focals(model, task)
@@ -216,7 +220,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             for pair, share in zip(own, shares, strict=True)
             if (num := evidence.num_cells(pair))
         ]
-        rotations = [turned[pair.ids] for pair in own if pair.ids in turned]
+        rotations = [turned[p.ids] for p in own if p.ids in turned] or list(turned.values())
         name, camera = graph.names[image_id], cameras[image_id]
         found[name] = Measures(
             evidence=sum(nats)
@@ -240,14 +244,17 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
 def _rotation_shares(
     graph: PairGraph, pairs_of: Mapping[int, Sequence[VerifiedPair]]
 ) -> dict[Ids, float]:
-    """Return, of the strongest pairs of each image, how much a camera that turns explains."""
-    found: dict[Ids, float] = {}
-    for pairs in pairs_of.values():
-        for pair in sorted(pairs, key=lambda pair: -len(pair.matches))[:NUM_TURNED]:
-            if pair.ids not in found:
-                sizes = _sizes(graph, pair.ids)
-                error = MAX_ERROR * max(map(max, sizes))
-                found[pair.ids] = rotation_share(*graph.points(pair), sizes, error)
+    """Return, of the strongest pairs of images, how much a camera that turns explains."""
+    strongest = {
+        pair.ids: pair
+        for pairs in pairs_of.values()
+        for pair in sorted(pairs, key=lambda pair: -len(pair.matches))[:NUM_TURNED]
+    }
+    found = {}
+    for pair in list(strongest.values())[:: -(-len(strongest) // MAX_PAIRS_TURNED) or 1]:
+        sizes = _sizes(graph, pair.ids)
+        error = MAX_ERROR * max(map(max, sizes))
+        found[pair.ids] = rotation_share(*graph.points(pair), sizes, error)
     return found
 
 
