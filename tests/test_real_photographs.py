@@ -15,6 +15,7 @@ from registration import compare, compare_subset
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.features.weights import missing
+from colmap_affrect.project.report import SURE
 from colmap_affrect.recipes import load_recipe
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
@@ -99,8 +100,9 @@ def test_portraits_are_registered(tmp_path: Path, call: Call) -> None:
     given = ["--image-path", portraits, "--image-list-path", tmp_path / "list.txt", "--json", "-q"]
     run = ["run", *given, "--recipe", "on-demand-learned", "--output-path"]
     ended = call(*run, tmp_path / "out")
-    assert ended.code == 3  # nothing tells the focal length of a lens so long
     assert ended.report["registered_names"] == names
+    # Nothing tells the focal length of a lens so long.
+    assert max(ended.report["probabilities"].values()) < SURE
     assert all("any focal length" in why for why in ended.report["doubtful"].values())
     known = call(*run, tmp_path / "known", "--focal-length-px", "1000")
     assert known.code == 0
