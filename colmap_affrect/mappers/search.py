@@ -38,7 +38,7 @@ class Search:
     num_seeds: int
     show: Callable[[int], None]
     num_starts: int = NUM_STARTS
-    """Models that are joined to the others in turn; with 0 there are no bridges."""
+    """Models that are joined to the others in turn; with 0 there are no bridges, and one try."""
 
     def grower(self, graph: PairGraph, adjuster: Adjuster | None = None) -> Grower:
         """Return what grows models of a graph."""
@@ -60,7 +60,8 @@ class Search:
             return self._beyond(graph, start)
         best: list[MappedModel] = []
         most = -math.inf
-        usual = [self._near(zoom) for zoom in ZOOMS] if self._shared else [self.adjuster]
+        zooms = ZOOMS if self.num_starts else ZOOMS[:1]
+        usual = [self._near(zoom) for zoom in zooms] if self._shared else [self.adjuster]
         left = usual.copy()
         while left:
             adjuster = left.pop(0)
@@ -68,7 +69,7 @@ class Search:
             found = self.joined(graph, adjuster, self._grown(graph, grower), self.num_starts)
             if not found:
                 continue
-            model, evidence = self._with_free_cameras(graph, found[0].reconstruction)
+            model, evidence = self._with_free_cameras(graph, found[0].reconstruction, most)
             found = [replace(found[0], reconstruction=model), *found[1:]]
             agrees = self._agrees(adjuster, model)
             evidence += MIN_GAIN * agrees  # with others, bridges are of the wrong length
@@ -158,18 +159,18 @@ class Search:
         return used & self.unknown.keys()
 
     def _with_free_cameras(
-        self, graph: PairGraph, model: pycolmap.Reconstruction
+        self, graph: PairGraph, model: pycolmap.Reconstruction, least: float
     ) -> tuple[pycolmap.Reconstruction, float]:
-        """Adjust a model, and from other focal lengths where that is better.
+        """Adjust a model; from other focal lengths, too, if it has more evidence than ``least``.
 
         Returns:
-            The model and its evidence.
+            The best one and its evidence.
         """
         free = self.grower(graph)
         if self.unknown:
             free.finish(model, MEDIUM)
         most = self.evidence.of(model)
-        if len(self.unknown) != 1 or self.evidence.is_confirmed(model):
+        if len(self.unknown) != 1 or most <= least or self.evidence.is_confirmed(model):
             return model, most  # several cameras: there are too many other focal lengths
         for factor in FACTORS:
             other = pycolmap.Reconstruction(model)
