@@ -3,6 +3,7 @@
 All points are (N, 2) px with the corner of the image at (0, 0); sizes are (width, height) px.
 """
 
+import cv2
 import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
@@ -16,6 +17,7 @@ FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
 MAX_NUM_POINTS = 500  # enough to measure a share to two per cent
 MIN_DEPTH = 1e-3  # of a turned ray of length 1; what is behind lands far outside of the image
 DISPLACEMENT_PX = np.array([13.0, 7.0])  # so moved, keypoints meet others by chance only
+MARGIN = 16  # px around an image, for what is moved out of it
 MIN_FREE_SHARE = 0.1  # where keypoints are so dense that chance leaves less, nothing can be told
 NUM_STARTS = 30  # rotations of two matches each; least squares begin with the best
 MAX_ITERATIONS = 3  # least squares are repeated without outliers
@@ -83,22 +85,21 @@ def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -
     if len(points2) < len(points1):
         points1, points2, sizes = points2, points1, sizes[::-1]
     size = sizes[0]
-    row = size[0] + 4
-    taken = np.unique(_cells(points2 * np.divide(size, sizes[1]), row))
-    neighbors = np.array([y * row + x for y in (-1, 0, 1) for x in (-1, 0, 1)])
+    taken = np.zeros((size[1] + 2 * MARGIN, size[0] + 2 * MARGIN), np.uint8)
+    taken[_pixels(points2 * np.divide(size, sizes[1]), size)] = 1
+    near = np.asarray(cv2.dilate(taken, np.ones((3, 3), np.uint8)))  # neighbours count, too
     shares = [0.0]
     for axis in (0, 1) if len(points1) else ():
         mirrored = _some(points1.astype(np.float64))
         mirrored[:, axis] = size[axis] - mirrored[:, axis]
-        share, chance = (
-            np.isin(_cells(points, row)[:, None] + neighbors, taken).any(axis=1).mean()
-            for points in (mirrored, mirrored + DISPLACEMENT_PX)
-        )
+        share = near[_pixels(mirrored, size)].mean()
+        chance = near[_pixels(mirrored + DISPLACEMENT_PX, size)].mean()
         shares.append(float((share - chance) / max(1.0 - chance, MIN_FREE_SHARE)))
     return max(shares)
 
 
-def _cells(points: Floats, row: int) -> Indices:
-    """Number the pixels that points lie in."""
-    columns, rows = np.floor(points).astype(np.int64).T
-    return np.asarray(rows * row + columns)
+def _pixels(points: Floats, size: Size) -> tuple[Indices, Indices]:
+    """Return rows and columns of points in an image with a margin."""
+    pixels = np.floor(points).astype(np.int64) + MARGIN
+    columns, rows = np.clip(pixels, 0, np.array(size) + 2 * MARGIN - 1).T
+    return rows, columns

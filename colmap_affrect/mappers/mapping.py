@@ -18,6 +18,9 @@ from colmap_affrect.project.report import DOUBTFUL, ModelSummary
 
 logger = logging.getLogger(__name__)
 
+Judgements = Mapping[str, Judgement]
+"""By the names of the images."""
+
 WRONG = 0.1  # probability below which an image leaves its model: nine of ten are wrong
 
 
@@ -57,17 +60,17 @@ def map_database(
             next_image(news)
 
     try:
-        with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as kept:
+        with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as whole:
             raw = partial / "raw"
             raw.mkdir(parents=True)
-            found = mapper.map(kept, raw, mapper.options.random_seed, show)
+            found = mapper.map(whole, raw, mapper.options.random_seed, show)
             remove_own([raw])
-        if not task.extend:  # whose images stay, whatever they are
-            found = [model for each in found if (model := _without_wrong(each, task))]
+        judged = [_judged(model, task) for model in found]
+        kept = [(model, sure) for model, sure in judged if sure]
         summaries = []
-        for index, model in enumerate(sorted(found, key=_size, reverse=True)):
+        for index, (model, sure) in enumerate(sorted(kept, key=_size, reverse=True)):
             write_model(model.reconstruction, partial / str(index))
-            summaries.append(_summary(model, judge(model, task), task))
+            summaries.append(_summary(model, sure, task))
             write_summary(summaries[-1], partial / str(index))
         remove_own([sparse_path])
         partial.rename(sparse_path)
@@ -76,8 +79,9 @@ def map_database(
     return summaries
 
 
-def _size(model: MappedModel) -> tuple[int, int]:
-    return model.reconstruction.num_reg_images(), model.reconstruction.num_points3D()
+def _size(judged: tuple[MappedModel, Judgements]) -> tuple[int, int]:
+    model = judged[0].reconstruction
+    return model.num_reg_images(), model.num_points3D()
 
 
 def read_models(sparse_path: Path, task: MappingTask) -> list[ModelSummary]:
@@ -94,28 +98,27 @@ def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
     return _summary(model, judge(model, task), task)
 
 
-def _without_wrong(mapped: MappedModel, task: MappingTask) -> MappedModel | None:
-    """Take out the images that are surely wrong, the worst one first; None if two are not left.
+def _judged(mapped: MappedModel, task: MappingTask) -> tuple[MappedModel, Judgements]:
+    """Take out the images that are surely wrong, the worst one first; judge what is left.
 
-    The reconstruction itself is changed. Of a rig all images leave that were taken at once.
+    The reconstruction itself is changed; nothing is left of it with fewer than two images. Of a rig
+    all images leave that were taken at once. Those of a model that is extended stay.
     """
     model, taken = mapped.reconstruction, dict[str, str]()
     while model.num_reg_images() > 1:
         found = judge(mapped, task)
         name = min(found, key=lambda name: found[name].probability)
-        if found[name].probability >= WRONG:
-            return replace(mapped, taken_out=taken)
+        if task.extend or found[name].probability >= WRONG:
+            return replace(mapped, taken_out=taken), found
         frame_id = model.find_image_with_name(name).frame_id
         for image in model.images.values():
             if image.frame_id == frame_id and image.has_pose:
                 taken[image.name] = found[name].reason
         model.deregister_frame(frame_id)
-    return None
+    return mapped, {}
 
 
-def _summary(
-    mapped: MappedModel, found: Mapping[str, Judgement], task: MappingTask
-) -> ModelSummary:
+def _summary(mapped: MappedModel, found: Judgements, task: MappingTask) -> ModelSummary:
     """Count what a model holds, and say how sure it is of each photograph."""
     model = mapped.reconstruction
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
