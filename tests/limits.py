@@ -16,8 +16,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
-    "lines of the package": 26_950,
-    "lines of the tests": 22_350,
+    "lines of the package": 26_800,
+    "lines of the tests": 22_000,
     "lines of the longest file": 435,
     "lines of the longest function": 60,
     "imports between folders": 164,

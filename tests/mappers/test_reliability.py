@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,16 +86,6 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
         assert judged(measures).probability <= judged(good).probability
 
 
-def write_keypoints(
-    mapped: MappedModel, task: MappingTask, points_of: Callable[[pycolmap.Image], np.ndarray]
-) -> None:
-    """Give each image other keypoints, of the same number."""
-    with open_database(task.database_path) as database:
-        for image_id in sorted(mapped.reconstruction.reg_image_ids()):
-            points = points_of(mapped.reconstruction.images[image_id])
-            database.update_keypoints(image_id, points.astype(np.float32))
-
-
 def test_camera_that_only_turned(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     first = mapped.reconstruction.images[min(mapped.reconstruction.reg_image_ids())]
@@ -113,7 +102,9 @@ def test_camera_that_only_turned(tmp_path: Path) -> None:
         return points
 
     assert max(one.turned for one in measure(mapped, task).values()) < 0.3
-    write_keypoints(mapped, task, turned)
+    with open_database(task.database_path) as database:
+        for image_id, image in mapped.reconstruction.images.items():
+            database.update_keypoints(image_id, turned(image).astype(np.float32))
     assert min(one.turned for one in measure(mapped, replace(task)).values()) > 0.9
 
 
