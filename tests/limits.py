@@ -18,7 +18,7 @@ PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
     "lines of the package": 26_800,
     "lines of the tests": 22_000,
-    "lines of the longest file": 435,
+    "lines of the longest file": 400,
     "lines of the longest function": 60,
     "imports between folders": 164,
     "words of ARCHITECTURE.md": 2_500,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -378,7 +378,7 @@ def recipes(options: argparse.Namespace) -> None:
 def weights(options: argparse.Namespace) -> None:
     from colmap_affrect.features.weights import describe_weights, fetch, install_hint, remedy
 
-    keys = _weight_keys(options.keys)
+    keys = given.weight_keys(options.keys)
     if options.keys and not keys:
         show(f"{', '.join(options.keys)}: no weights are needed")
         return
@@ -397,18 +397,3 @@ def weights(options: argparse.Namespace) -> None:
             where = f"{row.path}, {states[row.verified]}"
         show(f"{row.key:32s} {file.used_for}, {file.file_name}\n    {where}")
         show(f"    sha256 {file.sha256 or 'not known'}; licence {file.licence or 'not stated'}")
-
-
-def _weight_keys(names: Sequence[str]) -> list[str]:
-    """Return keys of weights once each.
-
-    Names of recipes stand for what these need, ``aliked`` and ``lightglue`` for all of that name.
-    """
-    from colmap_affrect.features.weights import WEIGHT_FILES
-    from colmap_affrect.recipes import load_recipe, recipe_names
-
-    keys: list[str] = []
-    for name in names:
-        alike = [key for key in WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
-        keys += load_recipe(name).weights if name in recipe_names() else alike or [name]
-    return list(dict.fromkeys(keys))

@@ -270,3 +270,18 @@ def distance(text: str) -> tuple[str, str, float]:
 
 def progress(options: argparse.Namespace) -> Progress:
     return SILENT if options.quiet else Progress(sys.stderr)
+
+
+def weight_keys(names: Sequence[str]) -> list[str]:
+    """Return keys of weights once each.
+
+    Names of recipes stand for what these need, ``aliked`` and ``lightglue`` for all of that name.
+    """
+    from colmap_affrect.features.weights import WEIGHT_FILES
+    from colmap_affrect.recipes import load_recipe, recipe_names
+
+    keys: list[str] = []
+    for name in names:
+        alike = [key for key in WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
+        keys += load_recipe(name).weights if name in recipe_names() else alike or [name]
+    return list(dict.fromkeys(keys))

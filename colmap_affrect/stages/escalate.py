@@ -20,11 +20,10 @@ record, so that a killed run goes on in the same way:
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -256,7 +255,10 @@ class Escalation:
         write_images_and_keypoints(self.context)
         ids = colmap_database.image_ids(self.path)
         if pairs := [pair for pair in self.pairs if pair[0] in ids and pair[1] in ids]:
-            _replace_matches(self.path, ids, self.matches.read(pairs))
+            with colmap_database.open_database(self.path) as database:
+                for found in self.matches.read(pairs):
+                    first, second = (ids[name] for name in found.names)
+                    colmap_database.replace_matches(database, first, second, found.indices)
         verify_new(self.context)
 
     def undo(self) -> None:
@@ -394,11 +396,3 @@ class Escalation:
                 if len(others):
                     found[pair] = others
         return found
-
-
-def _replace_matches(path: Path, ids: Mapping[str, int], matches: Iterable[PairMatches]) -> None:
-    """Put matches into a database where they differ from the ones there."""
-    with colmap_database.open_database(path) as database:
-        for found in matches:
-            first, second = (ids[name] for name in found.names)
-            colmap_database.replace_matches(database, first, second, found.indices)
