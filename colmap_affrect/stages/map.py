@@ -193,7 +193,8 @@ def advice(
     context: Context, missing: Collection[str], models: Sequence[ModelSummary]
 ) -> tuple[str, ...]:
     """Say what may help when images are missing or the largest model is doubtful, best first."""
-    doubts = "; ".join(models[0].doubtful.values()) if models else ""
+    against = [models[0].doubtful, models[0].taken_out] if models else []
+    doubts = "; ".join(why for reasons in against for why in reasons.values())
     if not missing and not doubts:
         return ()
     workspace = context.workspace

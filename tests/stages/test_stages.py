@@ -23,7 +23,7 @@ from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.reliability import FOCAL_UNKNOWN
+from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ReconstructionReport
@@ -151,6 +151,8 @@ def test_advice_is_about_what_is_wrong(finished: tuple[Workspace, Reconstruction
     stronger = "run again with --recipe on-demand,"
     assert any(text.startswith(stronger) for text in advice(context, [], [doubtful]))
     assert masks in advice(context, [NAMES[0]], [model])
+    wrong = replace(model, taken_out={NAMES[0]: f"{FOCAL_CONTRADICTED}, 9 px: 8 px does"})
+    assert advice(context, [NAMES[0]], [wrong])[0].startswith("run again without the given focal")
     first, *_, last = advice(context, [NAMES[0]], [doubtful])
     assert first.startswith(stronger)
     assert last.startswith("more photographs between")
