@@ -147,7 +147,12 @@ class SparseMapper(IncrementalMapper):
                 model = own[1].with_own_cameras(reduction(own[0]), best[0].reconstruction)
                 if own[1].evidence.of(model) > most + MIN_GAIN:
                     is_sharing, (graph, search) = False, own
-                    best = [replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))]
+                    first = replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))
+                    inside = set(model.reg_image_ids())
+                    others = (
+                        m for m in best[1:] if inside.isdisjoint(m.reconstruction.reg_image_ids())
+                    )
+                    best = [first, *others]
                     most = search.evidence_of(best)
         return best or (
             self._best(replace(task, may_share=False), own[0], native, show) if is_sharing else []
