@@ -244,20 +244,9 @@ def file_digests(folder: Path) -> dict[str, str]:
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model into a new folder."""
+    """Write a model into a new folder; pycolmap does not say when the disk is full."""
     folder.mkdir()
     model.write(folder)
-    _require_written(folder)
-
-
-def read_written_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a model that pycolmap has just written."""
-    _require_written(folder)
-    return pycolmap.Reconstruction(folder)
-
-
-def _require_written(folder: Path) -> None:
-    """Refuse a model of which a part is missing: pycolmap does not say when the disk is full."""
     try:
         registered_names(folder)
     except StoreError as error:

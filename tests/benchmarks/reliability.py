@@ -41,6 +41,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.poses import model_poses, pose_errors, read_poses, relative_pose
+from colmap_affrect.comparison import pose_scores
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MappingTask
 from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS, measure
 from colmap_affrect.project.report import DOUBTFUL, SURE
@@ -171,7 +172,6 @@ def make(name: str, scenes_path: Path, work_path: Path) -> Path:
 CAMERAS = ("unknown", "known", "wrong")  # focal lengths: nothing is said, true ones, a wrong one
 WRONG_FACTORS = (0.7, 0.8, 1.25, 1.45)
 SIZES = (3, 4, 5, 6, 8, 10)  # photographs of a part
-MAX_CORRECT_ERROR_DEG = 5.0
 MAX_ITERATIONS = 50
 
 
@@ -195,18 +195,16 @@ def truth_of(
 
 
 def correct_images(poses: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, bool]:
-    """Tell of each image whether its relative poses to at least half of the others are right."""
-    names = sorted(poses.keys() & truth.keys())
-    num_right = dict.fromkeys(names, 0)
+    """Tell of each image whether it is registered correctly; those without a place are not."""
+    names, errors = sorted(poses.keys() & truth.keys()), {}
     for one, two in itertools.combinations(names, 2):
         first, second = truth[one], truth[two]
+        errors[one, two] = (180.0, 180.0)
         if first and second and first[0] == second[0]:
             relative = relative_pose(poses[one], poses[two])
-            errors = pose_errors(relative, relative_pose(first[1], second[1]))
-            right = max(errors) <= MAX_CORRECT_ERROR_DEG
-            num_right[one] += right
-            num_right[two] += right
-    return {name: 2 * count >= len(names) - 1 for name, count in num_right.items()}
+            errors[one, two] = pose_errors(relative, relative_pose(first[1], second[1]))
+    right = pose_scores.correct_images(errors)
+    return {name: name in right for name in names}
 
 
 def parts_of(
