@@ -8,12 +8,9 @@ of range, in one line. A part is a class with its options class as attribute ``O
 import difflib
 import hashlib
 import json
-import logging
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
-from contextvars import ContextVar
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from importlib import metadata
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
@@ -25,31 +22,8 @@ from colmap_affrect.errors import OptionError
 
 PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
 MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
-PLAIN_NAMES = {"model": "options", "dict": "options", "tuple": "list"}  # types in messages
 MAX_COMMENT = 96  # width of comments in printed options
 CUSTOM = "custom"  # name of options that are no preset
-
-logger = logging.getLogger(__name__)
-_left_out: ContextVar[list[str] | None] = ContextVar("_left_out", default=None)
-Built = TypeVar("Built")
-
-
-def from_record(where: str, build: Callable[[], Built]) -> Built:
-    """Build options from a record, perhaps of another version; unknown ones are left out."""
-    names: list[str] = []
-    token = _left_out.set(names)
-    try:
-        built = build()
-    finally:
-        _left_out.reset(token)
-    if names:
-        _warn_once(f"{where}: options of another version are left out: {', '.join(names)}")
-    return built
-
-
-@lru_cache
-def _warn_once(text: str) -> None:
-    logger.warning("%s", text)
 
 
 def within(low: float, high: float) -> Any:
@@ -66,10 +40,6 @@ class Options(BaseModel):
 
     def __init__(self, /, **values: Any) -> None:
         """Check the values; OptionError names the option."""
-        if (names := _left_out.get()) is not None:
-            unknown = values.keys() - type(self).model_fields
-            names += sorted(unknown)
-            values = {key: value for key, value in values.items() if key not in unknown}
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -97,32 +67,16 @@ class Options(BaseModel):
     def _problem(cls, error: ErrorDetails) -> str:
         """Say in one line what pydantic found."""
         *outer, last = error["loc"] or ("",)
-        places = outer if isinstance(last, int) else [*outer, last]  # a list, not which of it
-        place, given = ".".join(map(str, places)), error["input"]
-        context = error.get("ctx", {})
+        place = ".".join(map(str, outer if isinstance(last, int) else [*outer, last]))
         match error["type"]:
             case "extra_forbidden":
                 return f"unknown option '{place}'{suggestion(place, cls.model_fields)}"
             case "missing":
                 return f"{place} is missing"
-            case "greater_than_equal" | "less_than_equal":
-                field = cls.model_fields.get(place)
-                ends = {type(limit).__name__: limit for limit in field.metadata} if field else {}
-                if {"Ge", "Le"} <= ends.keys():
-                    low, high = ends["Ge"].ge, ends["Le"].le
-                    return f"{place}={given} is outside [{low:g}, {high:g}]"
-                return f"{place}={given}: {error['msg'].removeprefix('Input ')}"
-            case "literal_error":
-                return f"{place}={given!r} is not one of {context['expected']}"
-            case "too_short":
-                return f"{place} is empty; give at least one value"
             case "value_error":
-                return f"{place}: {context['error']}" if place else str(context["error"])
-            case kind if kind.endswith(("_type", "_parsing", "_from_float")):
-                expected = kind.removesuffix("_type").removesuffix("_parsing")
-                expected = PLAIN_NAMES.get(expected, expected)
-                return f"{place}: expected {expected}, got {type(given).__name__} ({given!r})"
-        return f"{place}={given!r}: {error['msg']}"
+                said = error["ctx"]["error"]
+                return f"{place}: {said}" if place else str(said)
+        return f"{place}={error['input']!r}: {error['msg'].removeprefix('Input ')}"
 
 
 class PresetOptions(Options):

@@ -108,15 +108,6 @@ class RunOptions(InputOptions):
     database_descriptors: bool = False
     extend: Extension | None = None
 
-    def forecast(self, num_images: int) -> Forecast:
-        """Return what so many images will take."""
-        return Forecast(
-            num_images,
-            expected_num_pairs(self.pairs, num_images),
-            by_network=bool(self.recipe.matching.weights),
-            may_escalate=bool(self.recipe.extraction.escalation),
-        )
-
 
 def run(
     image_path: Path,
@@ -151,7 +142,10 @@ def run(
     mapper = MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    shown = progress.with_forecast(options.forecast(len(names)))
+    count, num_pairs = len(names), expected_num_pairs(options.pairs, len(names))
+    units = {"extract": count, "match": num_pairs, "verify": num_pairs}
+    units["map"] = count + count**2 // 50  # adjustments grow with the model
+    shown = progress.with_forecast(Forecast(units))
     context = Context(Workspace(output_path), options.resources, executor, shown)
     if options.extend:
         if overwrite:

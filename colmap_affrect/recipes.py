@@ -3,14 +3,13 @@
 A section is the options of a part, which ``name`` chooses; what is left out keeps its default.
 """
 
-import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, Field, SerializeAsAny
+from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureOptions, NetworkOptions
@@ -20,7 +19,7 @@ from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.options import Options, Registry, within
+from colmap_affrect.options import Options, Registry, suggestion, within
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
 from colmap_affrect.rectifiers.dense import DenseShapesOptions
 from colmap_affrect.rectifiers.whole_image import IdentityOptions
@@ -146,86 +145,74 @@ class EscalateOptions(Options):
     where light or age differ, gradients do."""
 
 
-class RecipeOptions(ExtractionOptions):
+def _mapper_options(
+    mapping: Mapping[str, Any], preset: str, name: str = "", **values: Any
+) -> MapperOptions:
+    own = dict(mapping)
+    usual = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))
+    if name and name != usual:
+        own = {}  # they are those of another mapper
+    options: MapperOptions = MAPPERS.part(name or usual).Options.preset(preset, **{**own, **values})
+    return options
+
+
+def _checked_mapping(mapping: dict[str, Any]) -> dict[str, Any]:
+    """Refuse wrong options of the mapper now, not when mapping begins."""
+    if mapping:
+        _mapper_options(mapping, "sparse")
+    return mapping
+
+
+class Recipe(ExtractionOptions):
     """All sections of a recipe."""
 
+    name: Annotated[str, Field(exclude=True)] = ""
+    """Name of the recipe, or the path that it was read from."""
     summary: str = ""
+    """One line for people."""
     matching: AnyMatcher = NearestOptions()
     escalate: EscalateOptions = EscalateOptions()
     guided: GuidedOptions = GuidedOptions()
-    mapping: dict[str, Any] = Field(default_factory=dict)
+    mapping: Annotated[dict[str, Any], AfterValidator(_checked_mapping)] = Field(
+        default_factory=dict
+    )
     """``name`` of the mapper and options that differ from the preset."""
 
+    @model_validator(mode="after")
+    def _matchers_fit(self) -> Self:
+        self.require_matching(self.matching)
+        return self
 
-@dataclass(frozen=True)
-class Recipe:
-    """What a recipe decides, resolved once; the fields are its sections."""
-
-    name: str  # of the recipe, or the path that it was read from
-    summary: str = ""  # one line for people
-    extraction: ExtractionOptions = field(default_factory=ExtractionOptions)
-    matching: MatcherOptions = field(default_factory=NearestOptions)
-    escalate: EscalateOptions = field(default_factory=EscalateOptions)
-    guided: GuidedOptions = field(default_factory=GuidedOptions)
-    mapping: Mapping[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def from_mapping(cls, name: str, values: Mapping[str, Any], where: str = "") -> Self:
-        """Build from the sections of a recipe; OptionError for unknown or wrong options."""
-        where = where or f"recipe {name}"
-        options = dict(RecipeOptions.from_mapping(values, where))
-        extraction = {key: options.pop(key) for key in ExtractionOptions.model_fields}
-        recipe, section = cls(name, extraction=ExtractionOptions(**extraction), **options), ""
-        try:  # refuse wrong options of the mapper now, not when mapping begins
-            recipe.extraction.require_matching(recipe.matching)
-            if recipe.mapping:
-                section = "mapping: "
-                recipe.mapper_options("sparse")
-        except OptionError as error:
-            raise OptionError(f"{where}: {section}{error}") from error
-        return recipe
+    @property
+    def extraction(self) -> ExtractionOptions:
+        """The options that decide the features of an image."""
+        return ExtractionOptions(**{key: getattr(self, key) for key in EXTRACTION})
 
     @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights of all parts, sorted."""
-        matchers = self.extraction.matchers(self.matching)
-        return tuple(sorted({*self.extraction.weights}.union(*(item.weights for item in matchers))))
+        matchers = self.matchers(self.matching)
+        return tuple(sorted({*super().weights}.union(*(item.weights for item in matchers))))
 
     @property
     def later_stages(self) -> dict[str, Options]:
         """Options of the stages after extraction, by stage."""
         found: dict[str, Options] = {"match": self.matching, "guide": self.guided}
-        if self.extraction.escalation:
+        if self.escalation:
             found["escalate"] = self.escalate
         if self.mapping:
             found["map"] = self.mapper_options("sparse")
         return found
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return all sections with all options, as :meth:`from_mapping` takes them."""
-        return {
-            **self.extraction.to_mapping(),
-            "matching": self.matching.to_mapping(),
-            "escalate": self.escalate.to_mapping(),
-            "guided": self.guided.to_mapping(),
-            "mapping": dict(self.mapping),
-        }
 
     def mapper_options(self, preset: str, name: str = "", **values: Any) -> MapperOptions:
         """Return the options of a mapper: of a preset, changed by the recipe, then by ``values``.
 
         ``name`` is by default that of the recipe, or of the preset.
         """
-        own = dict(self.mapping)
-        recipes_name = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))
-        name = name or recipes_name
-        if name != recipes_name:
-            own = {}
-        options: MapperOptions = MAPPERS.part(name).Options.preset(preset, **{**own, **values})
-        return options
+        return _mapper_options(self.mapping, preset, name, **values)
 
 
-RENAMED = {"affnet-shapes-recommended": ["second-moment-shapes"]}  # recipes of older versions
+EXTRACTION = tuple(ExtractionOptions.model_fields)
 DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}  # by preset
 
 
@@ -246,55 +233,46 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
     ``settings`` are ``section.option=value`` with a TOML value; strings may go without quotes.
     Raises OptionError for an unknown recipe or option, or a value out of range.
     """
-    return Recipe.from_mapping(name, with_settings(_read(name), settings))
-
-
-def _read(name: str) -> dict[str, Any]:
-    path = Path(name) if name.endswith(".toml") else recipe_folder() / f"{name}.toml"
+    is_file = name.endswith(".toml")
+    if not is_file and name not in recipe_names():
+        raise OptionError(f"unknown recipe '{name}'{suggestion(name, recipe_names())}")
+    path = Path(name) if is_file else recipe_folder() / f"{name}.toml"
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
-        if name.endswith(".toml"):
-            raise OptionError(f"recipe {name}: no such file") from error
-        close = RENAMED.get(name) or difflib.get_close_matches(name, recipe_names(), n=1)
-        hint = f"did you mean '{close[0]}'? " if close else ""
-        known = ", ".join(recipe_names())
-        raise OptionError(f"unknown recipe '{name}': {hint}known are {known}") from error
+        raise OptionError(f"recipe {name}: no such file") from error
     except (OSError, ValueError, RecursionError) as error:  # what tomllib raises on odd files
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
+    changed = with_settings(values, settings)
+    return Recipe.from_mapping({**changed, "name": name}, f"recipe {name}")
 
 
 def with_settings(values: Mapping[str, Any], settings: Sequence[str]) -> dict[str, Any]:
     """Return the sections of a recipe with single options changed; see :func:`load_recipe`."""
     changed = dict(values)
     for setting in settings:
-        _apply(changed, setting)
+        key, separator, text = setting.partition("=")
+        if not separator or not key.strip():
+            raise OptionError(f"--set {setting}: expected section.option=value")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except (ValueError, RecursionError):
+            value = text.strip()
+        *sections, option = key.strip().split(".")
+        target = changed
+        for section in sections:
+            inner = target.get(section, {})
+            inner = {"name": inner} if isinstance(inner, str) else inner  # a part by its name alone
+            if not isinstance(inner, Mapping):
+                raise OptionError(f"--set {setting}: {section} is not a section")
+            target[section] = dict(inner)
+            target = target[section]
+        if key.strip() in PART_SECTIONS and target.get("name") != value:
+            known = PART_SECTIONS[key.strip()].part(str(value)).Options.model_fields
+            for other in set(target) - set(known):  # options of the part that goes
+                del target[other]
+        target[option] = value
     return changed
-
-
-def _apply(values: dict[str, Any], setting: str) -> None:
-    """Change one option; where another part is chosen by its name, the old one's options go."""
-    key, separator, text = setting.partition("=")
-    if not separator or not key.strip():
-        raise OptionError(f"--set {setting}: expected section.option=value")
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        value = text.strip()
-    *sections, option = key.strip().split(".")
-    target: Any = values
-    for section in sections:
-        inner = target.get(section, {})
-        inner = {"name": inner} if isinstance(inner, str) else inner  # a part by its name alone
-        if not isinstance(inner, Mapping):
-            raise OptionError(f"--set {setting}: {section} is not a section")
-        target[section] = dict(inner)
-        target = target[section]
-    if option == "name" and key.strip() in PART_SECTIONS and target.get("name") != value:
-        known = PART_SECTIONS[key.strip()].part(str(value)).Options.model_fields
-        for other in set(target) - set(known):
-            del target[other]
-    target[option] = value
 
 
 PART_SECTIONS: dict[str, Registry[Any]] = {

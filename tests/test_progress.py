@@ -9,7 +9,6 @@ import pytest
 from colmap_affrect import progress
 from colmap_affrect.progress import (
     COSTS,
-    MAP_COST_PER_IMAGE,
     NUM_PLAIN_LINES,
     SILENT,
     Forecast,
@@ -38,64 +37,20 @@ def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent
     assert (lines[0], lines[-1]) == ("match: 40/400 pairs", "match: 400/400 pairs")
 
 
-MAP_COST = COSTS["map"] + MAP_COST_PER_IMAGE * 100
-"""Of each of a hundred images."""
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
-def run_stage(forecast: Forecast, clock: Clock, name: str, total: int, unit_s: float) -> None:
-    forecast.begin(name, total)
-    for _ in range(total):
-        clock.now_s += unit_s
-        forecast.advance(1)
-    forecast.end()
-
-
-def test_what_has_begun_is_measured_and_the_rest_is_guessed_from_it() -> None:
-    clock = Clock()
-    forecast = Forecast(100, 4950, clock=clock)
-    assert forecast.left_s() is None
-    forecast.begin("extract", 100)
-    for _ in range(4):
-        clock.now_s += 2.0
-        forecast.advance(1)
-        assert forecast.text() == ""  # says too little
-    clock.now_s += 2.0
-    forecast.advance(1)
-    guessed = 4950 * (COSTS["match"] + COSTS["verify"]) + 100 * MAP_COST
-    assert forecast.left_s() == pytest.approx(2.0 * (95 + guessed))
-    forecast.end()
-    run_stage(forecast, clock, "match", 4950, 0.01)
-    forecast.begin("verify", 4950)
-    clock.now_s += 10.0
-    forecast.advance(2475)
-    left_s = forecast.left_s()
-    assert left_s is not None
-    assert left_s > 10.0  # and as much again as it took until now
-    forecast.end()
-    forecast.begin("map", 100)
-    clock.now_s += 10.0
-    forecast.advance(1)
-    assert forecast.text() == ""
-
-
-def test_forecast_is_in_lines() -> None:
-    clock, lines = Clock(), io.StringIO()
-    progress = Progress(lines).with_forecast(Forecast(20, 0, clock=clock))
-    with progress.stage("extract", 20, "images") as advance:
+def test_forecast_measures_what_has_begun_and_guesses_the_rest_from_it() -> None:
+    now_s, lines = 0.0, io.StringIO()
+    forecast = Forecast({"extract": 20, "match": 190, "map": 20}, clock=lambda: now_s)
+    with Progress(lines).with_forecast(forecast).stage("extract", 20, "images") as advance:
         for _ in range(20):
-            clock.now_s += 60.0
+            now_s += 60.0
             advance(1)
+    minutes = 10 + 190 * COSTS["match"] + 20 * COSTS["map"]
     assert lines.getvalue().splitlines()[4] == (
-        "extract: 10/20 images, whole run: about 30 min left"
+        f"extract: 10/20 images, whole run: about {minutes:.0f} min left"
     )
+    forecast.begin("map", 20)
+    now_s += 600.0
+    assert forecast.text(0.5) == ""
 
 
 def test_inner_steps_are_not_counted_twice(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -360,12 +360,10 @@ def convert(options: argparse.Namespace) -> int:
 
 def recipes(options: argparse.Namespace) -> None:
     from colmap_affrect.options import described_toml
-    from colmap_affrect.recipes import RecipeOptions, load_recipe, recipe_names
+    from colmap_affrect.recipes import load_recipe, recipe_names
 
     if options.name:
-        recipe = load_recipe(options.name)
-        values = {"summary": recipe.summary, **recipe.to_mapping()}
-        show(described_toml(RecipeOptions.from_mapping(values, options.name)), end="")
+        show(described_toml(load_recipe(options.name)), end="")
         return
     for name in recipe_names():
         recipe = load_recipe(name)

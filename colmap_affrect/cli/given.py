@@ -146,7 +146,8 @@ def recipe(options: argparse.Namespace, record: Mapping[str, Any] | None = None)
     }
     others = {*Inputs.model_fields, WEIGHTS}
     values |= {key: value for key, value in record["extract"].items() if key not in others}
-    return Recipe.from_mapping(record["recipe"], with_settings(values, changes), "--config")
+    values["name"] = record["recipe"]
+    return Recipe.from_mapping(with_settings(values, changes), "--config")
 
 
 def _settings(options: argparse.Namespace, *names: str) -> list[str]:
@@ -230,7 +231,7 @@ def mapping(
     given = {**_seed(options), **({"mapper_options": native} if native else {})}
     if known and not (options.preset or options.mapper):
         return known.changed(**given)
-    recipe = recipe or Recipe("")
+    recipe = recipe or Recipe()
     return recipe.mapper_options(options.preset or "sparse", options.mapper or "", **given)
 
 
@@ -247,13 +248,13 @@ def key_values(option: str, settings: Sequence[str]) -> dict[str, str]:
 
 def changed(known: AnyOptions, options: argparse.Namespace, name: str) -> AnyOptions:
     """Return a section of the recipe with what is given of it, and by --set."""
-    from colmap_affrect.recipes import RecipeOptions, with_settings
+    from colmap_affrect.recipes import Recipe, with_settings
 
     settings = [*_settings(options, name), *options.set]
     values = with_settings({name: known.to_mapping()}, settings)
     if len(values) > 1:
         raise OptionError(f"--set: only options of {name} can be changed here")
-    found: AnyOptions = getattr(RecipeOptions.from_mapping(values, "--set"), name)
+    found: AnyOptions = getattr(Recipe.from_mapping(values, "--set"), name)
     return found
 
 

@@ -93,7 +93,7 @@ class MethodRun:
         self.verification, self.mapping = self.options.verification, self.options.mapping
         if is_colmap:
             self.verification = VerificationOptions.preset("colmap")
-            self.mapping = Recipe("").mapper_options("colmap")
+            self.mapping = Recipe().mapper_options("colmap")
         self.workspace = Workspace(self.output_path / METHODS / self.method.folder_name)
         self.database = self.workspace.database
         self.failure = self.workspace.path / "failed.txt"  # why its process ended

@@ -5,7 +5,6 @@ A field that keeps pycolmap's default asks for nothing. One that differs is hono
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +16,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.options import CUSTOM, Options, flat
-from colmap_affrect.recipes import ExtractionOptions, Recipe, RecipeOptions, load_recipe
+from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 
 Native = TypeVar("Native")  # an option class of pycolmap
 
@@ -91,17 +90,16 @@ def extraction_recipe(given: object) -> tuple[Recipe, dict[str, Any]]:
     """Return the recipe that is named or given in any form, and what pycolmap's options ask for."""
     if isinstance(given, str):
         return load_recipe(given), {}
-    if is_native(given, pycolmap.FeatureExtractionOptions, RecipeOptions):
+    if is_native(given, pycolmap.FeatureExtractionOptions, Recipe):
         asked = changes(given, pycolmap.FeatureExtractionOptions, "extraction_options")
         recipe = load_recipe("default")
         if "max_image_size" in asked:
-            size = {"max_image_size_px": asked["max_image_size"]}
-            recipe = replace(recipe, name=CUSTOM, extraction=recipe.extraction.changed(**size))
+            recipe = recipe.changed(name=CUSTOM, max_image_size_px=asked["max_image_size"])
         return recipe, asked
     if isinstance(given, Mapping):
-        return Recipe.from_mapping(CUSTOM, given, "extraction_options"), {}
+        return Recipe.from_mapping({**given, "name": CUSTOM}, "extraction_options"), {}
     if isinstance(given, ExtractionOptions):
-        return Recipe(CUSTOM, extraction=given), {}
+        return Recipe(**{**dict(given), "name": CUSTOM}), {}
     raise _not_ours(given, "extraction_options", "colmap_affrect.ExtractionOptions")
 
 

@@ -10,7 +10,7 @@ from colmap_affrect.errors import WeightsError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.options import Options, Registry, from_record
+from colmap_affrect.options import Options, Registry
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
@@ -115,11 +115,11 @@ class Context:
         others = beside.model_fields if beside else {}
         where, record = str(self.workspace.config), self.workspace.planned(stage) or {}
         values = {key: value for key, value in record.items() if key not in others}
-        return from_record(where, lambda: cls.from_mapping(values, where))
+        return cls.from_mapping(values, where)
 
     def _part(self, registry: Registry[Any], stage: str) -> Any:
         where, values = str(self.workspace.config), self.workspace.planned(stage) or {}
-        return from_record(where, lambda: registry.options(values, where=where))
+        return registry.options(values, where=where)
 
     @property
     def features(self) -> FeatureStore:

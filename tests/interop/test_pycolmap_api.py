@@ -174,7 +174,7 @@ def test_a_database_of_another_program_and_other_photographs_are_refused(
         ({"extraction_options": pycolmap.Camera()}, "Camera does not apply here"),
         ({"extraction_options": "defualt"}, "did you mean 'default'"),
         ({"reader_options": {"camera_modell": "PINHOLE"}}, "did you mean 'camera_model'"),
-        ({"camera_mode": "two"}, "mode='two' is not one of"),
+        ({"camera_mode": "two"}, "mode='two': should be 'auto'"),
         ({"image_names": ["a.png", "../x.png"]}, r"lists \.\./x\.png"),
     ],
 )

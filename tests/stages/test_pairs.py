@@ -150,7 +150,7 @@ def test_nearest_positions_take_cartesian_ones_and_images_without(rooms: Workspa
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        ({"methods": ("gps", "retrival")}, "'retrival' is not one of 'exhaustive', 'retrieval'"),
+        ({"methods": ("gps", "retrival")}, "'retrival': should be 'exhaustive', 'retrieval'"),
         ({"methods": ()}, "methods"),
         ({"num_neighbors": 0}, "num_neighbors=0"),
     ],
