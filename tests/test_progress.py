@@ -48,6 +48,7 @@ def test_forecast_measures_what_has_begun_and_guesses_the_rest_from_it() -> None
     assert lines.getvalue().splitlines()[4] == (
         f"extract: 10/20 images, whole run: about {minutes:.0f} min left"
     )
+    forecast.begin("match", 190)
     forecast.begin("map", 20)
     now_s += 600.0
     assert forecast.text(0.5) == ""
