@@ -1,4 +1,4 @@
-"""Files of hloc and deep-image-matching as those write them, and their readers, for tests."""
+"""Files of hloc as it writes them, and its readers, for tests."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def hloc_matches(path: Path, name0: str, name1: str) -> tuple[Array, Array]:
     return pairs[:, ::-1] if is_reversed else pairs, scores[rows]
 
 
-# Files as those programs write them.
+# Files as hloc writes them.
 
 
 def write_h5(path: Path, groups: Mapping[str, Datasets]) -> Path:

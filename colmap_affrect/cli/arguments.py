@@ -249,22 +249,9 @@ H5_FILES = tuple(
 )
 IMPORT_TARGET = _path("--database-path", "FILE", "the database to make; must not exist",
     required=True)  # fmt: skip
-IMPORT_FORMAT = (
-    _choice("--layout", ["auto", "hloc", "dim"],
-        "of the files; dim is deep-image-matching's (default: auto, as matches are stored)",
-        default="auto"),
-    _flag("--skip-verification", "no two-view geometries"),
-)  # fmt: skip
-EXPORT_SOURCE = OneOf(
-    _path("--output-path", "PATH", "an output folder in which matching is done",
-        dest="workspace_path"),
-    _path("--database-path", "FILE", "or any COLMAP database; a copy of it is read"),
-    required=True,
-)  # fmt: skip
-EXPORT_FORMAT = (
-    _choice("--layout", ["hloc", "dim"],
-        "of the files; dim is deep-image-matching's (default: hloc)", default="hloc"),
-)  # fmt: skip
+SKIP_VERIFICATION = _flag("--skip-verification", "no two-view geometries")
+EXPORT_SOURCE = _path("--database-path", "FILE", "any COLMAP database; a copy of it is read",
+    required=True)  # fmt: skip
 
 OLD_DATABASE = (
     _path("path", "PATH", "output folder, or any COLMAP database; a copy of it is read"),
@@ -281,7 +268,7 @@ EXPORT = (
     _value("--format", "A,B,...",
         "ply (points), text (COLMAP's), undistorted (photographs and model, for dense "
         "reconstruction), nerfstudio (the same with transforms.json, for Gaussian splatting too), "
-        "cameras (CSV), geojson (of a model that align put on earth) (default: ply,text,cameras)",
+        "cameras (CSV) (default: ply,text,cameras)",
         type=_words, default=("ply", "text", "cameras")),
     _path("--image-path", "PATH",
         "folder of the photographs, to undistort them (default: that of the run)"),

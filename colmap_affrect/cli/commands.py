@@ -219,7 +219,6 @@ def import_h5(options: argparse.Namespace) -> None:
         options.matches_path,
         options.database_path,
         cameras=given.built(options, "cameras", CameraOptions),
-        layout=options.layout,
         skip_verification=options.skip_verification,
         random_seed=options.random_seed,
         progress=given.progress(options),
@@ -231,11 +230,9 @@ def export_h5(options: argparse.Namespace) -> None:
     from colmap_affrect.interop.hdf5 import export_h5
 
     report = export_h5(
+        options.database_path,
         options.features_path,
         options.matches_path,
-        output_path=options.workspace_path,
-        database_path=options.database_path,
-        layout=options.layout,
         progress=given.progress(options),
     )
     show(report.summary())

@@ -301,7 +301,7 @@ def write_matches(
     if indices.size and (indices.min() < 0 or (indices.max(axis=0) >= counts).any()):
         raise DatabaseError(
             f"matches of images {image_id1}, {image_id2} point at keypoints that do not exist "
-            f"(largest {indices.max(axis=0).tolist()}, keypoints {counts}); run match again "
-            "with --overwrite"
+            f"(largest {indices.max(axis=0).tolist()}, keypoints {counts}); match "
+            "them again"
         )
     database.write_matches(image_id1, image_id2, indices.astype(np.uint32))

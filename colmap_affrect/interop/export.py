@@ -1,4 +1,4 @@
-"""A COLMAP model for other programs: points, text, undistorted photographs, tables, maps."""
+"""A COLMAP model for other programs: points, text, undistorted photographs, a table."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -151,34 +151,12 @@ def _cameras(source: Source, folder: Path) -> Path:
     return path
 
 
-def _geojson(source: Source, folder: Path) -> Path:
-    """Write where photographs were taken, for maps, with the direction that they look to."""
-    path, place = folder / "cameras.geojson", Georeference.read(source.path)
-    if place is None:
-        raise OptionError(
-            f"{source.path}: has no place on earth, which GeoJSON needs; align it first by "
-            "'colmap-affrect align' with --gps, or positions with latitude and longitude"
-        )
-    features = []
-    for image in source.images():
-        latitude, longitude, altitude = place.on_earth(image.projection_center())
-        east, north, _ = image.viewing_direction()
-        heading = float(np.degrees(np.arctan2(east, north)) % 360.0)
-        point = {"type": "Point", "coordinates": [longitude, latitude, altitude]}
-        about = {"name": image.name, "heading_deg": heading}
-        features.append({"type": "Feature", "geometry": point, "properties": about})
-    content = {"type": "FeatureCollection", "features": features}
-    replace_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-    return path
-
-
 FORMATS: dict[str, tuple[Callable[[Source, Path], Path], tuple[str, ...]]] = {
     "ply": (_points, ("points3D.ply",)),
     "text": (_text, ("text",)),
     "undistorted": (_undistorted, (DENSE,)),
     "nerfstudio": (_nerfstudio, (DENSE,)),
     "cameras": (_cameras, ("cameras.csv",)),
-    "geojson": (_geojson, ("cameras.geojson",)),
 }
 """What writes each format into a folder, and what it leaves there; ``undistorted`` comes before
 ``nerfstudio``, which uses its folder."""

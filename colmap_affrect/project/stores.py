@@ -215,7 +215,7 @@ def pair_key(name1: str, name2: str) -> str:
     return f"{name1.replace('/', '-')}/{name2.replace('/', '-')}"
 
 
-def hloc_matches(pair: PairMatches) -> dict[str, NDArray[np.generic]]:
+def hloc_matches(pair: PairMatches) -> dict[str, NDArray[Any]]:
     """Return the datasets that hloc has for a pair; in 32 bits where 16 do not suffice."""
     matches0 = np.full(pair.num_keypoints1, -1, np.int64)
     scores0 = np.zeros(pair.num_keypoints1, np.float16)

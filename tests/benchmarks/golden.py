@@ -154,17 +154,18 @@ def drop_in_digests(work: Path) -> dict[str, str]:
 
 
 def interop_digests(work: Path, run: Path) -> dict[str, str]:
-    """Export an output folder in both layouts, and import one of them again."""
+    """Export the database of an output folder to hloc's files, and import the folder's own."""
     work.mkdir(parents=True)
-    command, found = ("-m", "colmap_affrect"), {}
-    for layout in ("dim", "hloc"):
-        paths = [work / f"{kind}-{layout}.h5" for kind in ("features", "matches")]
-        files = ["--features-path", paths[0], "--matches-path", paths[1]]
-        python(*command, "export-h5", "-q", "--output-path", run, *files, "--layout", layout)
-        found |= {path.stem: h5_digest(path) for path in paths}
-    given = ["--image-path", COURTYARD / "images", *files, "--database-path", work / "imported.db"]
+    made, own = (
+        ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+        for folder in (work, run)
+    )
+    command = ("-m", "colmap_affrect")
+    python(*command, "export-h5", "-q", "--database-path", run / "database.db", *made)
+    given = ["--image-path", COURTYARD / "images", *own, "--database-path", work / "imported.db"]
     python(*command, "import-h5", "-q", *given)
-    return found | database_digests(work / "imported.db")
+    exported = {f"{kind}-hloc": h5_digest(work / f"{kind}.h5") for kind in ("features", "matches")}
+    return exported | database_digests(work / "imported.db")
 
 
 Job = tuple[Path, list[str], list[str]]

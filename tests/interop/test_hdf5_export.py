@@ -1,4 +1,4 @@
-"""Output folders and databases become files of hloc and deep-image-matching."""
+"""Databases become files of hloc, and output folders have such files."""
 
 from __future__ import annotations
 
@@ -70,23 +70,23 @@ def test_our_own_files_are_read_by_hlocs_rules(finished: tuple[Path, Path]) -> N
         assert_array_equal(turned, found[:, ::-1])
 
 
-@pytest.mark.parametrize("layout", ["hloc", "dim"])
 @pytest.mark.parametrize("source", ["folder", "database"])
-def test_export_and_import_give_the_same_database(
-    finished: tuple[Path, Path], tmp_path: Path, source: str, layout: str
+def test_files_of_a_run_and_of_its_database_give_the_same_database(
+    finished: tuple[Path, Path], tmp_path: Path, source: str
 ) -> None:
     photos, out = finished
     before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
-    files = tmp_path / "features.h5", tmp_path / "matches.h5"
-    origin = {"output_path": out} if source == "folder" else {"database_path": out / "database.db"}
-    exported = export_h5(*files, layout=layout, **origin)
+    files = out / "features.h5", out / "matches.h5"
+    if source == "database":
+        files = tmp_path / "features.h5", tmp_path / "matches.h5"
+        exported = export_h5(out / "database.db", *files)
+    imported = import_h5(photos, *files, tmp_path / "new.db", cameras=PINHOLE)
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
-    assert {path.name for path in tmp_path.iterdir()} == {"features.h5", "matches.h5"}
-    imported = import_h5(photos, *files, tmp_path / "new.db", cameras=PINHOLE, layout=layout)
-    assert exported.num_keypoints == imported.num_keypoints
-    assert exported.num_matches == imported.num_matches
-    assert (imported.num_pairs, imported.num_verified, imported.notes) == (6, 6, ())
-    assert {path.name for path in tmp_path.iterdir()} == {"features.h5", "matches.h5", "new.db"}
+    assert (imported.num_pairs, imported.num_verified) == (6, 6)
+    if source == "database":
+        assert exported.num_keypoints == imported.num_keypoints
+        assert exported.num_matches == imported.num_matches
+        assert {path.name for path in tmp_path.iterdir()} == {"features.h5", "matches.h5", "new.db"}
     keypoints, pairs = read_database(out / "database.db")
     new_keypoints, new_pairs = read_database(tmp_path / "new.db")
     assert new_pairs == pairs
@@ -102,7 +102,7 @@ def test_indices_beyond_16_bits_are_written_in_32(
     many = np.column_stack([np.linspace(0.0, 60.0, count), np.zeros(count)])
     pairs = {("a.png", "b.png"): [[0, count - 1], [1, 5]]}
     make_database(tmp_path / "x.db", {"a.png": many[:2], "b.png": many}, pairs).close()
-    export_h5(*targets, database_path=tmp_path / "x.db")
+    export_h5(tmp_path / "x.db", *targets)
     with h5py.File(targets[1], "r") as file:
         assert file["a.png/b.png/matches0"].dtype == dtype
         assert file["a.png/b.png/matches0"][()].tolist() == [count - 1, 5]
@@ -123,50 +123,37 @@ def test_descriptors_of_a_database_become_real_ones(
         2, pycolmap.FeatureDescriptors(type=aliked, data=reals.view(np.uint8))
     )
     database.close()
-    export_h5(*targets, database_path=tmp_path / "x.db")
+    export_h5(tmp_path / "x.db", *targets)
     with h5py.File(targets[0], "r") as file:
         assert_array_equal(file["a.png/descriptors"][()], bytes128.T / np.float32(512))
         assert_array_equal(file["b.png/descriptors"][()], reals.T)
         assert "descriptors" not in file["c.png"]
 
 
-def test_second_match_of_a_keypoint_is_left_out_of_hlocs_files_only(
-    tmp_path: Path, targets: tuple[Path, Path]
-) -> None:
-    indices = [[1, 2], [0, 1], [1, 0]]
+def test_second_match_of_a_keypoint_is_left_out(tmp_path: Path, targets: tuple[Path, Path]) -> None:
     columns = {name: points(3) for name in ("a.png", "b.png")}
-    make_database(tmp_path / "x.db", columns, {("a.png", "b.png"): indices}).close()
-    report = export_h5(*targets, database_path=tmp_path / "x.db")
-    assert report.num_matches == 2
-    assert "1 matches are left out" in report.summary()
+    pairs = {("a.png", "b.png"): [[1, 2], [0, 1], [1, 0]]}
+    make_database(tmp_path / "x.db", columns, pairs).close()
+    export_h5(tmp_path / "x.db", *targets)
     assert hloc_matches(targets[1], "a.png", "b.png")[0].tolist() == [[0, 1], [1, 2]]
-    for path in targets:
-        path.unlink()
-    report = export_h5(*targets, database_path=tmp_path / "x.db", layout="dim")
-    assert (report.num_matches, report.notes) == (3, ())
-    with h5py.File(targets[1], "r") as file:
-        assert file["a.png/b.png"][()].tolist() == indices
-    with h5py.File(targets[0], "r") as file:
-        assert file["a.png/image_size"][()].tolist() == [48, 64]
 
 
 @pytest.mark.parametrize(
-    ("names", "layout", "message"),
+    ("names", "message"),
     [
-        (["a/b-c.png", "a-b/c.png"], "hloc", "have the same key"),
-        (["a/b.png", "c/b.png"], "dim", r"which these share: a/b\.png, c/b\.png"),
-        (["a.png", "a.png/b.png"], "hloc", r"a\.png: is an image and the folder of another"),
-        (["../a.png"], "hloc", r"no plain relative paths: \.\./a\.png"),
-        (["/photos/a.png"], "hloc", r"no plain relative paths: /photos/a\.png"),
-        (["./a.png"], "dim", r"no plain relative paths: \./a\.png"),
+        (["a/b-c.png", "a-b/c.png"], "have the same key"),
+        (["a.png", "a.png/b.png"], r"a\.png: is an image and the folder of another"),
+        (["../a.png"], r"no plain relative paths: \.\./a\.png"),
+        (["/photos/a.png"], r"no plain relative paths: /photos/a\.png"),
+        (["./a.png"], r"no plain relative paths: \./a\.png"),
     ],
 )
-def test_names_that_the_layout_cannot_hold_are_refused(
-    tmp_path: Path, targets: tuple[Path, Path], names: list[str], layout: str, message: str
+def test_names_that_hlocs_files_cannot_hold_are_refused(
+    tmp_path: Path, targets: tuple[Path, Path], names: list[str], message: str
 ) -> None:
     make_database(tmp_path / "x.db", {name: points(1) for name in names}, {}).close()
     with pytest.raises(StoreError, match=message) as error:
-        export_h5(*targets, database_path=tmp_path / "x.db", layout=layout)
+        export_h5(tmp_path / "x.db", *targets)
     one_line(error)
     assert {path.name for path in tmp_path.iterdir()} == {"x.db"}
 
@@ -177,35 +164,31 @@ def test_wrong_database_is_refused_and_no_half_file_stays(
     columns = {"a.png": points(2), "b.png": points(2)}
     make_database(tmp_path / "range.db", columns, {("a.png", "b.png"): [[1, 2]]}).close()
     with pytest.raises(DatabaseError, match=r"range\.db: pairs with matches of keypoints that do"):
-        export_h5(*targets, database_path=tmp_path / "range.db")
+        export_h5(tmp_path / "range.db", *targets)
     database = make_database(tmp_path / "rows.db", {"a.png": points(2)}, {})
     data = np.zeros((3, 128), np.uint8)
     sift = pycolmap.FeatureExtractorType.SIFT
     database.write_descriptors(1, pycolmap.FeatureDescriptors(type=sift, data=data))
     database.close()
     with pytest.raises(DatabaseError, match=r"a\.png has 2 keypoints and 3 descriptors"):
-        export_h5(*targets, database_path=tmp_path / "rows.db")
+        export_h5(tmp_path / "rows.db", *targets)
     with pytest.raises(OptionError, match="no such file"):
-        export_h5(*targets, database_path=tmp_path / "none.db")
+        export_h5(tmp_path / "none.db", *targets)
     assert {path.suffix for path in tmp_path.iterdir()} == {".db"}
 
 
-def test_export_overwrites_nothing_and_needs_one_source(
-    finished: tuple[Path, Path], targets: tuple[Path, Path]
-) -> None:
+def test_export_overwrites_nothing(finished: tuple[Path, Path], targets: tuple[Path, Path]) -> None:
     features, matches = targets
-    _, out = finished
+    database = finished[1] / "database.db"
     matches.write_bytes(b"mine")
     with pytest.raises(OptionError, match=r"matches\.h5: exists"):
-        export_h5(features, matches, output_path=out)
+        export_h5(database, features, matches)
     assert matches.read_bytes() == b"mine"
     assert not features.exists()
-    with pytest.raises(StoreError, match="need a file each"):
-        export_h5(features, features, output_path=out)
+    with pytest.raises(OptionError, match="need a file each"):
+        export_h5(database, features, features)
     matches.unlink()
-    with pytest.raises(OptionError, match="either an output folder or a database"):
-        export_h5(features, matches)
-    made = export_h5(features.parent / "new" / "f.h5", matches, output_path=out)
+    made = export_h5(database, features.parent / "new" / "f.h5", matches)
     assert (features.parent / "new" / "f.h5").is_file()
     assert made.num_images == 4
 
@@ -218,7 +201,7 @@ from colmap_affrect.interop.hdf5 import export_h5
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
 try:
-    export_h5(Path(sys.argv[1]), Path(sys.argv[2]), output_path=Path(sys.argv[3]))
+    export_h5(Path(sys.argv[3]), Path(sys.argv[1]), Path(sys.argv[2]))
 except AffrectError as error:
     print(error)
 """
@@ -227,7 +210,13 @@ except AffrectError as error:
 def test_full_disk_is_one_line_and_leaves_nothing(
     finished: tuple[Path, Path], targets: tuple[Path, Path]
 ) -> None:
-    arguments = [sys.executable, "-c", FULL_DISK, *map(str, targets), str(finished[1])]
+    arguments = [
+        sys.executable,
+        "-c",
+        FULL_DISK,
+        *map(str, targets),
+        str(finished[1] / "database.db"),
+    ]
     done = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"{targets[0]}: cannot be written (")
@@ -242,9 +231,9 @@ def test_commands_export_and_import_and_print_no_more_than_progress(
     files = (
         "--features-path", tmp_path / "f.h5", "--matches-path", tmp_path / "m.h5",
     )  # fmt: skip
-    done = call("export-h5", "--output-path", out, *files, "--quiet")
+    done = call("export-h5", "--database-path", out / "database.db", *files, "--quiet")
     assert (done.code, done.stderr) == (0, [])
-    assert done.stdout.startswith("exported (hloc): 4 images, ")
+    assert done.stdout.startswith("exported: 4 images, ")
     done = call(
         "import-h5", "--image-path", photos, *files, "--database-path", tmp_path / "new.db",
         "--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS,

@@ -67,7 +67,10 @@ def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(photos, folder / "photos")
     files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
     out = folder / "out"
-    for words in (run_words(folder, out), ["export-h5", "--output-path", out, *files]):
+    for words in (
+        run_words(folder, out),
+        ["export-h5", "--database-path", out / "database.db", *files],
+    ):
         assert run_in_process_of_its_own(*words).code == 0
     shutil.copy(out / "database.db", folder / "any.db")
     for name in ("plain", "lens"):
@@ -102,7 +105,7 @@ NAMES = (
 
 RESULTS = {
     "ply": "points3D.ply", "text": "text", "undistorted": "dense", "nerfstudio": "dense",
-    "cameras": "cameras.csv", "geojson": "cameras.geojson",
+    "cameras": "cameras.csv",
 }  # fmt: skip
 """What each format of ``export`` writes."""
 
@@ -114,7 +117,7 @@ def exports(base: Path, photograph: str) -> dict[str, tuple[Words, str]]:
     new_files = ["--features-path", "{out}/features.h5", "--matches-path", "{out}/matches.h5"]
     assert RESULTS.keys() == FORMATS.keys()
     found: dict[str, tuple[Words, str]] = {}
-    for form, name in {**RESULTS, "ply,text,cameras,nerfstudio,geojson": "text"}.items():
+    for form, name in {**RESULTS, "ply,text,cameras,nerfstudio": "text"}.items():
         for model in ("plain", "lens"):
             given = ["--model-path", base / model, *images, "--format", form]
             found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)
