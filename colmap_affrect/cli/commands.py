@@ -240,12 +240,9 @@ def export_h5(options: argparse.Namespace) -> None:
 
 def export_database(options: argparse.Namespace) -> None:
     from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
-    from colmap_affrect.stages.mend import edits_of
 
     path = Workspace(options.path).database if options.path.is_dir() else options.path
     notes = export_database(path, options.database_path)
-    if options.path.is_dir() and (edits := str(edits_of(path) or "")):
-        notes.append(f"{path} was changed since the last run ({edits}); 'map' there mends it")
     notes.append(
         "then, for few photographs (the folder of models must be there): colmap mapper "
         f"--database_path {options.database_path} --image_path PHOTOS --output_path MODELS "

@@ -200,7 +200,8 @@ def context(options: argparse.Namespace) -> Iterator[Context]:
         found = Context(workspace, resources(options), where, progress(options))
         is_first = options.command == "extract"
         discards = is_first and options.overwrite
-        with watched(found, follows=not is_first, discards=discards):
+        maps = options.command == "map"
+        with watched(found, follows=not is_first, maps=maps, discards=discards):
             yield found
 
 

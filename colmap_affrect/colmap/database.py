@@ -44,27 +44,11 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         raise DatabaseError(
             f"{path}: not a usable COLMAP database, or in use by another program ({error})"
         ) from error
-    begun = _size_of_log(path)
     try:
         with closing(database):
-            try:
-                yield database
-            finally:
-                if begun is None or _size_of_log(path) != begun:
-                    working_seal(path).unlink(missing_ok=True)
+            yield database
     except RuntimeError as error:
         raise cannot_write(path, error) from error
-
-
-def _size_of_log(path: Path) -> int | None:
-    """Return the size of the log of an open database, which grows with all that is written."""
-    log = path.with_name(path.name + "-wal")
-    return log.stat().st_size if log.exists() else None
-
-
-def working_seal(path: Path) -> Path:
-    """Return the seal (:mod:`colmap_affrect.colmap.seal`) while a command works with a database."""
-    return path.with_name(path.name + ".seal-open")
 
 
 def write_frame(

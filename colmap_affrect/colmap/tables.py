@@ -1,5 +1,6 @@
 """What a COLMAP database of any version holds, read by SQLite: COLMAP migrates what it opens."""
 
+import hashlib
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
@@ -15,6 +16,12 @@ HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished chan
 DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # what sqlite3 raises, also quoting odd bytes
 MAX_NUM_IMAGES = 2**31 - 1  # an id of a pair is the smaller image id times this, plus the larger
 SENSOR_CAMERA = 0
+
+DIGESTED = (
+    "cameras", "rigs", "rig_sensors", "frames", "frame_data", "images", "pose_priors", "keypoints",
+    "matches", "two_view_geometries",
+)  # fmt: skip
+"""Tables that decide what is mapped."""
 
 
 @contextmanager
@@ -126,6 +133,22 @@ def rows_of(connection: sqlite3.Connection, columns: str, table: str) -> Iterabl
     present = ", ".join(name if name in known | {"rowid"} else "0" for name in columns.split())
     # All names are those of COLMAP's tables, written down in this package.
     return connection.execute(f"SELECT {present} FROM {table}")  # noqa: S608
+
+
+def rows_digest(path: Path) -> str:
+    """Return a SHA-256 of all rows but descriptors; DatabaseError where they cannot be read."""
+    digest = hashlib.sha256()
+    with open_read_only(path) as connection:
+        connection.text_factory = bytes
+        names = ", ".join(f"'{table}'" for table in DIGESTED)
+        made = f"sql FROM sqlite_master WHERE tbl_name IN ({names}) ORDER BY name"
+        queries = ["* FROM pragma_user_version", made, *(f"* FROM {name}" for name in DIGESTED)]
+        for query in queries:
+            for row in connection.execute(f"SELECT {query}"):
+                for value in row:
+                    digest.update(value if isinstance(value, bytes) else repr(value).encode())
+                    digest.update(b"|")
+    return digest.hexdigest()
 
 
 def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:

@@ -33,13 +33,18 @@ def _stamp(path: Path) -> str:
     return f"{there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
 
 
+def stamp_of(paths: Iterable[Path]) -> str:
+    """Return sizes and times of files: while these stay, nobody has to read them."""
+    return ", ".join(_or_empty(_stamp, path) for path in paths)
+
+
 def content_of(paths: Iterable[Path], known: Content | None = None) -> Content:
     """Return what files hold, without reading them if sizes and times are those that are known.
 
     One that cannot be read counts as empty.
     """
     files = list(paths)
-    stamp = ", ".join(_or_empty(_stamp, path) for path in files)
+    stamp = stamp_of(files)
     if known and known.stamp == stamp:
         return known
     digests = [_or_empty(file_sha256, path) for path in files]

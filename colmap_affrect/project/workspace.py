@@ -45,7 +45,6 @@ OWN_STEMS = {
 }  # fmt: skip
 """How names of files and folders begin that are written here."""
 
-SEAL_SUFFIXES = (".seal", ".seal-open")  # beside a database
 NOT_IN_DIGESTS = ("image_path", "image_list_path", "from_database", "cameras")
 
 
@@ -63,11 +62,11 @@ class Workspace:
         """Name the folder, and a database of the user in the place of one there; never removed."""
         self.path, self.users_database = path, users_database
         self.database = users_database or path / "database.db"
+        self.seal = path / "database.db.seal"  # what the last command left in it
         self.features = path / "features.h5"  # by image
         self.matches = path / "matches.h5"  # raw ones by pair
         self.guided = path / "guided.h5"  # what guided matching found, by pair
         self.pairs = path / "pairs.txt"  # those to match
-        self.deleted_pairs = path / "pairs.deleted.txt"  # but for those deleted in the database
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
         self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
         self.depth = path / "depth"  # folder of the depth maps that a network made
@@ -228,11 +227,11 @@ class Workspace:
         """Return the digest of the files that something was made from, empty if not known."""
         return str(self.recorded().get(MADE_FROM, {}).get(what, ""))
 
-    def record_made_from(self, what: str, digest: str) -> None:
-        """Put on record what something is made from now."""
-        if self.made_from(what) != digest:
-            record = self.recorded()
-            known = {**record.get(MADE_FROM, {}), what: digest}
+    def record_made_from(self, **digests: str) -> None:
+        """Put on record what things are made from now."""
+        record = self.recorded()
+        known = {**record.get(MADE_FROM, {}), **digests}
+        if any(self.made_from(what) != digest for what, digest in digests.items()):
             self._write_record({**record, MADE_FROM: known})
 
     def models_made_from(self) -> str:
@@ -296,7 +295,7 @@ class Workspace:
 
     def forget_models(self) -> None:
         """Have the models made anew, which stay until others take their place."""
-        self.record_made_from("map", "")
+        self.record_made_from(map="")
 
     @property
     def _remedy(self) -> str:
@@ -349,13 +348,9 @@ class Workspace:
         made = {
             "map": [self.sparse, self.snapshots, self.report, self.page],
             "guide": [self.guided],
-            "verify": [
-                self.cameras,
-                *database_files(self.database),
-                *(self.path / f"database.db{suffix}" for suffix in SEAL_SUFFIXES),
-            ],
+            "verify": [self.cameras, self.seal, *database_files(self.database)],
             "match": [self.matches],
-            "pairs": [self.pairs, self.deleted_pairs],
+            "pairs": [self.pairs],
             "extract": [self.features],
         }
         later = STAGES[STAGES.index(stage) :]

@@ -49,7 +49,7 @@ def copy_verified(
         if before:
             warnings[str(source)] = "has changed; its copy and the models are made anew"
         workspace.rewind()
-        workspace.record_made_from("copy", digest)
+        workspace.record_made_from(copy=digest)
     if not workspace.database.exists():
         copy_database(source, workspace.database, FATAL, add_frames)
     for name, what in warnings.items():

@@ -320,7 +320,7 @@ def _forget_changed(
     left = known.keys() & contents.keys() - set(changed)
     if other := {name: contents[name] for name in left if known[name] != contents[name]}:
         store.record_contents(other)
-    workspace.record_made_from("cameras", cameras)
+    workspace.record_made_from(cameras=cameras)
     if not lines:
         return {}
     return {inputs.image_path: f"{', '.join(lines)}; all that hangs on them is made again"}

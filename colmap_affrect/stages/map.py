@@ -78,7 +78,7 @@ def map_images(
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
     warnings = {}
-    workspace.record_made_from("map", inputs)
+    workspace.record_made_from(map=inputs)
     if extend and existing and existing.num_other_keypoints:
         warnings[str(extend.model_path)] = (
             f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "

@@ -2,12 +2,10 @@
 
 import logging
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from itertools import combinations
 from pathlib import Path
-
-import numpy as np
 
 from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import PairListError
@@ -15,10 +13,8 @@ from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.pairs.lists import read_pairs, sequence_pairs, write_pairs
 from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
-from colmap_affrect.project.atomic_files import replace_lines
 from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import write_images_and_keypoints
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching
@@ -71,7 +67,7 @@ def choose_pairs(
     pairs |= kept | _similar_pairs(context, options, kept)
     warnings = _forget_lost(context, there - pairs)
     write_pairs(workspace.pairs, sorted(pairs))
-    workspace.record_made_from("pairs", digest)
+    workspace.record_made_from(pairs=digest)
     return StageReport("pairs", time.perf_counter() - start, len(pairs), warnings=warnings)
 
 
@@ -87,7 +83,7 @@ def _all_pairs(
         logger.warning(MANY_PAIRS, len(names), count)
     workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
     write_pairs(workspace.pairs, combinations(names, 2), names)
-    workspace.record_made_from("pairs", "")
+    workspace.record_made_from(pairs="")
     return StageReport("pairs", time.perf_counter() - start, count)
 
 
@@ -154,7 +150,7 @@ def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
 
 
 def listed_pairs(context: Context) -> PairList:
-    """Return the pairs of the list whose images have features, but for deleted ones."""
+    """Return the pairs of the list whose images have features."""
     context.workspace.require("pairs")
     if not context.workspace.pairs.exists():
         raise PairListError(
@@ -162,22 +158,4 @@ def listed_pairs(context: Context) -> PairList:
             "'colmap-affrect pairs' and then match again"
         )
     names = context.features.names()
-    pairs = read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())
-    if deleted := deleted_pairs(context.workspace):
-        return pairs.at(np.array([frozenset(pair) not in deleted for pair in pairs], np.bool_))
-    return pairs
-
-
-def deleted_pairs(workspace: Workspace) -> set[frozenset[str]]:
-    """Return the pairs that somebody has deleted in the database."""
-    if not workspace.deleted_pairs.exists():
-        return set()
-    text = workspace.deleted_pairs.read_text(encoding="utf-8", errors="replace")
-    return {frozenset(line.split("\t")) for line in text.splitlines()}
-
-
-def delete_pairs(workspace: Workspace, pairs: Iterable[Pair]) -> None:
-    """Have pairs left out of the list from now on, until it is made anew with ``overwrite``."""
-    if new := set(map(frozenset, pairs)):
-        lines = sorted("\t".join(sorted(pair)) + "\n" for pair in deleted_pairs(workspace) | new)
-        replace_lines(workspace.deleted_pairs, lines)
+    return read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())

@@ -154,7 +154,7 @@ def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     target = ["--model-path", str(model), "--output-path", str(tmp_path / "new"), "--format=text"]
     for inputs in (None, "0" * 64):  # and where mapping would begin anew
         if inputs:
-            Workspace(folders.out).record_made_from("map", inputs)
+            Workspace(folders.out).record_made_from(map=inputs)
         for arguments in (["map", "--output-path", out], ["export", *target]):
             assert main([*arguments, "--quiet"]) == 1
             (line,) = capsys.readouterr().err.splitlines()

@@ -193,7 +193,7 @@ def test_models_that_somebody_put_beside_ours_are_not_removed(
 
 def test_what_models_were_made_from_is_on_record_while_they_are_there(workspace: Workspace) -> None:
     workspace.record_options("extract", OPTIONS)
-    workspace.record_made_from("map", "ab")
+    workspace.record_made_from(map="ab")
     assert workspace.models_made_from() == ""
     workspace.sparse.mkdir()
     assert Workspace(workspace.path).models_made_from() == "ab"

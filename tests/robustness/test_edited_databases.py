@@ -1,4 +1,4 @@
-"""The database of a finished run that others change: mended from the stores, or kept and said."""
+"""The database of a finished run that others change: made again from the stores, or mapped so."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command import Call, on_photographs
 from damaged import Harm, cut, damage, execute, noise
@@ -15,10 +14,10 @@ from results import database_content, model_names, results
 from small_scene import write_photographs
 
 from colmap_affrect.cli import main
-from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.project.workspace import Workspace
 
-FIRST_PAIR = "pair_id = (SELECT min(pair_id) FROM matches)"
+LAST_PAIR = "pair_id = (SELECT max(pair_id) FROM matches)"
 RENAMED = "UPDATE images SET name = 'x.png' WHERE image_id = 1"
 Change = Callable[[Path], object]
 
@@ -36,30 +35,20 @@ def empty(path: Path) -> None:
     assert image_ids(path) == {}  # which makes it
 
 
-MENDED: dict[str, tuple[Change, str]] = {
-    "image renamed": (sql(RENAMED), "was changed since the last run (images: 1 changed (x.png)"),
-    "image added": (sql("INSERT INTO images (name, camera_id) VALUES ('x', 1)"), "1 added (x)"),
-    "keypoints zero": (
-        sql("UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = 2"),
-        "keypoints: 1 changed (b c.png)",
-    ),
-    "camera of another size": (sql("UPDATE cameras SET width = 100"), "cameras: 3 changed"),
-    "camera of no size": (sql("UPDATE cameras SET width = 'wide'"), "(damaged (invalid"),
-    "other geometry": (
-        sql(f"UPDATE two_view_geometries SET F = zeroblob(72) WHERE {FIRST_PAIR}"),
-        "geometries: 1 changed",
-    ),
-    "table dropped": (sql("DROP TABLE frames"), "no such table: frames"),
-    "trigger": (
-        sql("CREATE TRIGGER t AFTER INSERT ON matches BEGIN DELETE FROM images; END"),
-        "its tables are others",
-    ),
-    "noise": (by_chance(noise), ""),
-    "cut": (by_chance(cut), ""),
-    "missing": (Path.unlink, "it is missing"),
-    "empty": (empty, "images: 3 gone"),
+CHANGES: dict[str, Change] = {
+    "image renamed": sql(RENAMED),
+    "pair deleted": sql(f"DELETE FROM matches WHERE {LAST_PAIR}"),
+    "other keypoints": sql("UPDATE keypoints SET data = zeroblob(length(data))"),
+    "other geometry": sql(f"UPDATE two_view_geometries SET F = zeroblob(72) WHERE {LAST_PAIR}"),
+    "other camera": sql("UPDATE cameras SET params = zeroblob(length(params))"),
+    "camera of no size": sql("UPDATE cameras SET width = 'wide'"),
+    "table dropped": sql("DROP TABLE frames"),
+    "trigger": sql("CREATE TRIGGER t AFTER INSERT ON matches BEGIN DELETE FROM images; END"),
+    "noise": by_chance(noise),
+    "cut": by_chance(cut),
+    "missing": Path.unlink,
+    "empty": empty,
 }
-"""What is done to a database, and what is said of it."""
 
 
 @pytest.fixture(scope="module")
@@ -93,59 +82,47 @@ def again(finished: Path, out: Path, call: Call) -> Callable[[str], list[str]]:
 Again = Callable[[str], list[str]]
 
 
-@pytest.mark.parametrize("case", MENDED)
+@pytest.mark.parametrize("case", CHANGES)
 def test_what_the_stores_hold_is_made_again(
     finished: Path, out: Path, again: Again, case: str
 ) -> None:
-    change, said = MENDED[case]
-    change(out / "database.db")
-    warnings = again("run")
-    assert len(warnings) == 1 or not said
-    assert said in "".join(warnings)
-    assert results(out) == results(finished / "out")
-    assert (out / "database.changed.db").exists() == (case != "missing")  # what was there
-    assert again("map") == []
-
-
-@pytest.mark.parametrize("table", ["matches", "two_view_geometries"])
-def test_deleted_pairs_stay_deleted(finished: Path, out: Path, again: Again, table: str) -> None:
-    execute(out / "database.db", f"DELETE FROM {table} WHERE {FIRST_PAIR}")
+    CHANGES[case](out / "database.db")
     (warning,) = again("run")
-    assert "which is kept: 1 pair deleted (a.png - b c.png)" in warning
-    execute(out / "database.db", RENAMED)  # all is made again
-    for command in ("map", "escalate", "guide", "run"):
-        again(command)
-        found = database_content(out / "database.db")
-        assert len(found["raw matches"]) == len(found["inliers"]) == 2
-    again("pairs")
-    (out / "pairs.deleted.txt").unlink()
-    again("run")
+    why, kept = "was changed since the last run", out / "database.changed.db"
+    if case == "missing":
+        why, kept = "is missing", out / "database.db"
+    assert f"database.db: {why}; it is made again from features.h5 and matches.h5" in warning
+    assert kept.exists()
+    assert results(out) == results(finished / "out")
+    assert again("run") == again("map") == []
+
+
+def test_database_that_was_touched_or_left_by_a_killed_command_is_used(
+    finished: Path, out: Path, again: Again
+) -> None:
+    for harmless in (Path.touch, image_ids, sql("VACUUM"), sql("DELETE FROM descriptors")):
+        harmless(out / "database.db")
+        assert again("run") == []
+    Workspace(out).seal.unlink()
+    assert again("run") == []
     assert results(out) == results(finished / "out")
 
 
-def test_priors_and_cameras_of_others_are_kept(out: Path, again: Again) -> None:
+def test_map_maps_a_changed_database_as_it_is(out: Path, again: Again, call: Call) -> None:
     path = out / "database.db"
-    execute(path, "INSERT INTO pose_priors SELECT 1, 1, 1, 0, zeroblob(24), zeroblob(72), NULL, 0")
-    with open_database(path) as database:
-        camera = database.read_all_cameras()[0]
-        camera.params = camera.params * 1.02
-        database.update_camera(camera)
-    (warning,) = again("map")
-    assert "which is kept: pose priors, intrinsics of cameras 1" in warning
-    assert again("run") == []
-    with open_database(path) as database:
-        assert database.read_camera(camera.camera_id).params.tolist() == camera.params.tolist()
-        assert len(database.read_all_pose_priors()) == 1
-
-
-def test_pairs_of_other_programs_are_kept(finished: Path, tmp_path: Path, call: Call) -> None:
-    arguments = on_photographs(finished / "photos", tmp_path / "out")
-    assert call("extract", "-q", *arguments).code == 0
-    with open_database(tmp_path / "out" / "database.db") as database:
-        database.write_matches(1, 2, np.array([[0, 1], [1, 0]], np.uint32))
-    assert "which is kept: 1 pair more" in call("extract", *arguments).stderr[0]
-    with open_database(tmp_path / "out" / "database.db") as database:
-        assert database.read_matches(1, 2).tolist() == [[0, 1], [1, 0]]
+    execute(path, f"DELETE FROM two_view_geometries WHERE {LAST_PAIR}")
+    changed = database_content(path)
+    for _ in range(2):
+        (warning,) = again("map")
+        assert f"{path}: was changed since the last run, and is mapped as it is" in warning
+    assert database_content(path) == changed
+    kept, other = out / "database.changed.db", ["--output-path", out.with_name("other")]
+    assert f"'colmap-affrect map --from-database {kept} --output-path OTHER'" in again("guide")[0]
+    assert len(database_content(path)["inliers"]) == 3
+    assert call("map", "-q", "--from-database", kept, *other).code == 0
+    execute(path, "UPDATE matches SET data = zeroblob(1)")
+    ended = call("map", "--output-path", out)
+    assert (ended.code, len(ended.stderr)) == (1, 1)
 
 
 def test_copies_are_made_again_from_the_original(
@@ -160,18 +137,12 @@ def test_copies_are_made_again_from_the_original(
     paths = ["--output-path", workspace.path]
     assert call("map", "-q", "--from-database", original, *paths).code == 0
     before = content()
-    changes: list[tuple[str, list[object]]] = [
-        (RENAMED, []),
-        ("UPDATE keypoints SET data = zeroblob(length(data))", ["--from-database", original]),
-    ]
-    for statement, given in changes:
-        execute(workspace.database, statement)
-        ended = call("map", *given, *paths)
-        assert ended.code == 0
-        assert f"is made again from {original}" in ended.stderr[0]
-        assert content() == before
-    original.unlink()
     execute(workspace.database, RENAMED)
-    ended = call("map", *paths)
-    assert (ended.code, len(ended.stderr)) == (1, 1)
-    assert f"and {original} is gone" in ended.errors[0]
+    assert "is mapped as it is" in call("map", *paths).stderr[0]
+    ended = call("map", "--from-database", original, *paths)
+    assert ended.code == 0
+    assert f"it is made again from {original}" in ended.stderr[0]
+    assert content() == before
+    workspace.database.unlink()
+    assert f"is missing; it is made again from {original}" in call("map", *paths).stderr[0]
+    assert content() == before

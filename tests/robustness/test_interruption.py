@@ -268,7 +268,6 @@ def test_model_that_does_not_fit_on_the_disk_is_not_taken_for_whole(
     shutil.copytree(cases[0].folder / "out", workspace.path)
     shutil.rmtree(workspace.sparse)
     workspace.report.unlink()
-    (workspace.path / "database.db.seal").unlink()  # as after a kill
     with file_size_limit(50_000):
         ended = call(*cases[0].arguments(workspace.path))
     assert_says_what_to_do(ended, workspace.path / "sparse.partial" / "0")

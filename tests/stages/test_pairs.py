@@ -18,6 +18,7 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages import pairs as stage
+from colmap_affrect.stages.context import Context
 
 WGS84 = pycolmap.PosePriorCoordinateSystem.WGS84
 CARTESIAN = pycolmap.PosePriorCoordinateSystem.CARTESIAN
@@ -112,10 +113,15 @@ def test_gps_without_positions_is_refused_and_nothing_discarded(
     assert rooms.pairs.read_text().splitlines() == before
 
 
-def test_pairs_by_gps_and_sequence_together(rooms: Workspace, call: Call) -> None:
+def test_pairs_by_gps_and_sequence_together(rooms: Workspace) -> None:
     write_positions(rooms.database, {"1.png": (50.0, 14.0, 0.0), "4.png": (50.0, 14.001, 500.0)})
-    pairs = choose(call, rooms, "--pairs", "gps,sequence", "--num-neighbors", 1)
-    assert pairs == ["1.png 2.png", "1.png 4.png", "2.png 3.png", "3.png 4.png"]
+    stage.choose_pairs(Context(rooms), PairOptions(methods=("gps", "sequence"), num_neighbors=1))
+    assert rooms.pairs.read_text().splitlines() == [
+        "1.png 2.png",
+        "1.png 4.png",
+        "2.png 3.png",
+        "3.png 4.png",
+    ]
 
 
 def write_positions(
