@@ -4,7 +4,7 @@ Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)`
 public names are loaded when first used, so that importing the package stays light.
 """
 
-import importlib.util
+import importlib
 import logging
 import sys
 import zlib
@@ -45,7 +45,7 @@ _PUBLIC = {
     "extract_features": "colmap_affrect.interop.pycolmap_api",
     "extract_image": "colmap_affrect.stages.one_image",
     "load_recipe": "colmap_affrect.recipes",
-    "incremental_mapping": "colmap_affrect.interop.pycolmap_mapping",
+    "incremental_mapping": "colmap_affrect.interop.pycolmap_api",
     "map_from_database": "colmap_affrect.pipeline",
     "match_exhaustive": "colmap_affrect.interop.pycolmap_api",
     "match_image_pairs": "colmap_affrect.interop.pycolmap_api",
@@ -62,12 +62,5 @@ __all__ += list(_PUBLIC)
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{_hint(name)}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_PUBLIC[name]), name)
-
-
-def _hint(name: str) -> str:
-    """Return what replaces a name of pycolmap; modules of ours are looked for before they load."""
-    if name.startswith("_") or importlib.util.find_spec(f"{__name__}.{name}"):
-        return ""
-    return str(importlib.import_module(f"{__name__}.pycolmap").hint(name))

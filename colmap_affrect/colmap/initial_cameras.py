@@ -36,7 +36,7 @@ from colmap_affrect.colmap.database import (
     require_database_space,
     write_frame,
 )
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
@@ -268,7 +268,7 @@ def _take_over(
     read = cameras_of_images(found)
     sizes = {i.name: (read[i.image_id].width, read[i.image_id].height) for i in images}
     priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
-    cameras, new = _known_cameras(initial, database, list(sizes)), {}
+    cameras, new = _known_cameras(initial, database), {}
     for group, names in initial.groups(list(sizes)).items():
         if group not in cameras:
             size = sizes[names[0]]
@@ -290,15 +290,10 @@ def _take_over(
 
 
 def _known_cameras(
-    initial: InitialCameras, database: pycolmap.Database, names: Sequence[str]
+    initial: InitialCameras, database: pycolmap.Database
 ) -> dict[Group, pycolmap.Camera]:
     """Return the cameras of the database that new images of a group get."""
     cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    existing = initial.options.existing_camera_id
-    if existing >= 0:
-        if existing not in cameras:
-            raise DatabaseError(f"the database has no camera {existing} (existing_camera_id)")
-        return {initial.group(name): cameras[existing] for name in names}
     used: dict[Group, set[int]] = defaultdict(set)
     for image in database.read_all_images():
         used[initial.group(image.name)].add(image.camera_id)

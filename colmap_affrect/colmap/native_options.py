@@ -3,13 +3,12 @@
 Lists, sets and arrays are left out.
 """
 
+import json
+import math
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any
-
-from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import flat, suggestion
@@ -31,7 +30,7 @@ def differences(options: Any, default: Any) -> dict[str, Plain]:
     return {key: value for key, value in _plain_values(options).items() if value != others[key]}
 
 
-def set_values(options: Any, values: Mapping[str, Plain]) -> None:
+def set_values(options: Any, values: Mapping[str, Any]) -> None:
     """Set single options by dotted key."""
     for key, value in values.items():
         *sections, name = key.split(".")
@@ -44,22 +43,41 @@ def resolve(
     """Set values, which may be text, in ``options``; return them by full dotted key.
 
     Of keys sections may be left out where a name exists once. OptionError, which begins with
-    ``flag``, names a key that is unknown, ambiguous, or ``owned``, or whose value is of a wrong
-    type.
+    ``flag``, names a key that is unknown, ambiguous, or ``owned``, or whose value pycolmap does not
+    take.
     """
-    known = flat_values(options)
-    resolved: dict[str, Plain] = {}
-    for text, value in given.items():
-        key = _full_key(text, known, flag)
+    known, plain = flat_values(options), _plain_values(options)
+    keys = {_full_key(text, known, flag): text for text in given}
+    for key, text in keys.items():
+        where, value = f"{flag} {text}", given[text]
         if reason := owned.get(_name(key)):
-            raise OptionError(f"{flag} {text}: cannot be changed here; {reason}")
-        resolved[key] = _converted(value, known[key], f"{flag} {text}")
+            raise OptionError(f"{where}: cannot be changed here; {reason}")
+        kind = type(known[key])
+        if key not in plain:
+            raise OptionError(f"{where}: cannot be given, it is of type {kind.__name__}")
         try:
-            set_values(options, {key: resolved[key]})
-        except (TypeError, ValueError, OverflowError) as error:
-            expected = type(known[key]).__name__
-            raise OptionError(f"{flag} {text}={value}: outside the range of {expected}") from error
-    return resolved
+            set_values(options, {key: _parsed(value, known[key])})
+        except (TypeError, ValueError, RuntimeError) as error:
+            names = getattr(kind, "__members__", ("true", "false") if kind is bool else ())
+            expected = f"one of {', '.join(names)}" if names else kind.__name__
+            raise OptionError(f"{where}={value}: expected {expected}") from error
+    taken = _plain_values(options)
+    return {key: taken[key] for key in keys}
+
+
+def _parsed(value: Any, example: Any) -> Any:
+    """Return the number, truth value or name of an enumeration that a text stands for."""
+    if isinstance(example, bool | int | float) and isinstance(value, str):
+        value = json.loads(value.lower())
+        if isinstance(example, bool) and value in (0, 1):  # as COLMAP's command line has it
+            value = bool(value)
+    elif hasattr(type(example), "__members__") and isinstance(value, str):
+        value = getattr(type(example), value.upper(), value)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(value)
+    if isinstance(value, bool) != isinstance(example, bool):
+        raise TypeError(value)
+    return value
 
 
 def _plain_values(options: Any) -> dict[str, Plain]:
@@ -79,40 +97,10 @@ def _name(key: str) -> str:
 
 
 def _full_key(text: str, known: Mapping[str, Any], flag: str) -> str:
-    if text in known:
-        return text
-    found = [key for key in known if _name(key) == text]
-    if len(found) == 1:
-        return found[0]
-    if found:
+    found = [text] if text in known else [key for key in known if _name(key) == text]
+    if len(found) > 1:
         raise OptionError(f"{flag} {text}: exists in several sections; give {' or '.join(found)}")
-    hint = suggestion(text, [*known, *map(_name, known)])
-    raise OptionError(f"{flag} {text}: pycolmap has no such option{hint}")
-
-
-EXPECTED: dict[type, tuple[str, Any]] = {
-    bool: ("true or false", TypeAdapter(bool)),
-    int: ("a whole number", TypeAdapter(int)),
-    float: ("a finite number", TypeAdapter(FiniteFloat)),
-    Path: ("a path", TypeAdapter(Path)),
-    str: ("text", TypeAdapter(str)),
-}
-"""What may be given for options of each type; the order matters, as bool is an int."""
-
-
-def _converted(value: Any, example: Any, where: str) -> Plain:
-    """Turn a value, which may be text, into the type of an example."""
-    if names := getattr(type(example), "__members__", None):
-        name = getattr(value, "name", value)
-        if isinstance(name, str) and name.upper() in names:
-            return name.upper()
-        raise OptionError(f"{where}={value}: expected one of {', '.join(names)}")
-    kind = next((kind for kind in EXPECTED if isinstance(example, kind)), None)
-    if kind is None:
-        raise OptionError(f"{where}: cannot be given, it is of type {type(example).__name__}")
-    expected, adapter = EXPECTED[kind]
-    if isinstance(value, bool) == (kind is bool) or isinstance(value, str):
-        with suppress(ValidationError):
-            converted: Plain | Path = adapter.validate_python(value)
-            return str(converted) if isinstance(converted, Path) else converted
-    raise OptionError(f"{where}={value}: expected {kind.__name__.lower()} ({expected})")
+    if not found:
+        hint = suggestion(text, [*known, *map(_name, known)])
+        raise OptionError(f"{flag} {text}: pycolmap has no such option{hint}")
+    return found[0]

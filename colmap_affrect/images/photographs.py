@@ -30,8 +30,6 @@ class CameraOptions(Options):
     params: str = ""
     default_focal_length_factor: Annotated[float, within(0.01, 100.0)] = 1.2
     """Focal length in units of the longer side where EXIF has none."""
-    existing_camera_id: Annotated[int, within(-1, 2**31)] = -1
-    """Camera of the database that all new images get; -1 makes cameras for them."""
     ignore_exif: bool = False
     """Take no focal length from EXIF, and do not ask it which images share a camera."""
     cameras_path: str = ""

@@ -7,6 +7,7 @@ functions go on where an earlier call stopped.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain, islice, repeat
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ from colmap_affrect.colmap.verification import VerificationOptions, two_view_opt
 from colmap_affrect.colmap.verification import verify as verify_database
 from colmap_affrect.errors import OptionError, PairListError
 from colmap_affrect.interop import pycolmap_options as translate
+from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.existing import Extension, read_existing
+from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.base import MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pairs.base import Pair
@@ -25,13 +29,14 @@ from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.project.outputs import new_results, temporary_folder
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.stages import verify as verify_stage
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate
-from colmap_affrect.stages.extract import extract, write_descriptors, write_images_and_keypoints
+from colmap_affrect.stages.extract import extract, write_images_and_keypoints
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
@@ -45,16 +50,16 @@ Native = Mapping[str, Any] | None  # nested dictionaries are taken for all optio
 GivenMatching = pycolmap.FeatureMatchingOptions | MatcherOptions | Native
 GivenVerification = VerificationOptions | pycolmap.TwoViewGeometryOptions | Native
 Token = pycolmap.CancellationToken | None
+Callback = Callable[[], None] | None
 Reports = tuple[StageReport, ...]
-
 
 Choose = Callable[[Context, Any], Iterable[Pair]]  # by pycolmap's pairing options
 
 ARGUMENTS = """
 
-    Arguments are those of pycolmap. ``matching_options`` may be ours, by default those of the
-    recipe, of which a dictionary without ``name`` changes some, and ``verification_options`` too.
-    ``random_seed`` is that of verification, ``weights_path`` a folder with weights of networks.
+    Arguments are those of pycolmap. ``matching_options``, by default those of the recipe, and
+    ``verification_options`` may be ours, too. ``random_seed`` is that of verification,
+    ``weights_path`` a folder with weights of networks.
 """
 
 
@@ -65,14 +70,13 @@ def extract_features(
     camera_mode: pycolmap.CameraMode | str = "auto",
     reader_options: pycolmap.ImageReaderOptions | Native = None,
     extraction_options: (
-        pycolmap.FeatureExtractionOptions | ExtractionOptions | Mapping[str, Any] | str
+        pycolmap.FeatureExtractionOptions | ExtractionOptions | Native | str
     ) = "default",
     device: pycolmap.Device | str = "auto",
     cancellation_token: Token = None,
     *,
     from_database: PathLike | None = None,
     weights_path: PathLike | None = None,
-    database_descriptors: bool = False,
     progress: Progress = SILENT,
 ) -> StageReport:
     """Extract rectified features of photographs into a COLMAP database, which may be new.
@@ -80,12 +84,11 @@ def extract_features(
     Images that have features already are passed over. One that cannot be read is named in the
     report. Raises AffrectError for anything that the caller can mend. A cancelled token stops by
     InterruptedError; what is done is kept. Other arguments are those of pycolmap, but
-    ``extraction_options`` are a recipe by name or path, its sections, or options; of pycolmap's,
-    the image size and where the work is done.
+    ``extraction_options`` are a recipe by name or path, or our options; of pycolmap's, the image
+    size and where the work is done.
 
     ``from_database``: begin ``database_path`` with the images, cameras, rigs, frames and pose
     priors of this one, which stays as it is. ``weights_path``: folder with weights of networks.
-    ``database_descriptors``: write descriptors too, as COLMAP's matchers need them.
     """
     cameras, masks = translate.reader_options(reader_options, camera_mode)
     inputs = Inputs.of(
@@ -97,10 +100,7 @@ def extract_features(
     recipe, asked = translate.extraction_recipe(extraction_options)
     shown = _Cancellable(progress, cancellation_token)
     with _context(database_path, device, asked, weights_path, shown) as context:
-        report = extract(context, inputs, recipe, image_names=image_names)
-        if database_descriptors:
-            write_descriptors(context)
-    return report
+        return extract(context, inputs, recipe, image_names=image_names)
 
 
 def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
@@ -122,8 +122,7 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
             translate.changes(pairing_options, kind, "pairing_options")
             pairing: Any = translate.native(pairing_options, kind, "pairing_options")
             verification = translate.verification_options(verification_options, random_seed)
-            recorded = Workspace.beside(Path(database_path)).planned("match")
-            matching, asked = translate.matching_options(matching_options, recorded)
+            matching, asked = translate.matching_options(matching_options)
             shown = _Cancellable(progress, cancellation_token)
             with _context(database_path, device, asked, weights_path, shown) as context:
                 context.workspace.require("extract")
@@ -262,6 +261,81 @@ def _verify_rigs(path: Path, options: VerificationOptions, token: Token) -> None
         )  # fmt: skip
 
     run_cancellable(call, token)
+
+
+def incremental_mapping(
+    database_path: PathLike,
+    image_path: PathLike,
+    output_path: PathLike,
+    options: pycolmap.IncrementalPipelineOptions | Native = None,
+    input_path: PathLike = "",
+    initial_image_pair_callback: Callback = None,
+    next_image_callback: Callback = None,
+    cancellation_token: Token = None,
+) -> dict[int, pycolmap.Reconstruction]:
+    """Map any verified database by our mapper and write the models as pycolmap does.
+
+    ``options`` that differ from pycolmap's defaults win over our preset for sparse sets. Models are
+    written to 0, 1, ... in ``output_path``, or, with ``input_path``, a model to be extended, into
+    it; they are returned by the number of their folder, largest first. A cancelled token stops by
+    InterruptedError.
+    """
+    native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
+    mapper = MAPPERS.make(translate.mapper_options(native))
+    database, output = Path(database_path), Path(output_path)
+    refuse_unusable(database)
+    with temporary_folder(output) as folder:
+        existing = None
+        if translate.given_path(input_path):
+            extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)
+            existing = read_existing(extension, database)
+        task = MappingTask(
+            database,
+            Path(image_path) if str(image_path) else None,
+            extend=existing,
+            cancellation=cancellation_token,
+        )
+        extends = existing is not None
+        show = _calling(initial_image_pair_callback, next_image_callback, extends=extends)
+        try:
+            map_database(mapper, task, folder / "sparse", show)
+        except KeyboardInterrupt as error:
+            if cancellation_token and cancellation_token.is_cancelled:
+                raise InterruptedError(CANCELLED) from error
+            raise
+        return _written(folder / "sparse", output, extends=extends)
+
+
+def _written(found: Path, output: Path, *, extends: bool) -> dict[int, pycolmap.Reconstruction]:
+    """Read models and move their files to where pycolmap writes them."""
+    models = {int(path.name): pycolmap.Reconstruction(path) for path in found.iterdir()}
+    files = {
+        path: (output if extends else output / path.parent.name) / path.name
+        for path in found.glob("*/*")
+    }
+    with new_results(*files.values(), replaces=True) as made:
+        for path, new in zip(files, made, strict=True):
+            path.replace(new)
+    return dict(sorted(models.items()))
+
+
+def _calling(begun: Callback, following: Callback, *, extends: bool) -> Callable[[int], None]:
+    """Return what calls pycolmap's callbacks for a number of newly registered images.
+
+    The first are a pair, or all images of the model that is extended.
+    """
+    calls = chain((begun,), repeat(following))
+    num_shown = 0
+
+    def show(number: int) -> None:
+        nonlocal num_shown
+        first = 1 if extends else max(1, number - 1)
+        for call in islice(calls, number if num_shown else first):
+            if call:
+                call()
+        num_shown += number
+
+    return show
 
 
 class _Cancellable(Progress):

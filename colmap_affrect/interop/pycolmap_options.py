@@ -14,8 +14,8 @@ from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
-from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
-from colmap_affrect.options import CUSTOM, Options, flat
+from colmap_affrect.matchers.base import MatcherOptions
+from colmap_affrect.options import CUSTOM, flat
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 
 Native = TypeVar("Native")  # an option class of pycolmap
@@ -47,7 +47,10 @@ HONOURED: dict[type, tuple[str, ...]] = {
         "loop_detection_period", "loop_detection_num_images", "num_threads",
     ),
     pycolmap.SpatialPairingOptions: tuple(flat_values(pycolmap.SpatialPairingOptions())),
-    pycolmap.ImageReaderOptions: tuple(flat_values(pycolmap.ImageReaderOptions())),
+    pycolmap.ImageReaderOptions: (
+        "camera_model", "camera_params", "default_focal_length_factor", "mask_path",
+        "camera_mask_path",
+    ),
 }  # fmt: skip
 """Fields that may differ from their defaults."""
 
@@ -60,7 +63,8 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
     if isinstance(given, kind):
         return given
     if given is not None and not isinstance(given, Mapping):
-        raise _not_ours(given, argument, f"pycolmap.{kind.__name__}")
+        shown = f"{argument}: {type(given).__name__} does not apply here"
+        raise OptionError(f"{shown}; give pycolmap.{kind.__name__} or a dictionary of its fields")
     options, usual = kind(), flat_values(kind())
     values = {k: v for k, v in flat(given or {}).items() if k not in usual or v != usual[k]}
     resolve(options, values, f"{argument}:", owned={})
@@ -78,46 +82,24 @@ def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
     return found
 
 
-def is_native(given: object, kind: type, own: type[Options]) -> bool:
-    """Tell whether options are pycolmap's: a dictionary is if it has a key that ours lack."""
-    if not isinstance(given, Mapping):
-        return isinstance(given, kind)
-    names = {key.partition(".")[0] for key in flat_values(kind())}
-    return not names.isdisjoint(given.keys() - own.model_fields.keys())
-
-
 def extraction_recipe(given: object) -> tuple[Recipe, dict[str, Any]]:
     """Return the recipe that is named or given in any form, and what pycolmap's options ask for."""
     if isinstance(given, str):
         return load_recipe(given), {}
-    if is_native(given, pycolmap.FeatureExtractionOptions, Recipe):
-        asked = changes(given, pycolmap.FeatureExtractionOptions, "extraction_options")
-        recipe = load_recipe("default")
-        if "max_image_size" in asked:
-            recipe = recipe.changed(name=CUSTOM, max_image_size_px=asked["max_image_size"])
-        return recipe, asked
-    if isinstance(given, Mapping):
-        return Recipe.from_mapping({**given, "name": CUSTOM}, "extraction_options"), {}
     if isinstance(given, ExtractionOptions):
         return Recipe(**{**dict(given), "name": CUSTOM}), {}
-    raise _not_ours(given, "extraction_options", "colmap_affrect.ExtractionOptions")
+    asked = changes(given, pycolmap.FeatureExtractionOptions, "extraction_options")
+    recipe = load_recipe("default")
+    if "max_image_size" in asked:
+        recipe = recipe.changed(name=CUSTOM, max_image_size_px=asked["max_image_size"])
+    return recipe, asked
 
 
-def matching_options(
-    given: object, recorded: Mapping[str, Any] | None = None
-) -> tuple[MatcherOptions | None, dict[str, Any]]:
-    """Return our options, None for those of the recipe, and what pycolmap's options ask for.
-
-    A dictionary without ``name`` changes those on record.
-    """
-    if given is None or isinstance(given, MatcherOptions):
+def matching_options(given: object) -> tuple[MatcherOptions | None, dict[str, Any]]:
+    """Return our options, None for those of the recipe, and what pycolmap's options ask for."""
+    if isinstance(given, MatcherOptions):
         return given, {}
-    if is_native(given, pycolmap.FeatureMatchingOptions, MATCHERS.part(MATCHERS.default).Options):
-        return None, changes(given, pycolmap.FeatureMatchingOptions, "matching_options")
-    if isinstance(given, Mapping):
-        values = given if "name" in given else {**(recorded or {}), **given}
-        return MATCHERS.options(values, where="matching_options"), {}
-    raise _not_ours(given, "matching_options", "colmap_affrect.NearestOptions")
+    return None, changes(given, pycolmap.FeatureMatchingOptions, "matching_options")
 
 
 def verification_options(given: object, random_seed: int | None) -> VerificationOptions:
@@ -125,21 +107,18 @@ def verification_options(given: object, random_seed: int | None) -> Verification
     argument = "verification_options"
     if isinstance(given, VerificationOptions):
         options = given
-    elif is_native(given, pycolmap.TwoViewGeometryOptions, VerificationOptions):
+    else:
         asked = changes(given, pycolmap.TwoViewGeometryOptions, argument)
         values = {VERIFICATION_NAMES[key]: value for key, value in asked.items()}
         if "max_error_px" in values:  # in pixels of the files
             values["scale_max_error"] = False
         options = VerificationOptions.from_mapping(values, argument)
-    elif given is None or isinstance(given, Mapping):
-        options = VerificationOptions.from_mapping(given or {}, argument)
-    else:
-        raise _not_ours(given, argument, "colmap_affrect.VerificationOptions")
     return options.changed(random_seed=options.random_seed if random_seed is None else random_seed)
 
 
 def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, MaskOptions]:
     """Return what pycolmap's options say of cameras and masks."""
+    changes(given, pycolmap.ImageReaderOptions, "reader_options")
     known = native(given, pycolmap.ImageReaderOptions, "reader_options")
     cameras = CameraOptions.from_mapping(
         {
@@ -147,7 +126,6 @@ def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, M
             "model": known.camera_model,
             "params": known.camera_params,
             "default_focal_length_factor": known.default_focal_length_factor,
-            "existing_camera_id": known.existing_camera_id,
         },
         "camera_mode, reader_options",
     )
@@ -176,9 +154,3 @@ def mapper_options(given: pycolmap.IncrementalPipelineOptions) -> MapperOptions:
         {"name": MAPPERS.default, **seed, "mapper_options": kept}, where="options"
     )
     return options
-
-
-def _not_ours(given: object, argument: str, name: str) -> OptionError:
-    return OptionError(
-        f"{argument}: {type(given).__name__} does not apply here; give {name} or a dictionary"
-    )

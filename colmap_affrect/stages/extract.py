@@ -15,7 +15,6 @@ from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.errors import (
     DatabaseError,
     ImageError,
-    OptionError,
     StaleStoreError,
     one_line,
     such_as,
@@ -107,12 +106,8 @@ def extract(
 
 def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:
     """Refuse cameras of a database that cannot be used before it is on record."""
-    path, camera_id = workspace.database, inputs.cameras.existing_camera_id
-    if inputs.from_database and not path.exists():
+    if inputs.from_database and not workspace.database.exists():
         refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)
-    cameras = colmap_database.all_cameras(path) if camera_id >= 0 and path.exists() else []
-    if camera_id >= 0 and all(camera.camera_id != camera_id for camera in cameras):
-        raise OptionError(f"existing_camera_id={camera_id}: {path} has no such camera")
 
 
 def _extract_missing(

@@ -91,7 +91,7 @@ def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], messa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"focal_length_px": -1.0}, "outside"),
+        ({"focal_length_px": -1.0}, "greater than or equal"),
         ({"params": "900,450,300,0", "focal_length_px": 5.0}, "--camera-params: has focal length"),
         ({"model": "PINHOL"}, "--camera-model PINHOL: not one of"),
         ({"params": "0,450,300,0"}, "--camera-params: a focal length of 0 px cannot be"),

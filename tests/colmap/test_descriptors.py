@@ -11,13 +11,11 @@ from small_scene import write_photographs
 
 import colmap_affrect
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import (
-    image_ids,
-    open_database,
-    write_descriptors,
-)
+from colmap_affrect.colmap.database import image_ids, open_database, write_descriptors
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages import extract as stage
+from colmap_affrect.stages.context import Context
 
 MAX_RATIO = 0.8
 Matches = set[tuple[int, int]]
@@ -48,9 +46,10 @@ def colmap_matches(path: Path) -> Matches:
 
 def test_colmap_matches_what_float_descriptors_match(tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", 2)
-    path = tmp_path / "a.db"
-    colmap_affrect.extract_features(path, tmp_path / "photos", database_descriptors=True)
-    store = FeatureStore(tmp_path / "a.affrect" / "features.h5")
+    colmap_affrect.extract_features(tmp_path / "a.db", tmp_path / "photos")
+    context = Context(Workspace.beside(tmp_path / "a.db"))
+    stage.write_descriptors(context)
+    path, store = context.workspace.database, context.features
     first, second = (store.read(name).descriptors for name in sorted(image_ids(path)))
     expected, found = float_matches(first, second), colmap_matches(path)
     assert len(expected) > 500

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.initial_cameras import (
     import_images,
     record_cameras,
 )
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 
 WIDE = {**BODY, "FocalLengthIn35mmFilm": 28}
@@ -206,14 +206,6 @@ def test_intrinsics_before_the_import_are_those_of_the_database(
         initial = InitialCameras(photos, CameraOptions(**options))
         for name, camera in read_cameras(path).items():
             assert_allclose(initial.matrix(name, NAMES), camera_matrix(camera))
-
-
-def test_existing_camera_is_that_of_all_new_images(photos: Path, tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    imported(path, photos, NAMES[:1])
-    assert imported(path, photos, NAMES[:3], existing_camera_id=1) == ["a.jpg"] * 3
-    with pytest.raises(DatabaseError, match="no camera 8"):
-        import_images(path, photos, NAMES, CameraOptions(existing_camera_id=8))
 
 
 def test_records_are_kept_and_follow_the_images_that_come_later(

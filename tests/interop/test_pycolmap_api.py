@@ -170,7 +170,7 @@ def test_a_database_of_another_program_and_other_photographs_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"extraction_options": {"sifft": {}}}, "unknown option 'sifft'"),
+        ({"extraction_options": {"sifft": {"a": 1}}}, "sifft.a: pycolmap has no such option"),
         ({"extraction_options": pycolmap.Camera()}, "Camera does not apply here"),
         ({"extraction_options": "defualt"}, "did you mean 'default'"),
         ({"reader_options": {"camera_modell": "PINHOLE"}}, "did you mean 'camera_model'"),
@@ -200,7 +200,7 @@ def test_options_of_verification_come_from_pycolmap_or_a_dictionary(
         colmap_affrect.match_exhaustive(path)
     with pytest.raises(OptionError, match="multiple_models=True cannot be carried over"):
         colmap_affrect.match_exhaustive(path, verification_options={"multiple_models": True})
-    with pytest.raises(OptionError, match=r"^matching_options: int does not apply here; give colm"):
+    with pytest.raises(OptionError, match=r"^matching_options: int does not apply here; give pyc"):
         colmap_affrect.match_exhaustive(path, 3)
     with pytest.raises(PairListError, match="give match_list_path"):
         colmap_affrect.match_image_pairs(path)

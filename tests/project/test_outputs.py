@@ -149,7 +149,7 @@ CHANGING = {
 }  # fmt: skip
 
 BY_THE_DOOR = {
-    "align.py", "pycolmap_mapping.py", "export.py", "hdf5.py",
+    "align.py", "pycolmap_api.py", "export.py", "hdf5.py",
     "conversion.py", "method_run.py", "sift.py",
 }  # fmt: skip
 """Write where the door lets them."""
