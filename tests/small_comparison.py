@@ -12,7 +12,7 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, PoseScores
+from colmap_affrect.comparison.pose_scores import PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.pairs.base import Pair
 
@@ -39,13 +39,13 @@ def make_comparison(folder: Path) -> Comparison:
     truth, pair_inliers = write_scene(folder / "all.db")
     sift = _write_method(folder, "sift", truth, NAMES[:4])
     default = _write_method(folder, "default", truth, NAMES[:5], SIMILARITY)
-    fewer = {pair: count for pair, count in pair_inliers.items() if pair != NAMES[:2]}
-    first, second = _seed(0, default, pair_inliers, wrong=[NAMES[4]]), _seed(1, default, fewer)
+    first = _seed(0, default, len(pair_inliers), wrong=[NAMES[4]])
+    second = _seed(1, default, len(pair_inliers) - 1)
     models = tuple(sorted(NAMES[:4])), tuple(NAMES[4:])
     methods = (
-        _method("sift", [_seed(0, sift, fewer), _seed(1, sift, fewer)]),
+        _method("sift", [_seed(number, sift, 14) for number in (0, 1)]),
         _method("broken", [], failed="weights <affnet> & more are missing"),
-        _method("default", [first, replace(second, model_names=models, num_points3D=70)]),
+        _method("default", [first, replace(second, models=models, points3D=70)]),
     )
     settings, versions = {"camera": {"mode": "auto"}}, {"pycolmap": pycolmap.__version__}
     return Comparison(
@@ -98,30 +98,21 @@ def _write_method(
 
 
 def _seed(
-    seed: int,
-    model: pycolmap.Reconstruction,
-    pair_inliers: dict[Pair, int],
-    wrong: Sequence[str] = (),
+    seed: int, model: pycolmap.Reconstruction, num_pairs: int, wrong: Sequence[str] = ()
 ) -> SeedResult:
     registered = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
     correct = tuple(name for name in registered if name not in wrong)
     name = "default" if len(registered) == 5 else "sift"
-    pairs = [(a, b) for a in registered for b in registered if a < b]
     return SeedResult(
         seed=seed,
-        model_names=(tuple(registered),),
+        models=(tuple(registered),),
         model_path=f"methods/{name}/seed-0/sparse/0",
-        num_points3D=model.num_points3D(),
+        verified_pairs=num_pairs,
+        points3D=model.num_points3D(),
         mean_track_length=model.compute_mean_track_length(),
         mean_reprojection_error_px=0.21 + seed / 100,
-        pair_inliers=pair_inliers,
-        scores=PoseScores(
-            correct,
-            {pair: (0.5 + seed, 40.0 if set(pair) & set(wrong) else 1.25) for pair in pairs},
-            15,
-            {f"{limit:g}": limit / 40 + seed / 100 for limit in AUC_THRESHOLDS_DEG},
-            0.0123,
-        ),
+        sure=correct,
+        scores=PoseScores(correct, tuple(wrong), 0.5 + seed),
         wall_s={"verify": 0.75, "map": 3.5 + seed},
     )
 
@@ -130,7 +121,6 @@ def _method(name: str, seeds: Sequence[SeedResult], failed: str = "") -> MethodR
     return MethodResult(
         name,
         summary=f"summary of {name}",
-        num_keypoints={image: 100 + number for number, image in enumerate(NAMES)},
         seeds=tuple(seeds),
         wall_s={"extract": 12.25, "match": 1.5},
         peak_memory_bytes=123_400_000,

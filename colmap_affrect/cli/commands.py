@@ -202,7 +202,7 @@ def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -
     if failed:
         where = options.output_path / "comparison.json"
         raise ComparisonError(f"failed: {', '.join(failed)}; {where} says why")
-    if not any(seed.model_names for method in comparison.methods for seed in method.seeds):
+    if not any(seed.models for method in comparison.methods for seed in method.seeds):
         show("error: no method found a model", file=sys.stderr)
         return EXIT_NO_MODEL
     failures = {name: why for m in comparison.methods for name, why in m.failures.items()}

@@ -4,24 +4,23 @@ What differs between methods are features and raw matches, and nothing else: cam
 masks, pairs, verification, mapping and seeds are the same for all.
 """
 
-import json
 import pickle
 import signal
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap.poses import Poses, read_poses
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
-from colmap_affrect.comparison.method_run import METHODS, CompareOptions, MethodRun
+from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
-from colmap_affrect.comparison.pose_scores import disagreeing_images, pose_scores
+from colmap_affrect.comparison.pose_scores import pose_scores
 from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.tables import to_json
-from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
+from colmap_affrect.errors import ComparisonError, OptionError
 from colmap_affrect.features.weights import install_hint, resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import Options, digest_of
@@ -30,8 +29,6 @@ from colmap_affrect.parallel.subprocesses import child
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import content_of
-from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.inputs import Inputs
@@ -60,27 +57,28 @@ def compare(
     pairs = list(options.pairs_of(names))
     truth = _ground_truth(options.ground_truth_path, names)
     options = replace(options, mapping=MAPPERS.make(options.mapping).options)
-    folders = output_path.resolve(), image_path.resolve()
-    runs = [MethodRun(method, *folders, options) for method in methods]
+    same = _same_for_all(inputs, names, pairs, options)
+    given = output_path.resolve(), image_path.resolve(), options, same
+    runs = [MethodRun(method, *given) for method in methods]
     recipes = [run.method.recipe for run in runs if overwrite or not run.finished()]
     keys = {key for recipe in recipes if recipe for key in recipe.weights}
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
     with Workspace(output_path).locked():
-        same = _same_for_all(inputs, names, pairs, options)
-        _require_same(same, output_path, overwrite=overwrite)
         for run in runs:
             run.begin(overwrite=overwrite)
         results = []
         for number, run in enumerate(runs, 1):
             title = f"method {number} of {len(runs)}, {run.method.label}: "
             results.append(run.finished() or _run(run, progress, title))
+        if truth:
+            results = [_measured(result, output_path, truth, names) for result in results]
         comparison = Comparison(
             image_names=tuple(names),
-            image_path=str(folders[1]),
-            methods=_measured(results, output_path, truth, names),
+            image_path=str(image_path.resolve()),
+            methods=tuple(results),
             seeds=tuple(options.seeds),
             num_pairs=len(pairs),
-            settings=_settings(same, options) | {"not_compared": not_compared},
+            settings=_settings(options) | {"not_compared": not_compared},
             versions=installed_versions(),
         )
         replace_text(output_path / "comparison.json", to_json(comparison))
@@ -131,26 +129,31 @@ def _same_for_all(
     return {
         "photographs": {k: content_of(paths).digest[:NUM_DIGITS] for k, paths in files.items()},
         "pairs": {"number": len(pairs), "sha256": digest_of(pairs)},
-        "camera": options.cameras.to_mapping(),
         "masks": {key: bool(path) for key, path in masks.items()},
-        "verification": _without_seed(options.verification),
-        "mapping": _without_seed(options.mapping),
+        **_sections(options),
     }
 
 
-def _settings(same: Mapping[str, Any], options: CompareOptions) -> dict[str, Any]:
+def _sections(options: CompareOptions) -> dict[str, Any]:
+    def without_seed(section: Options) -> dict[str, Any]:
+        return {k: value for k, value in section.to_mapping().items() if k != "random_seed"}
+
+    return {
+        "camera": options.cameras.to_mapping(),
+        "verification": without_seed(options.verification),
+        "mapping": without_seed(options.mapping),
+    }
+
+
+def _settings(options: CompareOptions) -> dict[str, Any]:
     places = ("image_list_path", "from_database", "ground_truth_path")
     return {
-        **{key: same[key] for key in ("camera", "verification", "mapping")},
+        **_sections(options),
         **{key: str(getattr(options, key) or "") for key in places},
         "masks": options.masks.to_mapping(),
         "match_list_path": options.pairs.match_list_path,
         "preset": options.mapping.preset_name,
     }
-
-
-def _without_seed(options: Options) -> dict[str, Any]:
-    return {key: value for key, value in options.to_mapping().items() if key != "random_seed"}
 
 
 def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
@@ -163,28 +166,6 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
             f"{min(names)}); rename the images of one of them"
         )
     return truth
-
-
-def _require_same(same: Mapping[str, Any], output_path: Path, *, overwrite: bool) -> None:
-    """Refuse methods that were run there on something else; ``overwrite`` discards them."""
-    methods = output_path / METHODS
-    record = methods / "inputs.json"
-    if record.exists():
-        known = json.loads(record.read_text(encoding="utf-8"))
-        if difference := first_difference(known, same):
-            if not overwrite:
-                raise StaleStoreError(
-                    f"{output_path}: methods were compared there with {difference}; use "
-                    "--overwrite to discard these results, or another --output-path"
-                )
-            remove_own([methods])
-    elif methods.exists():
-        raise StaleStoreError(
-            f"{methods}: was not made here, or by an older version; it is left as it is, use "
-            "another --output-path"
-        )
-    methods.mkdir(exist_ok=True)
-    replace_text(record, json.dumps(same, indent=1))
 
 
 def _run(run: MethodRun, progress: Progress, title: str) -> MethodResult:
@@ -206,26 +187,11 @@ def _run(run: MethodRun, progress: Progress, title: str) -> MethodResult:
 
 
 def _measured(
-    results: Sequence[MethodResult], folder: Path, truth: Poses | None, names: Sequence[str]
-) -> tuple[MethodResult, ...]:
-    """Add what needs the models: scores against ground truth, and where models contradict."""
-    firsts, measured = dict[str, Poses](), list[MethodResult]()
-    for result in results:
-        seeds = []
-        for seed in result.seeds:
-            poses = read_poses(folder / seed.model_path) if seed.model_path else {}
-            firsts.setdefault(result.name, poses)
-            seeds.append(replace(seed, scores=pose_scores(poses, truth, names)) if truth else seed)
-        measured.append(replace(result, seeds=tuple(seeds)))
-    return tuple(
-        replace(
-            result,
-            disagreements={
-                name: images
-                for name, poses in firsts.items()
-                if name != result.name
-                and (images := disagreeing_images(firsts.get(result.name, {}), poses))
-            },
-        )
-        for result in measured
-    )
+    result: MethodResult, folder: Path, truth: Poses, names: Sequence[str]
+) -> MethodResult:
+    """Add the scores of the models against ground truth."""
+    seeds = []
+    for seed in result.seeds:
+        poses = read_poses(folder / seed.model_path) if seed.model_path else {}
+        seeds.append(replace(seed, scores=pose_scores(poses, truth, names)))
+    return replace(result, seeds=tuple(seeds))

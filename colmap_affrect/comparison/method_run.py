@@ -4,9 +4,10 @@
 ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
 """
 
+import json
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,12 +16,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.colmap.cameras import read_camera_records
-from colmap_affrect.colmap.database import (
-    image_ids,
-    keypoint_counts,
-    open_database,
-    unverified_pairs,
-)
+from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
 from colmap_affrect.colmap.database_copy import copy_database, copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
@@ -35,7 +31,7 @@ from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Progress, Stopwatch
-from colmap_affrect.project.atomic_files import replace_bytes
+from colmap_affrect.project.atomic_files import replace_bytes, replace_text
 from colmap_affrect.project.outputs import new_results, remove_own
 from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.report import ModelSummary
@@ -45,7 +41,6 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
@@ -86,37 +81,29 @@ class MethodRun:
     output_path: Path  # of the comparison
     image_path: Path
     options: CompareOptions
+    inputs: Mapping[str, Any]  # what all methods begin with, for the record
     progress: Progress = SILENT
 
     def __post_init__(self) -> None:
-        is_colmap = self.method.label == SIFT_COLMAP  # and all of it as COLMAP does it
         self.verification, self.mapping = self.options.verification, self.options.mapping
-        if is_colmap:
+        if self.method.label == SIFT_COLMAP:  # all of it as COLMAP does it
             self.verification = VerificationOptions.preset("colmap")
             self.mapping = Recipe().mapper_options("colmap")
         self.workspace = Workspace(self.output_path / METHODS / self.method.folder_name)
         self.database = self.workspace.database
         self.failure = self.workspace.path / "failed.txt"  # why its process ended
-        self.result_path = self.workspace.path / "result.json"
         self.result = self._read_result()
 
     def _read_result(self) -> MethodResult:
         """Return what is done of the method; without seeds before the last of them has ended."""
         with suppress(FileNotFoundError, ValidationError):  # of a version before: features stay
-            return RESULT.validate_json(self.result_path.read_bytes())
-        folder = self.workspace.path.relative_to(self.output_path).as_posix()
-        method = self.method
+            return RESULT.validate_json((self.workspace.path / "result.json").read_bytes())
         return MethodResult(
-            method.label, summary=method.summary, folder=folder, options=self._method_options()
+            self.method.label,
+            summary=self.method.summary,
+            folder=self.workspace.path.relative_to(self.output_path).as_posix(),
+            options=self.method.options,
         )
-
-    def _method_options(self) -> dict[str, Any]:
-        """Return options of features and matching, and the seed where verification decides."""
-        recipe = self.method.recipe
-        if recipe is None:
-            return {"affine": self.method.label == SIFT_AFFINE_DSP}
-        seed = {"seed": self.options.seeds[0]} if self.method.escalates else {}
-        return {**recipe.to_mapping(), **seed}
 
     def finished(self) -> MethodResult | None:
         """Return the result of the method if it has been run with the same seeds."""
@@ -125,21 +112,28 @@ class MethodRun:
         return self.result if seeds == list(self.options.seeds) else None
 
     def begin(self, *, overwrite: bool) -> None:
-        """Make the folder; StaleStoreError where the method was begun with other options."""
+        """Make the folder; StaleStoreError where the method was run there on something else."""
+        folder, record = self.workspace.path, self.workspace.path / "inputs.json"
         if overwrite:
-            remove_own([self.workspace.path])
-        # Both as JSON has them, in which tuples are lists.
-        known, now = (
-            RESULT.dump_python(result, mode="json")["options"]
-            for result in (self._read_result(), MethodResult("", options=self._method_options()))
-        )
-        if difference := first_difference(known, now):
+            remove_own([folder])
+        asked = {**self.inputs, **self.method.options}
+        if self.method.escalates:  # verification of this seed decides
+            asked["seed"] = self.options.seeds[0]
+        asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
+        if record.exists():
+            if difference := first_difference(json.loads(record.read_bytes()), asked):
+                raise StaleStoreError(
+                    f"{folder}: {self.method.label} was run there with {difference}; use "
+                    "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
+                    "or another --output-path"
+                )
+        elif folder.exists():
             raise StaleStoreError(
-                f"{self.workspace.path}: {self.method.label} was run there with {difference}; use "
-                "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
-                "or another --output-path"
+                f"{folder}: was not made here, or by an older version; use --overwrite to redo "
+                "the methods that are named, or another --output-path"
             )
         self.workspace.begin()
+        replace_text(record, json.dumps(asked, indent=1))
         self.failure.unlink(missing_ok=True)
 
     def run(self) -> None:
@@ -147,14 +141,14 @@ class MethodRun:
         if self.method.recipe:
             self._match_recipe(self.method.recipe)
         else:
-            self._match_sift()
-        seeds = tuple(map(self._run_seed, self.options.seeds))
-        self._keep(seeds=seeds, num_keypoints=dict(sorted(keypoint_counts(self.database).items())))
+            self._stage("extract", self._extract_sift)
+            self._stage("match", self._match_sift)
+        self._keep(seeds=tuple(map(self._run_seed, self.options.seeds)))
 
     def _keep(self, **values: Any) -> None:
         peak = max(self.result.peak_memory_bytes, peak_memory_bytes())
         self.result = replace(self.result, peak_memory_bytes=peak, **values)
-        replace_bytes(self.result_path, RESULT.dump_json(self.result, by_alias=True, indent=1))
+        replace_bytes(self.workspace.path / "result.json", RESULT.dump_json(self.result, indent=1))
 
     def _stage(self, name: str, work: Callable[[], object]) -> None:
         """Do what is not done; a stage that was killed counts from where it went on."""
@@ -163,42 +157,35 @@ class MethodRun:
             work()
             self._keep(wall_s={**self.result.wall_s, name: time.perf_counter() - start})
 
-    def _match_sift(self) -> None:
+    def _extract_sift(self) -> None:
         inputs = self.options.inputs(self.image_path)
-        affine, names = self.method.label == SIFT_AFFINE_DSP, inputs.names()
+        names, source = inputs.names(), self.options.from_database
+        with self.progress.stage("extract", len(names), "images") as advance:
+            if source and not self.database.exists():
+                copy_without_features(source, self.database)
+            mode = self.options.cameras.mode
+            rejected = import_images(self.database, self.image_path, names, self.options.cameras)
+            initial = None if source else inputs.initial_cameras
+            known = read_camera_records(source.with_name("cameras.json")) if source else None
+            record_cameras(self.database, self.workspace.cameras, initial, known)
+            taken = [name for name in names if name not in set(rejected)]
+            if not taken:
+                raise ComparisonError(f"COLMAP cannot use any of the {len(names)} images")
+            affine = self.method.label == SIFT_AFFINE_DSP
+            failures = extract_sift(
+                self.database, self.image_path, taken, self.options.masks, affine=affine
+            )
+            reason = f"COLMAP cannot read it, or does not take it (camera mode {mode})"
+            self._keep(failures=dict.fromkeys(rejected, reason) | failures)
+            advance(len(names))
 
-        def extract_all() -> None:
-            with self.progress.stage("extract", len(names), "images") as advance:
-                failures = self._import_images(inputs)
-                taken = [name for name in names if name not in failures]
-                if not taken:
-                    raise ComparisonError(f"COLMAP cannot use any of the {len(names)} images")
-                images = self.image_path, taken, self.options.masks
-                failures |= extract_sift(self.database, *images, affine=affine)
-                self._keep(failures=failures)
-                advance(len(names))
-
-        def match_all() -> None:
-            taken = image_ids(self.database).keys()
-            pairs = [pair for pair in self.options.pairs_of(names) if taken >= set(pair)]
-            with self.progress.stage("match", len(pairs), "pairs") as advance:
-                match_sift(self.database, pairs)
-                advance(len(pairs))
-
-        self._stage("extract", extract_all)
-        self._stage("match", match_all)
-
-    def _import_images(self, inputs: Inputs) -> dict[str, str]:
-        """Make the database that features go into; return the images that COLMAP does not take."""
-        source, cameras = self.options.from_database, self.options.cameras
-        initial = None if source else inputs.initial_cameras
-        known = read_camera_records(source.with_name("cameras.json")) if source else None
-        if source and not self.database.exists():
-            copy_without_features(source, self.database)
-        rejected = import_images(self.database, self.image_path, inputs.names(), cameras)
-        record_cameras(self.database, self.workspace.cameras, initial, known)
-        reason = f"COLMAP cannot read it, or does not take it (camera mode {cameras.mode})"
-        return dict.fromkeys(rejected, reason)
+    def _match_sift(self) -> None:
+        taken = image_ids(self.database).keys()
+        names = self.options.inputs(self.image_path).names()
+        pairs = [pair for pair in self.options.pairs_of(names) if taken >= set(pair)]
+        with self.progress.stage("match", len(pairs), "pairs") as advance:
+            match_sift(self.database, pairs)
+            advance(len(pairs))
 
     def _match_recipe(self, recipe: Recipe) -> None:
         context = Context(self.workspace, self.options.resources, None, self.progress)
@@ -218,11 +205,12 @@ class MethodRun:
         folder = self.workspace.path / f"seed-{seed}"
         result_path = folder / "result.json"
         if result_path.exists():
-            return SEED_RESULT.validate_json(result_path.read_bytes())
+            with suppress(ValidationError):
+                return SEED_RESULT.validate_json(result_path.read_bytes())
         with new_results(folder) as (new,):
             new.mkdir()
             result = self._seed_result(seed, new, f"{self.result.folder}/{folder.name}/sparse/0")
-            replace_bytes(new / result_path.name, SEED_RESULT.dump_json(result, by_alias=True))
+            replace_bytes(new / result_path.name, SEED_RESULT.dump_json(result))
         return result
 
     def _seed_result(self, seed: int, folder: Path, model_path: str) -> SeedResult:
@@ -231,25 +219,20 @@ class MethodRun:
         copy_database(self.database, database_path)
         with open_database(database_path) as database:
             database.clear_two_view_geometries()
-            names = {image.image_id: image.name for image in database.read_all_images()}
         map_seed = self._map_recipe if self.method.recipe else self._map_sift
         models = map_seed(seed, folder, watch, self.progress.titled(f"seed {seed}, "))
         largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
-        inliers = verified_pairs(database_path, self.verification.min_num_inliers)
         return SeedResult(
             seed=seed,
-            model_names=tuple(item.registered_names for item in models),
+            models=tuple(item.registered_names for item in models),
             model_path=model_path if models else "",
-            num_points3D=largest.num_points3D,
+            verified_pairs=len(verified_pairs(database_path, self.verification.min_num_inliers)),
+            points3D=largest.num_points3D,
             mean_track_length=largest.mean_track_length,
             mean_reprojection_error_px=largest.mean_reprojection_error_px,
-            pair_inliers={
-                (min(names[i], names[j]), max(names[i], names[j])): count
-                for (i, j), count in inliers.items()
-            },
-            scores=None,
-            wall_s=watch.seconds,
+            sure=largest.sure,
             doubtful=largest.doubtful,
+            wall_s=watch.seconds,
         )
 
     def _map_recipe(

@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from typing import Any
 
 from colmap_affrect.comparison import LEARNED_METHODS
 from colmap_affrect.errors import OptionError
@@ -31,6 +32,13 @@ class Method:
     def summary(self) -> str:
         """One line for people."""
         return self.recipe.summary if self.recipe else SIFT_SUMMARIES[self.label]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of features and matching."""
+        if self.recipe is None:
+            return {"affine": self.label == SIFT_AFFINE_DSP}
+        return self.recipe.to_mapping()
 
     @property
     def escalates(self) -> bool:

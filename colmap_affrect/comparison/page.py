@@ -1,29 +1,25 @@
 """A comparison of methods as one page, ``report.html``."""
 
-from collections.abc import Sequence
+import itertools
+import string
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from colmap_affrect.comparison.pose_scores import MAX_CORRECT_ERROR_DEG
-from colmap_affrect.comparison.results import Comparison
-from colmap_affrect.comparison.tables import (
-    Column,
-    columns_of,
-    digits_of,
-    span_text,
-    summary_rows,
-)
-from colmap_affrect.comparison.verdict import cautions, changes, headline, wrong_poses
+from colmap_affrect.comparison.results import Comparison, MethodResult
+from colmap_affrect.comparison.tables import headline, notes, table
 from colmap_affrect.options import flat
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.report import page, view_graph
+from colmap_affrect.report import page
 from colmap_affrect.report.pictures import thumbnails
 from colmap_affrect.report.scene import read_scene
-from colmap_affrect.report.view_graph import Node
 
 TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
 
+METHOD_COLORS = (
+    "#0b62a8", "#a34700", "#00714f", "#9b2d79", "#5d4bb0", "#7a5c00", "#a3213b", "#46606e",
+)  # fmt: skip
+"""Of the marks of methods; white text on them is readable."""
 FILTERS = {
     "all": "All",
     "differ": "Methods differ",
@@ -32,78 +28,27 @@ FILTERS = {
     "uncertain": "Doubtful",
     "none": "Registered by none",
 }
-
 KINDS = {"shared": "registered", "uncertain": "doubtful", "wrong": "at a wrong place"}
 """How cameras are drawn; each has a colour of this name."""
 
 
-def write_page(comparison: Comparison, output_path: Path, progress: Progress = SILENT) -> Path:
-    """Write ``report.html``, one file that loads nothing, and return its path.
+@dataclass(frozen=True)
+class Column:
+    """A method that finished, as it is marked everywhere on the page."""
 
-    What is missing, as an unreadable photograph, is said in its place. Raises WorkspaceError.
-    """
-    columns = columns_of(comparison)
-    names, folder = comparison.image_names, Path(comparison.image_path)
-    graphs = [column.method.seeds[0].pair_inliers for column in columns]
-    cards = cards_of(columns, comparison)
-    index = {name: number for number, name in enumerate(names)}
-    layout = view_graph.lay_out(names, graphs)
-    shown = {column.name: column.method.shown_seed for column in columns}
-    views = read_scene({n: output_path / s.model_path if s else None for n, s in shown.items()})
-    kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
-    content = {
-        "comparison": comparison,
-        "headline": headline(comparison),
-        "changes": changes(comparison),
-        "cautions": cautions(comparison),
-        "bars": _bars(columns, len(names)),
-        "has_wrong_poses": bool(wrong_poses(comparison)),
-        "columns": columns,
-        "failed": [method for method in comparison.methods if method.failed],
-        "rows": summary_rows(columns, comparison),
-        "filters": FILTERS,
-        "cards": cards,
-        "thumbnails": thumbnails(folder, names, progress),
-        "image_index": index,
-        "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
-        "settings": flat(comparison.settings),
-        "method_options": {c.name: flat(c.method.options) for c in columns},
-        "layout": layout,
-        "edges": [view_graph.edge_paths(names, layout, graph) for graph in graphs],
-        "num_pairs": list(map(len, graphs)),
-        "views": views,
-        "kinds": KINDS,
-        "script_data": {
-            "matrices": [view_graph.matrix(names, graph) for graph in graphs],
-            "views": [view.script_data(index, k) for view, k in zip(views, kinds, strict=True)],
-        },
-    }
-    folders = [folder, output_path.resolve()]
-    return page.write_page(output_path / "report.html", TEMPLATE, content, folders)
-
-
-def _bars(columns: Sequence[Column], num_images: int) -> list[dict[str, Any]]:
-    bars = []
-    for column in columns:
-        known = [span for span in (column.method.registered, column.method.correct) if span]
-        first, *correct = (span_text(span, digits_of([span.mean], 1)) for span in known)
-        text = ", ".join([f"{first} of {num_images}", *(f"{each} correct" for each in correct)])
-        shares = [span.mean / max(1, num_images) for span in known]
-        bars.append({"column": column, "shares": shares, "text": text})
-    return bars
+    letter: str
+    color: str
+    method: MethodResult
 
 
 @dataclass(frozen=True)
-class Mark(Node):
+class Mark:
     """What one method does with one photograph."""
 
     column: Column
-    is_uncertain: bool  # doubtful, and ground truth does not say that it is right
-
-    @property
-    def kind(self) -> str:
-        """One of ``KINDS``."""
-        return "wrong" if self.is_wrong else "uncertain" if self.is_uncertain else "shared"
+    state: str  # ``always``, ``sometimes`` or ``never`` registered, over the seeds
+    kind: str  # one of ``KINDS``
+    text: str
 
 
 @dataclass(frozen=True)
@@ -116,43 +61,88 @@ class Card:
     groups: tuple[str, ...]
 
 
-def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
+def write_page(comparison: Comparison, output_path: Path, progress: Progress = SILENT) -> Path:
+    """Write ``report.html``, one file that loads nothing, and return its path.
+
+    What is missing, as an unreadable photograph, is said in its place. Raises WorkspaceError.
+    """
+    columns = columns_of(comparison)
+    names, folder = comparison.image_names, Path(comparison.image_path)
+    cards = cards_of(columns, comparison)
+    index = {name: number for number, name in enumerate(names)}
+    shown = {column.method.name: column.method.shown_seed for column in columns}
+    views = read_scene({n: output_path / s.model_path if s else None for n, s in shown.items()})
+    kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
+    content = {
+        "comparison": comparison,
+        "headline": headline(comparison),
+        "notes": notes(comparison),
+        "columns": columns,
+        "table": table(comparison),
+        "filters": FILTERS,
+        "cards": cards,
+        "thumbnails": thumbnails(folder, names, progress),
+        "image_index": index,
+        "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
+        "settings": flat(comparison.settings),
+        "method_options": [flat(column.method.options) for column in columns],
+        "views": views,
+        "kinds": KINDS,
+        "script_data": {
+            "matrices": [],
+            "views": [view.script_data(index, k) for view, k in zip(views, kinds, strict=True)],
+        },
+    }
+    folders = [folder, output_path.resolve()]
+    return page.write_page(output_path / "report.html", TEMPLATE, content, folders)
+
+
+def columns_of(comparison: Comparison) -> list[Column]:
+    """Give each method that finished a letter and a colour, the best first."""
+    letters = [*string.ascii_uppercase, *map(str, range(27, len(comparison.finished) + 1))]
+    marks = zip(letters, itertools.cycle(METHOD_COLORS), comparison.finished, strict=False)
+    return [Column(*mark) for mark in marks]
+
+
+def cards_of(columns: list[Column], comparison: Comparison) -> list[Card]:
     """Return the contact sheet."""
-    cards, with_truth = [], comparison.names_with_truth
+    cards = []
     for number, name in enumerate(comparison.image_names, 1):
-        marks = tuple(
-            _mark(column, number, name, has_truth=name in with_truth) for column in columns
-        )
+        marks = tuple(_mark(column, name) for column in columns)
+        kinds = {mark.kind for mark in marks}
+        registered = comparison.registered_by[name]
         tests = {
             "all": True,
-            "differ": len({name in c.method.usually_registered for c in columns}) > 1,
+            "differ": 0 < len(registered) < len(columns),
             "seeds": any(mark.state == "sometimes" for mark in marks),
-            "wrong": any(mark.is_wrong for mark in marks),
-            "uncertain": any(mark.is_uncertain for mark in marks),
-            "none": name in comparison.registered_by_none,
+            "wrong": "wrong" in kinds,
+            "uncertain": "uncertain" in kinds,
+            "none": not registered,
         }
         groups = tuple(group for group, passes in tests.items() if passes)
         cards.append(Card(number, name, marks, groups))
     return cards
 
 
-def _mark(column: Column, number: int, name: str, *, has_truth: bool) -> Mark:
+def _mark(column: Column, name: str) -> Mark:
     method, seeds = column.method, column.method.seeds
     registering = [seed for seed in seeds if name in seed.registered_names]
-    correct = [s for s in registering if s.scores is not None and name in s.scores.correct_names]
-    state, text = "always", f"{column.name}: registered"
+    state, kind, text = "always", "shared", f"{method.name}: registered"
     if not registering:
-        state, text = "never", f"{column.name}: not registered"
-    elif len(registering) < len(seeds):
+        return Mark(column, "never", kind, f"{method.name}: not registered")
+    if len(registering) < len(seeds):
         state = "sometimes"
         text += f" with {len(registering)} of {len(seeds)} seeds"
-    is_wrong = has_truth and len(correct) < len(registering)
-    if is_wrong:
-        text += f", correctly with {len(correct)}" if correct else ", wrongly"
-    elif correct:
-        text += ", correctly"
+    scores = [seed.scores for seed in registering if seed.scores]
+    num_correct = sum(name in each.correct_names for each in scores)
     doubt = method.usually_doubted.get(name)
-    if doubt and (is_wrong or not has_truth):
+    if any(name in each.wrong_names for each in scores):
+        kind = "wrong"
+        text += f", correctly with {num_correct}" if num_correct else ", wrongly"
+    elif num_correct:
+        text += ", correctly"
+    elif doubt:
+        kind = "uncertain"
+    if doubt and kind != "shared":
         text += f", doubtful: {doubt}"
-    is_uncertain = bool(doubt) and not has_truth
-    return Mark(number, name, state, is_wrong, text, column=column, is_uncertain=is_uncertain)
+    return Mark(column, state, kind, text)

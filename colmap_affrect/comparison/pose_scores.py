@@ -1,52 +1,29 @@
-"""Camera poses of a model against ground truth, or against another model."""
+"""Camera poses of a model against ground truth."""
 
 import itertools
-import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Annotated, Any
 
-import numpy as np
-from pydantic import BeforeValidator, PlainSerializer, computed_field
-
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Poses, pose_errors, relative_pose
 from colmap_affrect.pairs.base import Pair
 
-PairErrors = Annotated[
-    Mapping[Pair, tuple[float, float]],
-    BeforeValidator(lambda rows: {(row[0], row[1]): tuple(row[2:]) for row in rows}),
-    PlainSerializer(lambda errors: [[*pair, *both] for pair, both in errors.items()]),
-]
+PairErrors = Mapping[Pair, tuple[float, float]]
 """By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
-and of the direction of the translation; in JSON rows of both."""
-AUC_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
+and of the direction of the translation."""
 MAX_CORRECT_ERROR_DEG = 5.0
 """An image is registered correctly if its relative poses to at least half of the other registered
 images are off by at most this, in rotation and in translation direction."""
-MIN_IMAGES_TO_ALIGN = 3
-MAX_ALIGNMENT_ERROR = 0.05  # of the true extent; centres farther off do not decide alignment
 
 
 @dataclass(frozen=True)
 class PoseScores:
-    """A model against ground truth."""
+    """A model against ground truth, in the registered images that have a true pose."""
 
-    correct_names: tuple[str, ...]  # images registered correctly (``MAX_CORRECT_ERROR_DEG``)
-    pair_errors_deg: PairErrors  # of every pair of registered images that have ground truth
-    num_pairs: int  # of all images with truth; those without errors count as failures
-    auc: Mapping[str, float]  # area under the curve, 0 to 1, by the threshold in degrees
-    # of camera centres after similarity alignment, in units of the ground truth; None with fewer
-    # than three images, or all on one line
-    median_position_error: float | None
-
-    @computed_field  # type: ignore[prop-decorator]  # of a property, as pydantic documents it
-    @property
-    def median_rotation_error_deg(self) -> float | None:
-        """Of the pairs of registered images; None without pairs."""
-        return median(r for r, _ in self.pair_errors_deg.values()) if self.pair_errors_deg else None
+    correct_names: tuple[str, ...]  # registered correctly (``MAX_CORRECT_ERROR_DEG``)
+    wrong_names: tuple[str, ...]  # the others
+    median_rotation_error_deg: float | None  # of the pairs of these images; None without pairs
 
 
 def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
@@ -69,62 +46,14 @@ def correct_images(errors: PairErrors) -> tuple[str, ...]:
     return tuple(sorted(name for name in names if 2 * num_right[name] >= len(names) - 1))
 
 
-def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg: float) -> float:
-    """Return the area under the steps of recall over errors, divided by the threshold: 0 to 1.
-
-    Of ``num_pairs`` those without an error were not estimated.
-    """
-    if not num_pairs:
-        return 0.0
-    return math.fsum(max(0.0, 1.0 - error / threshold_deg) for error in errors_deg) / num_pairs
-
-
-def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
-    """Return distances of camera centres after a robust similarity, in units of the truth.
-
-    Empty with fewer than three images, or centres on one line.
-    """
-    names = sorted(estimated.keys() & truth.keys())
-    if len(names) < MIN_IMAGES_TO_ALIGN:
-        return {}
-    centres, true_centres = (
-        np.array([-poses[name][0].T @ poses[name][1] for name in names])
-        for poses in (estimated, truth)
-    )
-    extent = float(np.linalg.norm(np.ptp(true_centres, axis=0)))
-    robust: Any = pycolmap.estimate_sim3d_robust(  # its stub says Sim3d, it is a dictionary
-        centres,
-        true_centres,
-        pycolmap.RANSACOptions(max_error=MAX_ALIGNMENT_ERROR * extent, random_seed=0),
-    )
-    if not robust:
-        return {}
-    aligned = robust["tgt_from_src"]
-    moved = centres @ aligned.matrix()[:, :3].T + aligned.matrix()[:, 3]
-    return dict(zip(names, np.linalg.norm(moved - true_centres, axis=1).tolist(), strict=True))
-
-
 def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> PoseScores:
     """Measure the poses of registered images against ground truth, of the images given only."""
     given = {name: pose for name, pose in truth.items() if name in set(image_names)}
     errors = pair_errors(estimated, given)
-    largest = [max(both) for both in errors.values()]
-    num_pairs = math.comb(len(given), 2)
-    distances = list(position_errors(estimated, given).values())
+    correct = correct_images(errors)
+    names = {name for pair in errors for name in pair}
     return PoseScores(
-        correct_names=correct_images(errors),
-        pair_errors_deg=errors,
-        num_pairs=num_pairs,
-        auc={
-            f"{limit:g}": area_under_curve(largest, num_pairs, limit)
-            for limit in AUC_THRESHOLDS_DEG
-        },
-        median_position_error=float(np.median(distances)) if distances else None,
+        correct_names=correct,
+        wrong_names=tuple(sorted(names - set(correct))),
+        median_rotation_error_deg=median(r for r, _ in errors.values()) if errors else None,
     )
-
-
-def disagreeing_images(poses: Poses, other: Poses) -> tuple[str, ...]:
-    """Return common images whose poses relative to over half of the others contradict."""
-    errors = pair_errors(poses, other)
-    agreeing = set(correct_images(errors))
-    return tuple(sorted({name for pair in errors for name in pair} - agreeing))

@@ -1,29 +1,13 @@
-"""What a comparison found, as frozen data; pydantic writes and reads it."""
+"""What a comparison found, as plain data."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from statistics import fmean
-from typing import Annotated, Any, Self
-
-from pydantic import (
-    BeforeValidator,
-    Field,
-    PlainSerializer,
-    SerializerFunctionWrapHandler,
-    model_serializer,
-)
+from typing import Any, Self
 
 from colmap_affrect.comparison.pose_scores import PoseScores
-from colmap_affrect.pairs.base import Pair
-
-PairCounts = Annotated[
-    Mapping[Pair, int],
-    BeforeValidator(lambda rows: {(first, second): count for first, second, count in rows}),
-    PlainSerializer(lambda counts: [[*pair, count] for pair, count in sorted(counts.items())]),
-]
-"""Numbers by pair; in JSON rows of two names and a number."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +22,7 @@ class Span:
     def of(cls, values: Iterable[float]) -> Self:
         """Return the span of one or more values."""
         numbers = [float(value) for value in values]
-        return cls(sum(numbers) / len(numbers), min(numbers), max(numbers))
+        return cls(fmean(numbers), min(numbers), max(numbers))
 
 
 @dataclass(frozen=True)
@@ -46,84 +30,57 @@ class SeedResult:
     """Verification and mapping of one method with one seed."""
 
     seed: int
-    # image names of each model, the largest model first
-    model_names: Annotated[tuple[tuple[str, ...], ...], Field(alias="models")]
+    models: tuple[tuple[str, ...], ...]  # image names of each model, the largest first
     model_path: str  # the largest model, relative to the folder of the comparison; empty if none
+    verified_pairs: int
     # of the largest model, as all that follow
-    num_points3D: Annotated[int, Field(alias="points3D")]
+    points3D: int
     mean_track_length: float  # images per point
     mean_reprojection_error_px: float
-    pair_inliers: PairCounts  # of the verified pairs, whatever the model
-    scores: PoseScores | None  # against ground truth; None where there is none
-    wall_s: Mapping[str, float]  # seconds of ``verify`` and ``map``
-    doubtful: Mapping[str, str] = field(default_factory=dict)  # images that cannot be trusted: why
+    sure: tuple[str, ...] = ()  # images that the mapper is sure of
+    doubtful: Mapping[str, str] = field(default_factory=dict)  # images that may be wrong: why
+    wall_s: Mapping[str, float] = field(default_factory=dict)  # seconds of ``verify`` and ``map``
+    scores: PoseScores | None = None  # against ground truth; None where there is none
 
     @property
     def registered_names(self) -> tuple[str, ...]:
         """Images of the largest model."""
-        return self.model_names[0] if self.model_names else ()
+        return self.models[0] if self.models else ()
 
     @property
-    def correct_names(self) -> tuple[str, ...]:
-        """Images registered correctly; without ground truth those registered."""
-        return self.registered_names if self.scores is None else self.scores.correct_names
-
-    @model_serializer(mode="wrap")
-    def _with_measures(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {"seed": self.seed, **{k: m.of(self) for k, m in MEASURES.items()}, **plain(self)}
-
-
-Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
+    def right_names(self) -> tuple[str, ...]:
+        """Images registered correctly; without ground truth those that the mapper is sure of."""
+        return self.scores.correct_names if self.scores else self.sure
 
 
 @dataclass(frozen=True)
 class Measure:
     """A number of every seed, and how tables write it."""
 
+    title: str  # of its column
     of: Callable[[SeedResult], float | None]  # None where a seed has no such number
-    title: str  # of its line
-    digits: int  # decimals, where not all values are whole
-    better: Better = None
-    column: str = ""  # title of its column in the terminal; empty: not shown there
-
-
-def _of_scores(value: Callable[[PoseScores], float | None]) -> Callable[[SeedResult], float | None]:
-    return lambda seed: value(seed.scores) if seed.scores else None
+    digits: int = 1  # decimals, where not all values are whole
 
 
 def _of_model(name: str) -> Callable[[SeedResult], float | None]:
-    return lambda seed: getattr(seed, name) if seed.model_names else None
+    return lambda seed: getattr(seed, name) if seed.models else None
 
 
 MEASURES = {
-    "registered": Measure(
-        lambda seed: len(seed.registered_names), "Registered, of {images}", 1, max, "registered"
-    ),
-    "correct": Measure(
-        _of_scores(lambda scores: len(scores.correct_names)),
-        "Registered correctly, of {images}", 1, max, "correct",
-    ),
-    "num_doubtful": Measure(lambda seed: len(seed.doubtful), "Doubtful", 1, min),
-    "num_models": Measure(lambda seed: len(seed.model_names), "Models", 1),
-    "verified_pairs": Measure(
-        lambda seed: len(seed.pair_inliers), "Verified pairs, of {pairs}", 1, None, "verified"
-    ),
-    "points3D": Measure(_of_model("num_points3D"), "3D points", 0, max, "points"),
-    "mean_track_length": Measure(
-        _of_model("mean_track_length"), "Images per 3D point", 2, None, "track"
-    ),
-    "mean_reprojection_error_px": Measure(
-        _of_model("mean_reprojection_error_px"), "Reprojection error, px", 2, None, "px"
-    ),
+    "registered": Measure("registered", lambda seed: len(seed.registered_names)),
+    "correct": Measure("correct", lambda s: len(s.scores.correct_names) if s.scores else None),
+    "num_sure": Measure("sure", lambda seed: None if seed.scores else len(seed.sure)),
+    "num_doubtful": Measure("doubtful", lambda seed: None if seed.scores else len(seed.doubtful)),
+    "verified_pairs": Measure("pairs", lambda seed: seed.verified_pairs),
+    "points3D": Measure("points", _of_model("points3D"), 0),
+    "mean_track_length": Measure("track", _of_model("mean_track_length"), 2),
+    "mean_reprojection_error_px": Measure("px", _of_model("mean_reprojection_error_px"), 2),
     "median_rotation_error_deg": Measure(
-        _of_scores(lambda scores: scores.median_rotation_error_deg),
-        "Median rotation error, °", 2, min,
+        "degrees", lambda seed: seed.scores.median_rotation_error_deg if seed.scores else None, 2
     ),
-    "auc_5": Measure(
-        _of_scores(lambda scores: scores.auc["5"]), "AUC of relative poses at 5°", 3, max
-    ),
-}  # fmt: skip
-"""Numbers of every seed, by their names in JSON."""
+}
+"""Numbers of every seed, by their names in JSON. With ground truth it is correct that counts,
+without what the mapper is sure of."""
 
 
 @dataclass(frozen=True)
@@ -132,16 +89,13 @@ class MethodResult:
 
     name: str  # label of the method
     _: KW_ONLY
+    summary: str = ""  # of the method
+    folder: str = ""  # of its results, relative to the folder of the comparison
+    options: Mapping[str, Any] = field(default_factory=dict)
     failed: str = ""  # why it failed as a whole; empty if it did not
+    failures: Mapping[str, str] = field(default_factory=dict)  # images that cannot be used: why
     wall_s: Mapping[str, float] = field(default_factory=dict)  # of stages before all seeds
     peak_memory_bytes: int = 0
-    # by another method, images that both register with the first seed in contradicting poses
-    disagreements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    num_keypoints: Mapping[str, int] = field(default_factory=dict)  # of images that could be read
-    summary: str = ""
-    failures: Mapping[str, str] = field(default_factory=dict)  # images that cannot be used: why
-    options: Mapping[str, Any] = field(default_factory=dict)
-    folder: str = ""  # of its results, relative to the folder of the comparison
     seeds: tuple[SeedResult, ...] = ()  # in the order asked for; empty if the method failed
 
     def span(self, measure: str) -> Span | None:
@@ -156,9 +110,9 @@ class MethodResult:
         return Span.of(len(seed.registered_names) for seed in self.seeds)
 
     @property
-    def correct(self) -> Span | None:
-        """Images registered correctly; None without ground truth."""
-        return self.span("correct")
+    def right(self) -> Span:
+        """Images registered correctly; without ground truth those that the mapper is sure of."""
+        return Span.of(len(seed.right_names) for seed in self.seeds)
 
     @property
     def shown_seed(self) -> SeedResult | None:
@@ -168,19 +122,13 @@ class MethodResult:
     @cached_property
     def usually_registered(self) -> frozenset[str]:
         """Images that more than half of the seeds register."""
-        return in_most([seed.registered_names for seed in self.seeds])
-
-    @cached_property
-    def usually_correct(self) -> frozenset[str]:
-        """Images that more than half of the seeds register correctly (without truth: register)."""
-        return in_most([seed.correct_names for seed in self.seeds])
+        return _in_most([seed.registered_names for seed in self.seeds])
 
     @cached_property
     def usually_doubted(self) -> dict[str, str]:
-        """Images that cannot be trusted in more than half of the seeds, with a reason."""
-        seeds = [dict(seed.doubtful) for seed in self.seeds]
-        names = in_most([list(reasons) for reasons in seeds])
-        return {name: next(r[name] for r in seeds if name in r) for name in sorted(names)}
+        """Images that are doubtful with more than half of the seeds, with a reason."""
+        reasons = {name: why for seed in self.seeds for name, why in seed.doubtful.items()}
+        return {n: reasons[n] for n in sorted(_in_most([[*s.doubtful] for s in self.seeds]))}
 
     @property
     def stage_seconds(self) -> dict[str, float]:
@@ -194,18 +142,8 @@ class MethodResult:
         """Seconds from photographs to one model."""
         return sum(self.stage_seconds.values())
 
-    @model_serializer(mode="wrap")
-    def _with_spans(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {
-            **{key: self.span(key) for key in MEASURES},
-            "registered_names": {str(s.seed): s.registered_names for s in self.seeds},
-            "total_s": self.total_s,
-            **plain(self),
-            "wall_s": self.stage_seconds,
-        }
 
-
-def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
+def _in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
     """Return what more than half of the seeds name."""
     counts = Counter(name for names in names_of_seeds for name in names)
     return frozenset(name for name, count in counts.items() if 2 * count > len(names_of_seeds))
@@ -224,43 +162,31 @@ class Comparison:
     versions: Mapping[str, str]
 
     @property
-    def finished(self) -> tuple[MethodResult, ...]:
-        """The methods that did not fail."""
-        return tuple(method for method in self.methods if not method.failed)
-
-    @property
-    def only_registered_by(self) -> dict[str, str]:
-        """Image name to the one method that usually registers it."""
-        methods = {
-            name: [method.name for method in self.finished if name in method.usually_registered]
-            for name in self.image_names
-        }
-        return {name: found[0] for name, found in methods.items() if len(found) == 1}
-
-    @cached_property
-    def registered_by_none(self) -> tuple[str, ...]:
-        """Images that no method usually registers."""
-        registered = frozenset().union(*(method.usually_registered for method in self.finished))
-        return tuple(name for name in self.image_names if name not in registered)
+    def finished(self) -> list[MethodResult]:
+        """The methods that did not fail, most photographs first, of equals the fastest."""
+        methods = [method for method in self.methods if not method.failed]
+        return sorted(methods, key=lambda m: (-m.right.mean, -m.registered.mean, m.total_s))
 
     @property
     def has_ground_truth(self) -> bool:
         """Whether models were measured against ground truth."""
-        return any(method.correct for method in self.finished)
+        return any(seed.scores for method in self.methods for seed in method.seeds)
 
     @cached_property
-    def names_with_truth(self) -> frozenset[str]:
-        """Images whose poses were measured against ground truth, by any method."""
-        scores = [seed.scores for method in self.finished for seed in method.seeds if seed.scores]
-        return frozenset(name for each in scores for pair in each.pair_errors_deg for name in pair)
-
-    @model_serializer(mode="wrap")
-    def _with_totals(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = plain(self)
+    def registered_by(self) -> dict[str, list[str]]:
+        """Names of the methods that usually register each image."""
+        finished = self.finished
         return {
-            "images_total": len(self.image_names),
-            "only_registered_by": self.only_registered_by,
-            "registered_by_none": self.registered_by_none,
-            "methods": {method.pop("name"): method for method in values.pop("methods")},
-            **values,
+            name: [method.name for method in finished if name in method.usually_registered]
+            for name in self.image_names
         }
+
+    @property
+    def only_registered_by(self) -> dict[str, str]:
+        """Image name to the one method that usually registers it."""
+        return {name: found[0] for name, found in self.registered_by.items() if len(found) == 1}
+
+    @property
+    def registered_by_none(self) -> tuple[str, ...]:
+        """Images that no method usually registers."""
+        return tuple(name for name, found in self.registered_by.items() if not found)

@@ -1,153 +1,114 @@
-"""The table of methods that finished, on the page and in the terminal; and JSON."""
+"""The table of methods and what it means in words, and ``comparison.json``."""
 
-import itertools
 import json
-import string
 import textwrap
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from itertools import zip_longest
 
-from pydantic import TypeAdapter
+from colmap_affrect.comparison.methods import SIFT_COLMAP, SIFT_SUMMARIES
+from colmap_affrect.comparison.results import MEASURES, Comparison, Span
+from colmap_affrect.errors import such_as
+from colmap_affrect.project.report import by_story
 
-from colmap_affrect.comparison.results import MEASURES, Better, Comparison, MethodResult, Span
-from colmap_affrect.comparison.verdict import ranked, verdict
-from colmap_affrect.project.record import STAGES
-
-METHOD_COLORS = (
-    "#0b62a8", "#a34700", "#00714f", "#9b2d79", "#5d4bb0", "#7a5c00", "#a3213b", "#46606e",
-)  # fmt: skip
-"""Of the marks of methods; white text on them is readable."""
-MAIN_ROWS = {
-    "registered", "correct", "num_models", "verified_pairs", "points3D", "mean_track_length",
-    "total_s",
-}  # fmt: skip
-"""Rows that decide; the others are folded away."""
 BYTES_PER_MB = 1_000_000
 NOTHING = "-"  # where there is no number
+MIN_IMAGES = 3  # fewer are a pair, not a reconstruction
+MAX_NAMES = 6  # of photographs in a sentence
 WIDTH = 88  # of the verdict in the terminal
 
 
-@dataclass(frozen=True)
-class Column:
-    """A method that finished, as it is marked everywhere on the page."""
+def table(comparison: Comparison) -> dict[str, list[str]]:
+    """Return a cell for each method that finished, the best first, by the titles of columns.
 
-    letter: str
-    color: str
-    method: MethodResult
-
-    @property
-    def name(self) -> str:
-        """Of the method."""
-        return self.method.name
-
-
-def columns_of(comparison: Comparison) -> list[Column]:
-    """Give each method that finished a letter and a colour, the best first."""
-    letters = [*string.ascii_uppercase, *map(str, range(27, len(comparison.finished) + 1))]
-    marks = zip(letters, itertools.cycle(METHOD_COLORS), ranked(comparison.finished), strict=False)
-    return [Column(*mark) for mark in marks]
+    Numbers are means over the seeds, with the range where seeds differ.
+    """
+    methods, columns = comparison.finished, dict[str, list[str]]()
+    for key, measure in MEASURES.items():
+        spans = [method.span(key) for method in methods]
+        if any(spans):
+            columns[measure.title] = [span_text(span, measure.digits) for span in spans]
+    columns["seconds"] = [f"{method.total_s:,.1f}" for method in methods]
+    columns["MB"] = [f"{method.peak_memory_bytes / BYTES_PER_MB:,.0f}" for method in methods]
+    return columns
 
 
-@dataclass(frozen=True)
-class Row:
-    """A line of the table of methods, and which cells have the best value, where methods differ."""
+def span_text(span: Span | None, digits: int = 1) -> str:
+    """Write a mean, and the range where its ends differ; whole numbers without decimals.
 
-    key: str
-    title: str
-    cells: list[str]
-    best: tuple[bool, ...]
-    column: str  # its title in the terminal; empty: not shown there
-
-    @property
-    def is_main(self) -> bool:
-        """Whether it is one of those that decide."""
-        return self.key in MAIN_ROWS
-
-
-def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]:
-    """Return the table of methods, without the lines that say nothing of any of them."""
-    methods = [column.method for column in columns]
-    counts = {"images": len(comparison.image_names), "pairs": f"{comparison.num_pairs:,}"}
-    stages = {stage for method in methods for stage in method.stage_seconds}
-    rows = [
-        _row(key, m.title.format(**counts), m.digits, m.better, m.column,
-             [method.span(key) for method in methods])
-        for key, m in MEASURES.items()
-        if key != "num_models"
-    ]  # fmt: skip
-    splits = [_splits(method) for method in methods]
-    rows.insert(2, Row("num_models", "Images in each model", splits, (False,) * len(splits), ""))
-    costs: list[tuple[str, str, int, str, list[float | None]]] = [
-        *((f"{stage}_s", f"Seconds to {stage}", 1, "",
-           [method.stage_seconds.get(stage) for method in methods])
-          for stage in sorted(stages, key=STAGES.index)),
-        ("total_s", "Seconds in all", 1, "seconds", [method.total_s for method in methods]),
-        ("peak_memory_bytes", "Peak memory, MB", 0, "MB",
-         [method.peak_memory_bytes / BYTES_PER_MB for method in methods]),
-    ]  # fmt: skip
-    for key, title, digits, column, values in costs:
-        spans = [None if value is None else Span.of([value]) for value in values]
-        rows.append(_row(key, title, digits, min, column, spans))
-    return [row for row in rows if any(cell != NOTHING for cell in row.cells)]
-
-
-def _row(
-    key: str, title: str, digits: int, better: Better, column: str, spans: Sequence[Span | None]
-) -> Row:
-    """Write means and, in brackets, ranges with as many decimals in all cells as any needs."""
-    known = [span for span in spans if span]
-    means = {round(span.mean, digits) for span in known}
-    best = better(means) if better and len(means) > 1 else None
-    digits_of_mean = digits_of((span.mean for span in known), digits)
-    digits_of_ends = digits_of((end for span in known for end in (span.min, span.max)), digits)
-    cells = [span_text(span, digits_of_mean, digits_of_ends) for span in spans]
-    is_best = tuple(span is not None and round(span.mean, digits) == best for span in spans)
-    return Row(key, title, cells, is_best, column)
-
-
-def digits_of(values: Iterable[float], digits: int) -> int:
-    """Return so many digits after the point, none where all values are whole."""
-    return 0 if all(value == round(value) for value in values) else digits
-
-
-def span_text(span: Span | None, digits: int = 1, digits_of_ends: int = 0) -> str:
-    """Write a mean, and the range where its ends differ as they are written.
-
-    >>> span_text(Span.of([7, 8])), span_text(Span.of([8, 8])), span_text(None)
-    ('7.5 (7-8)', '8.0', '-')
+    >>> span_text(Span.of([7, 8])), span_text(Span.of([8])), span_text(Span.of([0.5, 0.501]), 2)
+    ('7.5 (7-8)', '8', '0.50')
     """
     if span is None:
         return NOTHING
-    mean = f"{span.mean:,.{digits}f}"
-    low, high = (f"{end:,.{digits_of_ends}f}" for end in (span.min, span.max))
+    mean, low, high = (
+        f"{number:,.{0 if number == round(number) else digits}f}"
+        for number in (span.mean, span.min, span.max)
+    )
     return mean if low == high else f"{mean} ({low}-{high})"
 
 
-def _splits(method: MethodResult) -> str:
-    splits = [" + ".join(str(len(m)) for m in s.model_names) or "none" for s in method.seeds]
-    if len(set(splits)) == 1:
-        return splits[0]
-    pairs = zip(method.seeds, splits, strict=True)
-    return "; ".join(f"seed {seed.seed}: {split}" for seed, split in pairs)
+def verdict(comparison: Comparison) -> list[str]:
+    """Return what the numbers mean, the most important paragraph first."""
+    return [headline(comparison), *notes(comparison)]
+
+
+def headline(comparison: Comparison) -> str:
+    """Say what COLMAP, our mapper with its SIFT, and our features get from the photographs."""
+    finished, total = comparison.finished, len(comparison.image_names)
+    if not finished:
+        return "No method finished."
+    most = max(method.registered.max for method in finished)
+    if most < MIN_IMAGES <= total:
+        return (
+            f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
+            "photographs."
+        )
+    kinds = {
+        "COLMAP as it is": [m for m in finished if m.name == SIFT_COLMAP],
+        "our mapper with COLMAP's SIFT": [
+            m for m in finished if m.name in SIFT_SUMMARIES and m.name != SIFT_COLMAP
+        ],
+        "our features": [m for m in finished if m.name not in SIFT_SUMMARIES],
+    }
+    what = "correct" if comparison.has_ground_truth else "sure"
+    texts = [
+        f"{kind}{'' if best.name == SIFT_COLMAP else f' ({best.name})'} "
+        f"{span_text(best.registered)} ({span_text(best.right)} {what})"
+        for kind, methods in kinds.items()
+        for best in methods[:1]
+    ]
+    return f"Of {total} photographs are registered: {'; '.join(texts)}."
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """Return what follows on the counts: what is missing or doubtful, and which methods failed."""
+    finished = comparison.finished
+    texts = []
+    if len(finished) > 1:
+        only = comparison.only_registered_by
+        for method in finished:
+            if names := [name for name, by in only.items() if by == method.name]:
+                texts.append(f"Only {method.name} registers {such_as(names, MAX_NAMES)}.")
+    if finished and (missing := comparison.registered_by_none):
+        texts.append(f"Registered by no method: {such_as(missing, MAX_NAMES)}.")
+    texts += [f"{m.name} failed: {m.failed}" for m in comparison.methods if m.failed]
+    if not comparison.has_ground_truth:
+        for method in finished:
+            doubts = by_story(method.usually_doubted)
+            texts += [f"Doubtful in {method.name}: {line}." for line in doubts]
+    if absent := comparison.settings.get("not_compared"):
+        texts.append(f"Not compared for want of weights: {absent}")
+    return texts
 
 
 def summary(comparison: Comparison) -> str:
-    """Return the verdict under a table of methods."""
-    columns = columns_of(comparison)
-    rows = [row for row in summary_rows(columns, comparison) if row.column]
-    cells = {
-        column.name: [
-            f"{row.cells[index]}{f' of {len(comparison.image_names)}' * (row.key == 'registered')}"
-            for row in rows
-        ]
-        for index, column in enumerate(columns)
-    }
-    table = [[method.name, *cells.get(method.name, ["failed"])] for method in comparison.methods]
-    lines = [aligned([["method", *(row.column for row in rows)], *table])]
-    only = comparison.only_registered_by if len(comparison.finished) > 1 else {}
-    lines += [""] * bool(only)
-    lines += [f"only {method} registers {name}" for name, method in only.items()]
+    """Return the table of methods, and the verdict under it."""
+    columns = table(comparison)
+    names = [method.name for method in comparison.finished]
+    rows = [[name, *(cells[k] for cells in columns.values())] for k, name in enumerate(names)]
+    rows += [[method.name, "failed"] for method in comparison.methods if method.failed]
+    lines = [aligned([["method", *columns], *rows])]
     for paragraph in verdict(comparison):
         lines += ["", *textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)]
     return "\n".join(lines)
@@ -172,6 +133,18 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 
 def to_json(comparison: Comparison) -> str:
     """Return ``comparison.json``: all results, and the verdict first."""
-    content = TypeAdapter(Comparison).dump_python(comparison, mode="json", by_alias=True)
-    values = {"verdict": verdict(comparison), **content}
-    return json.dumps(values, indent=2, ensure_ascii=False) + "\n"
+    content = asdict(comparison)
+    for method, values in zip(comparison.methods, content["methods"], strict=True):
+        values |= {key: span and asdict(span) for key in MEASURES for span in [method.span(key)]}
+        values["registered_names"] = {str(s.seed): s.registered_names for s in method.seeds}
+        values |= {"total_s": method.total_s, "wall_s": method.stage_seconds}
+        for seed, numbers in zip(method.seeds, values["seeds"], strict=True):
+            numbers |= {key: measure.of(seed) for key, measure in MEASURES.items()}
+    content["methods"] = {values.pop("name"): values for values in content["methods"]}
+    totals = {
+        "verdict": verdict(comparison),
+        "images_total": len(comparison.image_names),
+        "only_registered_by": comparison.only_registered_by,
+        "registered_by_none": comparison.registered_by_none,
+    }
+    return json.dumps({**totals, **content}, indent=2, ensure_ascii=False) + "\n"

@@ -18,7 +18,6 @@ from pydantic import BeforeValidator
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, pose_errors
-from colmap_affrect.comparison.pose_scores import area_under_curve
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
@@ -240,6 +239,12 @@ def rays(camera: pycolmap.Camera, points: Points) -> Points:
     return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
 
 
+def area_under_curve(errors_deg: Sequence[float], threshold_deg: float) -> float:
+    """Return the area under the steps of recall over errors, divided by the threshold: 0 to 1."""
+    shares = (max(0.0, 1.0 - error / threshold_deg) for error in errors_deg)
+    return math.fsum(shares) / max(1, len(errors_deg))
+
+
 def pose_columns(results: Results, *, by_category: bool = True) -> dict[str, float]:
     """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
 
@@ -251,7 +256,7 @@ def pose_columns(results: Results, *, by_category: bool = True) -> dict[str, flo
     groups["all"] = [result.error < MAX_ERROR_DEG for result in results]
     columns = {title: sum(below) / max(1, len(below)) for title, below in groups.items()}
     largest = [max(r.error, r.details.get("direction_error_deg", math.inf)) for r in results]
-    area = area_under_curve(largest, len(results), MAX_AUC_ERROR_DEG)
+    area = area_under_curve(largest, MAX_AUC_ERROR_DEG)
     return {**columns, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": area}
 
 

@@ -1,0 +1,123 @@
+"""The table of methods and the sentences about it, on results made for them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from colmap_affrect.comparison.pose_scores import PoseScores
+from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
+from colmap_affrect.comparison.tables import headline, notes, summary, table, to_json
+
+NAMES = tuple("abcdef")
+Methods = list[MethodResult]
+
+
+def method(
+    name: str, *names_of_seeds: str, correct: str | None = None, **settings: Any
+) -> MethodResult:
+    """A method whose photographs are all sure, but for those that are doubtful."""
+    seeds = []
+    for seed, names in enumerate(names_of_seeds):
+        doubtful = {n: why for n, why in settings.items() if n in names}
+        scores = None
+        if correct is not None:
+            scores = PoseScores(tuple(correct), tuple(set(names) - set(correct)), 0.5)
+        sure = tuple(n for n in names if n not in doubtful)
+        models, times = (tuple(names),) if names else (), {"verify": 1.0, "map": 3.0 + 2 * seed}
+        figures = (50, 900, 3.0, 0.25)
+        seeds.append(SeedResult(seed, models, "", *figures, sure, doubtful, times, scores))
+    return MethodResult(name, seeds=tuple(seeds), wall_s={"extract": 6.0})
+
+
+def comparison(*methods: MethodResult) -> Comparison:
+    return Comparison(NAMES, "photos", methods, (0, 1), 15, {}, {})
+
+
+SIFT, COLMAP, DEFAULT = method("sift", "abc"), method("sift-colmap", "ab"), method("default", NAMES)
+FAILED = MethodResult("sift", failed="no weights")
+
+
+@pytest.mark.parametrize(
+    ("methods", "expected"),
+    [
+        ([], "No method finished."),
+        (
+            [SIFT, method("default", "abcd", "abcde"), COLMAP],
+            "Of 6 photographs are registered: COLMAP as it is 2 (2 sure); our mapper with COLMAP's "
+            "SIFT (sift) 3 (3 sure); our features (default) 4.5 (4-5) (4.5 (4-5) sure).",
+        ),
+        (
+            [method("sift", "abc", correct="abc"), method("default", "abcdef", correct="ab")],
+            "Of 6 photographs are registered: our mapper with COLMAP's SIFT (sift) 3 (3 correct); "
+            "our features (default) 6 (2 correct).",
+        ),
+        (
+            [method("sift", ""), method("default", "ab", "")],
+            "Nothing was reconstructed: no method registers more than 2 of the 6 photographs.",
+        ),
+    ],
+)
+def test_headline_counts_what_each_kind_of_method_registers(methods: Methods, expected: str):
+    assert headline(comparison(*methods)) == expected
+
+
+@pytest.mark.parametrize(
+    ("methods", "expected"),
+    [
+        (
+            [SIFT, method("default", "abd", "abde", "bd")],
+            ["Only sift registers c.", "Only default registers d.",
+             "Registered by no method: e, f."],
+        ),
+        ([DEFAULT, FAILED], ["sift failed: no weights"]),
+        ([FAILED], ["sift failed: no weights"]),
+        (
+            [method("default", NAMES, c="any focal length fits", d="any focal length fits")],
+            ["Doubtful in default: c, d: any focal length fits."],
+        ),
+        ([method("default", NAMES, correct="abcdef", c="any focal length fits")], []),
+    ],
+)  # fmt: skip
+def test_what_is_missing_doubtful_or_failed_in_most_seeds_is_told(
+    methods: Methods, expected: list[str]
+):
+    assert notes(comparison(*methods)) == expected
+
+
+def test_table_has_the_best_method_first_and_ranges_over_the_seeds():
+    without = replace(method("none", ""), peak_memory_bytes=10**8)
+    columns = table(comparison(without, SIFT, method("default", "abcd", "abcde")))
+    assert columns == {
+        "registered": ["4.5 (4-5)", "3", "0"],
+        "sure": ["4.5 (4-5)", "3", "0"],
+        "doubtful": ["0", "0", "0"],
+        "pairs": ["50", "50", "50"],
+        "points": ["900", "900", "-"],
+        "track": ["3", "3", "-"],
+        "px": ["0.25", "0.25", "-"],
+        "seconds": ["11.0", "10.0", "10.0"],
+        "MB": ["0", "0", "100"],
+    }
+
+
+def test_json_and_summary_say_the_same():
+    compared = comparison(SIFT, method("default", "abcd", "abcde", correct="abc"), FAILED)
+    values = json.loads(to_json(compared))
+    assert values["verdict"] == [headline(compared), *notes(compared)]
+    assert (values["images_total"], values["registered_by_none"]) == (6, ["e", "f"])
+    default = values["methods"]["default"]
+    assert default["registered"] == {"mean": 4.5, "min": 4.0, "max": 5.0}
+    assert default["registered_names"] == {"0": [*"abcd"], "1": [*"abcde"]}
+    assert (default["wall_s"]["map"], default["total_s"]) == (4.0, 11.0)
+    seed = default["seeds"][0]
+    assert (seed["registered"], seed["correct"], seed["points3D"]) == (4, 3, 900)
+    assert seed["scores"]["correct_names"] == [*"abc"]
+    found, _, text = summary(compared).partition("\n\n")
+    rows = [line.split() for line in found.splitlines()]
+    assert [row[0] for row in rows] == ["method", "default", "sift", "sift"]
+    assert rows[-1] == ["sift", "failed"]
+    assert max(map(len, text.splitlines())) <= 88
