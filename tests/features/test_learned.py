@@ -15,7 +15,7 @@ from random_weights import write_random_weights
 from colmap_affrect.errors import WeightsError
 from colmap_affrect.features.base import EXTRACTORS, NetworkContext
 from colmap_affrect.features.learned import RADIUS_PX, LearnedFeatures
-from colmap_affrect.features.weights import WEIGHT_FILES, describe_weights
+from colmap_affrect.features.weights import WEIGHT_FILES, find
 
 COURTYARD = Path(__file__).resolve().parents[2] / "sample_scenes" / "courtyard"
 SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
@@ -53,7 +53,7 @@ def photograph() -> np.ndarray:
 @pytest.fixture
 def published(key: str) -> dict[str, Path]:
     folder = SHARED_WEIGHTS if SHARED_WEIGHTS.is_dir() else None
-    path = next(row.path for row in describe_weights(folder) if row.key == key)
+    path = find(key, folder)
     if path is None:
         pytest.skip(f"{WEIGHT_FILES[key].file_name} is not here: see colmap-affrect weights")
     return {key: path}
