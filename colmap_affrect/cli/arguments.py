@@ -94,8 +94,8 @@ CAMERAS = (
         "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5"),
     _path("--cameras-path", "FILE",
         "known cameras: folder of a COLMAP model of these images, or a CSV file "
-        "with the columns name and any of focal_px, focal_mm with sensor_width_mm or "
-        "plate_width_mm (of what the whole image shows), model, params, cx, cy, camera (images "
+        "with the columns name and any of focal_px, focal_mm with plate_width_mm "
+        "(of what the whole image shows), model, params, cx, cy, camera (images "
         "with one label share a camera)"),
     _value("--focal-length-px", "PX",
         "known focal length of images that --cameras-path does not name; the rest is refined",

@@ -3,19 +3,27 @@
 COLMAP's database only has a flag that somebody does; ``cameras.json`` beside it says who.
 """
 
-import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import TypeAdapter
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    TypeAdapter,
+    model_validator,
+)
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import camera_like, read_given_model
-from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_again, such_as
+from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_again
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.options import Options
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
@@ -30,8 +38,6 @@ Given = Literal["focal", "principal-point", "distortion"]
 
 TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
 """Sources whose focal lengths are priors before any pair has been verified."""
-
-MAX_LINES = 5  # groups of cameras that are logged
 
 
 @dataclass(frozen=True)
@@ -83,33 +89,65 @@ def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> Non
     replace_text(path, with_checksum(content.decode()))
 
 
-def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
-    """Return a line for the cameras of each source and reason, at most a few."""
-    groups = defaultdict(list)
-    for record in records:
-        if record.why:
-            groups[f"{record.source}: {record.why}"].append(record)
-    lines = []
-    for what, same in groups.items():
-        names = [name for record in same for name in record.names]
-        ends = sorted({round(record.focal_px) for record in same})
-        focal = " to ".join(map(str, dict.fromkeys((ends[0], ends[-1]))))
-        lines.append(f"{such_as(names)}: focal length {focal} px, {what}")
-    more = len(lines) - MAX_LINES
-    return lines if more <= 1 else [*lines[:MAX_LINES], f"and {more} more, see report.json"]
+def _known_model(name: str) -> str:
+    """Refuse what is no camera model of COLMAP with a focal length."""
+    models = [
+        model
+        for model, number in pycolmap.CameraModelId.__members__.items()
+        if (like := camera_like(number.value)) and len(like.focal_length_idxs())
+    ]
+    if name not in models:
+        raise ValueError(f"{name} is not one of {', '.join(models)}")
+    return name
 
 
-WIDTHS = ("sensor_width_mm", "plate_width_mm")
-CENTER = ("cx", "cy")
-COLUMNS = ("name", "camera", "model", "params", "focal_px", "focal_mm", *WIDTHS, *CENTER)
-"""Of tables of cameras; only the name is needed."""
+def _split(text: object) -> object:
+    """Separate numbers at commas, semicolons and spaces."""
+    return text.replace(",", " ").replace(";", " ").split() if isinstance(text, str) else text
 
-EXCLUSIVE: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
-    (("params",), COLUMNS[4:]),
-    (("focal_px",), ("focal_mm", *WIDTHS)),
-    (WIDTHS[:1], WIDTHS[1:]),
-)
-"""Columns of which a row may fill those of one side only."""
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class _Row(Options):
+    """What a row of a table, or the options, say of a camera; only the name is needed."""
+
+    model_config = ConfigDict(strict=False)
+
+    name: str
+    camera: str = ""
+    """Images with the same label share a camera."""
+    model: Annotated[str, AfterValidator(_known_model)]
+    params: Annotated[tuple[FiniteFloat, ...], BeforeValidator(_split)] = ()
+    focal_px: Positive | None = None
+    focal_mm: Positive | None = None
+    plate_width_mm: Positive | None = None
+    """Width of what the whole image shows, of a plate or a sensor."""
+    cx: FiniteFloat | None = None
+    cy: FiniteFloat | None = None
+
+    @model_validator(mode="after")
+    def _says_all_once(self) -> Self:
+        if self.params and (self.focal_px or self.focal_mm or self.cx is not None):
+            raise ValueError("params have focal length and principal point; leave these out")
+        if self.focal_px and self.focal_mm:
+            raise ValueError("focal_px and focal_mm say the same twice; leave one out")
+        if (self.focal_mm is None) != (self.plate_width_mm is None):
+            raise ValueError(
+                "focal_mm needs plate_width_mm, the width of what the whole image shows, and the "
+                "other way round"
+            )
+        if (self.cx is None) != (self.cy is None):
+            raise ValueError("give both cx and cy, or none")
+        like = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1)
+        if len(self.params) not in (0, len(like.params)):
+            raise ValueError(
+                f"params: {self.model} needs {len(like.params)} values ({like.params_info}), not "
+                f"{len(self.params)}"
+            )
+        if self.params and any(self.params[index] <= 0.0 for index in like.focal_length_idxs()):
+            raise ValueError(f"params: a focal length of {self.params[0]:g} px cannot be")
+        return self
 
 
 @dataclass(frozen=True)
@@ -121,7 +159,7 @@ class GivenCamera:
     focal_px: float = 0.0  # focal length
     focal_widths: float = 0.0  # focal length in units of the width of what the whole image shows
     principal_point: tuple[float, ...] = ()  # x, y in COLMAP's px, from the corner of the image
-    size: tuple[int, ...] = ()  # (width, height) in px of the images that it is of
+    size: tuple[int, ...] = ()  # (width, height) in px of its images; only of a model
     label: str = field(default="", compare=False)  # images with one label share a camera
     where: str = field(default="", compare=False)  # file and line
 
@@ -132,22 +170,13 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     Raises OptionError for options that are wrong or contradict each other, and for a file that
     cannot be read, naming the line.
     """
-    _require_model(options.model, "--camera-model")
-    others = GivenCamera(
-        model=options.model,
-        params=_numbers(options.params, "--camera-params"),
-        focal_px=options.focal_length_px,
-        principal_point=_numbers(options.principal_point, "--principal-point"),
-        where="the options",
-    )
-    if others.params and (others.focal_px or others.principal_point):
-        raise OptionError(
-            "--camera-params: has focal length and principal point already; leave out "
-            "--focal-length-px and --principal-point"
-        )
-    _require_params(others, "--camera-params")
-    if len(others.principal_point) not in (0, 2):
-        raise OptionError(f"--principal-point {options.principal_point}: give cx,cy, two numbers")
+    says = {"name": "", "model": options.model, "params": options.params}
+    if options.focal_length_px:
+        says["focal_px"] = str(options.focal_length_px)
+    if options.principal_point:
+        says["cx"], _, says["cy"] = options.principal_point.replace(",", " ").partition(" ")
+    where = "--camera-model, --camera-params, --focal-length-px or --principal-point"
+    others = _given(_Row.from_mapping(says, where), "the options")
     if not options.cameras_path:
         return {"": others}
     path = Path(options.cameras_path)
@@ -156,38 +185,16 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     return {"": others, **found}
 
 
-def _numbers(text: str, where: str) -> tuple[float, ...]:
-    """Read finite numbers that commas, semicolons or spaces separate."""
-    try:
-        values = tuple(float(word) for word in text.replace(",", " ").replace(";", " ").split())
-    except ValueError as error:
-        raise OptionError(f"{where} {text}: not numbers separated by commas") from error
-    if not all(math.isfinite(value) for value in values):
-        raise OptionError(f"{where} {text}: has a number that is not finite")
-    return values
-
-
-def _require_model(name: str, where: str) -> None:
-    models = [
-        model
-        for model, number in pycolmap.CameraModelId.__members__.items()
-        if (like := camera_like(number.value)) and len(like.focal_length_idxs())
-    ]
-    if name not in models:
-        raise OptionError(f"{where} {name}: not one of {', '.join(models)}")
-
-
-def _require_params(given: GivenCamera, where: str) -> None:
-    if not given.params:
-        return
-    expected = pycolmap.Camera.create_from_model_name(1, given.model, 1.0, 1, 1)
-    if len(given.params) != len(expected.params):
-        raise OptionError(
-            f"{where}: {given.model} needs {len(expected.params)} values "
-            f"({expected.params_info}), not {len(given.params)}"
-        )
-    if any(given.params[index] <= 0.0 for index in expected.focal_length_idxs()):
-        raise OptionError(f"{where}: a focal length of {given.params[0]:g} px cannot be")
+def _given(row: _Row, where: str) -> GivenCamera:
+    return GivenCamera(
+        row.model,
+        row.params,
+        row.focal_px or 0.0,
+        row.focal_mm / row.plate_width_mm if row.focal_mm and row.plate_width_mm else 0.0,
+        () if row.cx is None or row.cy is None else (row.cx, row.cy),
+        label=f"label/{row.camera}" if row.camera else "",
+        where=where,
+    )
 
 
 def _read_model(path: Path) -> dict[str, GivenCamera]:
@@ -207,80 +214,28 @@ def _read_model(path: Path) -> dict[str, GivenCamera]:
 
 
 def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
-    """Read a CSV file with a header; rows may leave cells empty."""
+    """Read a CSV file with a header; rows may leave cells empty, which are as in the options."""
     found: dict[str, GivenCamera] = {}
     labels: dict[str, GivenCamera] = {}
-    for place, row in read_table(path, f"--cameras-path {path}", COLUMNS):
-        name = row.get("name", "")
-        if not name or name in found:
-            raise OptionError(f"{place}: {f'{name} is there twice' if name else 'has no name'}")
-        given = found[name] = _read_row(row, others, place)
+    for place, cells in read_table(path, f"--cameras-path {path}", list(_Row.model_fields)):
+        row = _Row.from_mapping({"model": others.model, **cells}, place)
+        if row.name in found:
+            raise OptionError(f"{place}: {row.name} is there twice")
+        given = _given(row, place)
+        if cells.keys() <= {"name", "camera"}:
+            given = replace(given, params=others.params)
+        if not (given.params or given.focal_px or given.focal_widths):
+            given = replace(given, focal_px=others.focal_px)
+        if not (row.params or given.principal_point):
+            given = replace(given, principal_point=others.principal_point)
+        found[row.name] = given
         first = labels.setdefault(given.label, given)
         if given.label and given != first:
             raise OptionError(
-                f"{place}: says something else of camera '{row['camera']}' than "
+                f"{place}: says something else of camera '{row.camera}' than "
                 f"{first.where.rpartition(', ')[2]}; give them two labels, or the same values"
             )
     return found
-
-
-def _read_row(row: Mapping[str, str], others: GivenCamera, where: str) -> GivenCamera:
-    """Return the camera of a row; what it says nothing of is as in the options."""
-    _refuse_contradictions(row, where)
-    focal_px, focal_mm, *widths = (_number(row, column, where) for column in COLUMNS[4:8])
-    center = tuple(_number(row, column, where) for column in CENTER if column in row)
-    model = row.get("model", others.model)
-    _require_model(model, f"{where}: model")
-    params = _numbers(row.get("params", ""), f"{where}: params")
-    has_focal = bool(params or focal_mm or focal_px)
-    says_nothing = row.keys() <= {"name", "camera"}
-    given = GivenCamera(
-        model,
-        params or (others.params if says_nothing else ()),
-        focal_px or (0.0 if has_focal else others.focal_px),
-        focal_mm / max(widths) if focal_mm else 0.0,
-        center or (() if params else others.principal_point),
-        label=f"label/{row['camera']}" if "camera" in row else "",
-        where=where,
-    )
-    _require_params(given, f"{where}: params")
-    return given
-
-
-def _refuse_contradictions(row: Mapping[str, str], where: str) -> None:
-    for columns in EXCLUSIVE:
-        first, second = ([name for name in names if name in row] for names in columns)
-        if first and second:
-            raise OptionError(
-                f"{where}: {first[0]} and {second[0]} say the same twice; leave one out"
-            )
-    if ("focal_mm" in row) != any(name in row for name in WIDTHS):
-        raise OptionError(
-            f"{where}: focal_mm needs sensor_width_mm or plate_width_mm, the width of what the "
-            "whole image shows, and these need focal_mm"
-        )
-    if ("cx" in row) != ("cy" in row):
-        raise OptionError(f"{where}: give both cx and cy, or none")
-
-
-def _number(row: Mapping[str, str], column: str, where: str) -> float:
-    """Return a number, positive unless it is a coordinate; 0 where there is none."""
-    if column not in row:
-        return 0.0
-    values = _numbers(row[column], f"{where}: {column}")
-    if len(values) != 1 or (values[0] <= 0.0 and column not in CENTER):
-        kind = "number" if column in CENTER else "positive number"
-        raise OptionError(f"{where}: {column} {row[column]}: not a {kind}")
-    return values[0]
-
-
-def unknown_names(
-    given: Mapping[str, GivenCamera], image_path: Path, names: Sequence[str]
-) -> list[str]:
-    """Return the names in a table that no photograph has; of a model, if it has none of them."""
-    others = [name for name in given if name and not (image_path / name).is_file()]
-    is_model = any(camera.label.startswith("model/") for camera in given.values())
-    return [] if is_model and given.keys() & set(names) else others
 
 
 def with_shared_cameras(records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:

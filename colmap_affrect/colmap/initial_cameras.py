@@ -21,10 +21,8 @@ from colmap_affrect.colmap.cameras import (
     Given,
     GivenCamera,
     Source,
-    notable_lines,
     read_camera_records,
     read_given_cameras,
-    unknown_names,
     write_camera_records,
 )
 from colmap_affrect.colmap.cancellable import run_leavable
@@ -36,7 +34,7 @@ from colmap_affrect.colmap.database import (
     require_database_space,
     write_frame,
 )
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, such_as
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
@@ -48,6 +46,8 @@ from colmap_affrect.images.exif import (
 from colmap_affrect.images.headers import is_too_large
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.outputs import remove_database
+
+MAX_LINES = 5  # that are logged; report.json says all
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +103,9 @@ class InitialCameras:
 
         OptionError names the option, or file and line, and what to do.
         """
-        if unknown := unknown_names(self._given, self.image_path, names):
+        unknown = [n for n in self._given if n and not (self.image_path / n).is_file()]
+        is_model = any(given.size for given in self._given.values())  # of more images, perhaps
+        if unknown and not (is_model and self._given.keys() & set(names)):
             given = self.given(unknown[0])
             raise OptionError(f"{given.where}: {unknown[0]} is not in {self.image_path}")
         for group, same in self.groups(names).items():
@@ -328,8 +330,12 @@ def record_cameras(
             records[camera_id] = _record(cameras[camera_id], same, initial)
     if records != before:
         write_camera_records(records_path, records)
-        for line in notable_lines(r for key, r in records.items() if r != before.get(key)):
-            logger.info("cameras: %s", line)
+        reasons: defaultdict[str, list[str]] = defaultdict(list)
+        for key, record in records.items():
+            if record.why and record != before.get(key):
+                reasons[record.why] += record.names
+        for why, concerned in list(reasons.items())[:MAX_LINES]:
+            logger.info("cameras: %s: %s", such_as(concerned), why)
 
 
 def _record(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import (
     CameraRecord,
-    notable_lines,
     read_camera_records,
     read_given_cameras,
     write_camera_records,
@@ -66,14 +64,14 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
             ["name,focal_px", "a,3,4"],
             "line 2: has 3 cells and the first line 2; values with commas",
         ),
-        (["name,focal_px", "a,long"], "line 2: focal_px long: not numbers"),
-        (["name,focal_px", "a,0"], "line 2: focal_px 0: not a positive number"),
-        (["name,focal_px", "a,1e999"], "not finite"),
-        (["name,focal_mm", "a,50"], "line 2: focal_mm needs sensor_width_mm or plate_width_mm"),
+        (["name,focal_px", "a,long"], "line 2: focal_px='long': should be a valid number"),
+        (["name,focal_px", "a,0"], "line 2: focal_px='0': should be greater than 0"),
+        (["name,focal_px", "a,1e999"], "a finite number"),
+        (["name,focal_mm", "a,50"], "line 2: focal_mm needs plate_width_mm"),
         (["name,focal_px,focal_mm", "a,5,5"], "line 2: focal_px and focal_mm say the same twice"),
         (["name,cx", "a," + "5" * 200_000], "line 2: field larger than field limit"),
         (["name,cx", "a,5"], "line 2: give both cx and cy, or none"),
-        (["name,model", "a,PINHOL"], "line 2: model PINHOL: not one of SIMPLE_PINHOLE"),
+        (["name,model", "a,PINHOL"], "line 2: model: PINHOL is not one of SIMPLE_PINHOLE"),
         (["name,model,params", "a,PINHOLE,1 2 3"], r"line 2: params: PINHOLE needs 4 values \(fx"),
         (
             ["name,focal_px,camera", "a,3,X", "b,,Y", "c,4,X"],
@@ -92,10 +90,13 @@ def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], messa
     ("options", "message"),
     [
         ({"focal_length_px": -1.0}, "greater than or equal"),
-        ({"params": "900,450,300,0", "focal_length_px": 5.0}, "--camera-params: has focal length"),
-        ({"model": "PINHOL"}, "--camera-model PINHOL: not one of"),
-        ({"params": "0,450,300,0"}, "--camera-params: a focal length of 0 px cannot be"),
-        ({"principal_point": "1"}, "--principal-point 1: give cx,cy, two numbers"),
+        (
+            {"params": "900,450,300,0", "focal_length_px": 5.0},
+            "--camera-params, .*: params have focal length",
+        ),
+        ({"model": "PINHOL"}, "--camera-model, .* model: PINHOL is not one of"),
+        ({"params": "0,450,300,0"}, "params: a focal length of 0 px cannot be"),
+        ({"principal_point": "1"}, "--principal-point: cy='': should be a valid number"),
         ({"cameras_path": "nowhere.csv"}, "--cameras-path nowhere.csv: cannot be read .No such"),
     ],
 )
@@ -152,13 +153,3 @@ def test_report_has_the_focal_length_in_longer_sides_and_the_refined_one() -> No
     assert entry["focal_longer_sides"] == pytest.approx(1.25)
     known = FROM_EXIF.to_report(3, None)
     assert known["refined_px"] is None
-
-
-def test_only_cameras_with_a_story_are_named_and_not_all() -> None:
-    assert notable_lines([FROM_EXIF]) == []
-    (line,) = notable_lines([FROM_EXIF, VOTED])
-    assert line == "c.jpg: focal length 500 px, pairs: 40 pairs agree"
-    (line,) = notable_lines([VOTED, replace(VOTED, names=("d", "e", "f"), focal_px=700.4)])
-    assert line == "c.jpg, d, e and 1 more: focal length 500 to 700 px, pairs: 40 pairs agree"
-    lines = notable_lines([replace(VOTED, why=str(index)) for index in range(9)])
-    assert (len(lines), lines[-1]) == (6, "and 4 more, see report.json")
