@@ -4,7 +4,7 @@ A pose is (R, t) with ``x2 = R x1 + t`` for points in the two camera frames; ray
 normalized image coordinates, the point at depth z being ``z (x, y, 1)``.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -73,10 +73,6 @@ NUM_NEIGHBORS = 5  # known places looked at beside each place of a pair
 NUM_INDEPENDENT = 10  # ratios that count at most: all share the errors of the same poses
 NUM_ON_PLANE = 12  # known places to which a plane is fitted
 MAX_PLANE_ERROR = 0.04  # relative, of a predicted inverse depth and of those it is fitted to
-MIN_KNOWN = 20  # known depths that a depth map is fitted to
-MAX_FITTED = 500  # known depths of which pairs are tried and counted; more are thinned
-
-MAX_UNEXPLAINED = 0.5  # part of the spread of known depths that a depth map may leave unexplained
 
 
 def scale_between(
@@ -118,76 +114,6 @@ def scale_by_planes(
     certain = (predicted > 0) & (np.maximum(errors, spreads) < MAX_PLANE_ERROR * predicted)
     ratios = -np.log(predicted[certain] * places[1][full[certain]])
     return _densest(full[certain], ratios, np.ones(len(ratios)))
-
-
-def scale_by_depth_map(
-    known: tuple[Array, Array], places: tuple[Array, Array]
-) -> ScaleEstimate | None:
-    """Estimate the scale as :func:`scale_between`, by a depth map where nothing else is near.
-
-    Inverse depths of the map are those of the model up to scale and shift, which are fitted to the
-    known depths robustly, and hold between the nearest and the farthest of these only. Both
-    arguments have depths of the map, NaN where it has none, (K,) and (N,), and then the known ones
-    or, all positive, those of the pair.
-    """
-    known_map, known_inverse = (1.0 / part[np.isfinite(known[0])] for part in known)
-    fitted = _fitted_to(known_map, known_inverse)
-    if fitted is None:
-        return None
-    (slope, shift), errors = fitted
-    agreeing = errors <= TOLERANCE
-    with np.errstate(invalid="ignore"):
-        inverse_depths = 1.0 / places[0]
-        inside = (inverse_depths >= known_map[agreeing].min()) & (
-            inverse_depths <= known_map[agreeing].max()
-        )
-    rows = np.flatnonzero(inside)
-    ratios = -np.log((slope * inverse_depths[rows] + shift) * places[1][rows])
-    found = _densest(rows, ratios, np.ones(len(rows)))
-    if found is None:
-        return None
-    of_fit = np.sqrt(np.mean(errors[agreeing] ** 2) / min(int(agreeing.sum()), NUM_INDEPENDENT))
-    return replace(found, error_frac=float(np.hypot(found.error_frac, of_fit)))
-
-
-def _fitted_to(values: Array, inverse_depths: Array) -> tuple[Array, Array] | None:
-    """Fit ``slope * value + shift`` to inverse depths that may be wrong, up to half of them.
-
-    Returns both, and (K,) errors of the logarithm; None where values do not explain the depths.
-    """
-    if len(values) < MIN_KNOWN:
-        return None
-    some = np.argsort(values)[:: -(-len(values) // MAX_FITTED)]
-    half = len(some) // 2
-    starts, ends = np.meshgrid(some[:half], some[half :: max(1, half // 10)], indexing="ij")
-    runs = values[ends] > values[starts]
-    first, second = starts[runs], ends[runs]
-    slopes = (inverse_depths[second] - inverse_depths[first]) / (values[second] - values[first])
-    lines = np.stack([slopes, inverse_depths[first] - slopes * values[first]], axis=1)
-    if not len(lines):
-        return None
-    errors = _log_errors(lines, values[some], inverse_depths[some])
-    line = lines[np.argmin(np.median(errors, axis=1))]
-    for _ in range(3):
-        agrees = _log_errors(line[None], values, inverse_depths)[0] <= TOLERANCE
-        if agrees.sum() < MIN_KNOWN:
-            return None
-        system = np.stack([values, np.ones(len(values))], axis=1) / inverse_depths[:, None]
-        line = np.linalg.lstsq(system[agrees], np.ones(int(agrees.sum())), rcond=None)[0]
-    errors = _log_errors(line[None], values, inverse_depths)[0]
-    logs = np.log(inverse_depths)
-    spread = np.median(np.abs(logs - np.median(logs)))
-    if line[0] <= 0 or np.median(errors) > min(TOLERANCE, MAX_UNEXPLAINED * spread):
-        return None
-    return line, errors
-
-
-def _log_errors(lines: Array, values: Array, inverse_depths: Array) -> Array:
-    """Return (L, K) errors of the logarithms that (L, 2) lines predict; infinite if negative."""
-    predicted = lines[:, :1] * values + lines[:, 1:]
-    ratios = np.maximum(predicted, 0.0) / inverse_depths
-    with np.errstate(divide="ignore"):
-        return np.abs(np.log(ratios))
 
 
 def _densest(rows: Indices, ratios: Array, weights: Array) -> ScaleEstimate | None:

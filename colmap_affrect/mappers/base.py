@@ -41,11 +41,6 @@ class MapperOptions(PartOptions, PresetOptions):
     """The mapper can register images into an existing model, ``MappingTask.extend``."""
 
 
-DepthLookup = Callable[[str, NDArray[np.floating]], NDArray[np.float64]]
-"""Returns what the depth map of an image, by its name, has at (N, 2) px of COLMAP: (N,) depths in
-any unit, inverse depths in any unit and with any shift; NaN where it has none."""
-
-
 @dataclass(frozen=True, eq=False)
 class MappingTask:
     """What to map.
@@ -60,7 +55,6 @@ class MappingTask:
         measured: (M, 2) inliers of measured frames, of pairs of image names that have others, too.
         cameras: what is known of the cameras, by id.
         may_share: images of one size may turn out to share a camera that nobody knows.
-        depth_at: depth maps of the images, where there are any.
     """
 
     database_path: Path
@@ -72,7 +66,6 @@ class MappingTask:
     measured: Mapping[tuple[str, str], NDArray[np.int64]] = field(default_factory=dict)
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
     may_share: bool = False
-    depth_at: DepthLookup | None = None
 
     @property
     def colors_path(self) -> Path:

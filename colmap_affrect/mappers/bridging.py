@@ -19,7 +19,6 @@ from colmap_affrect.colmap.poses import Pose
 from colmap_affrect.geometry.two_views import (
     ScaleEstimate,
     scale_between,
-    scale_by_depth_map,
     scale_by_planes,
 )
 from colmap_affrect.mappers.base import Bridge
@@ -215,24 +214,9 @@ class Bridges:
         places = self.graph.keypoints[image_id][relative.matches[in_front, side]]
         known = part.known_depths(image_id)
         positive = depths[in_front]
-        return (
-            _trusted(scale_between(known, (places, positive), radius))
-            or _trusted(scale_by_planes(known, (places, positive), PLANE_RADIUS * radius))
-            or _trusted(self._scale_by_depth_map(image_id, known, (places, positive)))
+        return _trusted(scale_between(known, (places, positive), radius)) or _trusted(
+            scale_by_planes(known, (places, positive), PLANE_RADIUS * radius)
         )
-
-    def _scale_by_depth_map(
-        self,
-        image_id: int,
-        known: tuple[NDArray[np.floating], NDArray[np.float64]],
-        given: tuple[NDArray[np.floating], NDArray[np.float64]],
-    ) -> ScaleEstimate | None:
-        if self.graph.depth_at is None:
-            return None
-        both = np.concatenate([known[0], given[0]])
-        depths = self.graph.depth_at(self.graph.names[image_id], both)
-        of_known, of_given = np.split(depths, [len(known[0])])
-        return scale_by_depth_map((of_known, known[1]), (of_given, given[1]))
 
     def _judged(
         self,

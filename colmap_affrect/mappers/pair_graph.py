@@ -25,7 +25,7 @@ from colmap_affrect.geometry.two_views import (
     essential_matrix,
     triangulated_depths,
 )
-from colmap_affrect.mappers.base import DepthLookup, MappingTask
+from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.thinning import matches_of_best_tracks
 
 Ids = tuple[int, int]  # of two images
@@ -111,7 +111,6 @@ class PairGraph:
         pairs: sorted by ids.
         weak: verified pairs that are not among the strongest, and in the cache only.
         min_num_matches: pairs with fewer inliers are left out.
-        depth_at: depth maps of the images, where there are any.
     """
 
     cache: pycolmap.DatabaseCache
@@ -121,14 +120,12 @@ class PairGraph:
     pairs: tuple[VerifiedPair, ...]
     weak: tuple[VerifiedPair, ...]
     min_num_matches: int
-    depth_at: DepthLookup | None = None
 
     @classmethod
     def read(
         cls,
         path: Path,
         min_num_matches: int = MIN_NUM_MATCHES,
-        depth_at: DepthLookup | None = None,
     ) -> Self:
         """Read the pairs with at least as many inliers."""
         with open_database(path) as database:
@@ -152,7 +149,7 @@ class PairGraph:
         names = {image_id: image.name for image_id, image in images.items()}
         of_images = {image_id: cameras[image.camera_id] for image_id, image in images.items()}
         strong, weak = _strongest(verified)
-        return cls(cache, names, of_images, keypoints, strong, weak, min_num_matches, depth_at)
+        return cls(cache, names, of_images, keypoints, strong, weak, min_num_matches)
 
     def without(self, ids: Collection[Ids]) -> Self:
         """Leave out some pairs."""
@@ -298,7 +295,7 @@ class PairGraph:
 @lru_cache(maxsize=2)  # the task of all attempts, and that of one
 def graph_of(task: MappingTask, min_num_matches: int = MIN_NUM_MATCHES) -> PairGraph:
     """Return the graph of what is to be mapped; of one task it is read once."""
-    return PairGraph.read(task.database_path, min_num_matches, task.depth_at)
+    return PairGraph.read(task.database_path, min_num_matches)
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[int, Pose]:

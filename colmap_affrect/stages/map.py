@@ -24,7 +24,6 @@ from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.depth_lookup import depth_lookup
 from colmap_affrect.stages.escalate import measured_inliers
 from colmap_affrect.stages.guide import guided_matches
 from colmap_affrect.stages.pairs import listed_pairs
@@ -102,7 +101,6 @@ def _task(context: Context, existing: ExistingModel | None, may_share: bool | No
         measured={} if copied else measured_inliers(context),
         cameras=read_camera_records(workspace.cameras),
         may_share=_may_share(context) if may_share is None else may_share,
-        depth_at=None if copied else depth_lookup(context),
     )
 
 

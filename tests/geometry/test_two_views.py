@@ -13,7 +13,6 @@ from colmap_affrect.geometry.two_views import (
     essential_matrix,
     homogeneous,
     scale_between,
-    scale_by_depth_map,
     scale_by_planes,
     triangulated_depths,
 )
@@ -77,62 +76,11 @@ def test_plane_carries_depths_to_where_nothing_is_known_and_only_a_plane_does() 
     assert scale_by_planes((known, rough), given, 160.0) is None
 
 
-def rugged(points: np.ndarray) -> np.ndarray:
-    """Depths of steps and waves, without planes."""
-    steps = 2.0 * (points[:, 1] > 300) + 1.5 * (points[:, 0] % 170 > 60)
-    return np.asarray(3.0 + steps + np.sin(points[:, 0] / 37.0) * np.cos(points[:, 1] / 23.0))
-
-
-def known_and_places() -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """Points and their true depths left, and depths of the pair far away to the right."""
-    random = np.random.default_rng(4)
-    known = random.uniform((0, 0), (400, 700), (300, 2))
-    places = random.uniform((500, 50), (1000, 650), (120, 2))
-    return (known, rugged(known)), (places, rugged(places) / SCALE)
-
-
-@pytest.mark.parametrize(("slope", "shift"), [(1.0, 0.0), (4.0, -0.3)])
-def test_depth_map_of_any_scale_and_shift_gives_the_scale_far_away(
-    slope: float, shift: float
-) -> None:
-    (known, depths), (places, given) = known_and_places()
-    random = np.random.default_rng(5)
-
-    def read(points: np.ndarray) -> np.ndarray:
-        true = rugged(points) * np.exp(random.normal(0, 0.015, len(points)))
-        return np.where(random.random(len(points)) < 0.1, np.nan, 1 / (slope / true + shift))
-
-    wrong = random.random(len(known)) < 0.25
-    depths = np.where(wrong, depths * np.exp(random.uniform(-2, 2, len(known))), depths)
-    found = scale_by_depth_map((read(known), depths), (read(places), given))
-    assert found is not None
-    assert found.scale == pytest.approx(SCALE, rel=0.03)
-    assert found.num_ratios > 80
-    assert found.share > 0.9
-    assert 0.0 < found.error_frac < 0.03
-
-
-def test_wrong_depth_map_and_one_that_explains_nothing_are_refused() -> None:
-    (known, depths), (places, given) = known_and_places()
-    turned = [rugged(np.array([1000, 700]) - part) for part in (known, places)]
-    upside_down = [1.0 / part for part in (rugged(known), rugged(places))]
-    for of_known, of_places in (turned, upside_down):
-        assert scale_by_depth_map((of_known, depths), (of_places, given)) is None
-    flat = 5.0 + 0.01 * depths
-    of_known, of_places = turned
-    assert scale_by_depth_map((of_known, flat), (of_places, given)) is None
-    few = slice(0, 15)
-    assert scale_by_depth_map((rugged(known)[few], depths[few]), (rugged(places), given)) is None
-
-
 @pytest.mark.parametrize("estimate", [scale_between, scale_by_planes])
 def test_without_known_depths_or_places_there_is_no_scale(estimate: Callable[..., object]) -> None:
     nothing, something = (np.zeros((0, 2)), np.zeros(0)), (np.zeros((20, 2)), np.ones(20))
     for known, places in ((nothing, something), (something, nothing)):
         assert estimate(known, places, 10.0) is None
-    ramp = np.linspace(1.0, 2.0, 30)
-    assert scale_by_depth_map((np.zeros(0), np.zeros(0)), (ramp, ramp)) is None
-    assert scale_by_depth_map((ramp, ramp), (np.full(9, np.nan), np.ones(9))) is None
 
 
 SIZES: tuple[Size, Size] = ((640, 480), (640, 480))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Poses, model_poses, pose_errors, relative_pose
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.mappers.base import DepthLookup, MappedModel
+from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.loops import contradicting_pairs, dispensable
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
@@ -41,7 +41,7 @@ def views(count: int) -> Poses:
     return found
 
 
-def wall(random: np.random.Generator, count: int, _: tuple[int, int]) -> NDArray[np.float64]:
+def wall(random: np.random.Generator, count: int) -> NDArray[np.float64]:
     """Points of two slanted planes that meet in an edge."""
     x, y = random.uniform(-3, 9, count), random.uniform(-3, 3, count)
     return np.stack([x, y, 7.0 + 0.35 * np.abs(x - 3.0) + 0.1 * y], axis=1)
@@ -51,9 +51,6 @@ def write_scene(
     path: Path,
     poses: Poses,
     pairs: Iterable[tuple[int, int]],
-    num_points: int = 600,
-    scene: Callable[[np.random.Generator, int, tuple[int, int]], NDArray[np.float64]] | None = None,
-    noise_px: float = NOISE_PX,
 ) -> None:
     """Write a verified database in which each pair of images has features of its own."""
     random = np.random.default_rng(5)
@@ -61,12 +58,12 @@ def write_scene(
     keypoints = {i: [np.zeros((0, 2))] for i in range(len(names))}
     matches = {}
     for first, second in pairs:
-        points = (scene or wall)(random, num_points, (first, second))
+        points = wall(random, 600)
         seen = [project(points, poses[names[i]]) for i in (first, second)]
         inside = np.logical_and(*(is_inside(part) for part in seen))
         starts = [sum(map(len, keypoints[i])) for i in (first, second)]
         for i, part in zip((first, second), seen, strict=True):
-            keypoints[i].append(part[inside] + random.normal(0, noise_px, (inside.sum(), 2)))
+            keypoints[i].append(part[inside] + random.normal(0, NOISE_PX, (inside.sum(), 2)))
         rows = np.arange(inside.sum())
         matches[first, second] = np.stack([starts[0] + rows, starts[1] + rows], axis=1)
     with closing(pycolmap.Database.open(path)) as database:
@@ -99,9 +96,9 @@ def is_inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         return np.asarray(((points > 0) & (points < (WIDTH, HEIGHT))).all(axis=1))
 
 
-def mapped(path: Path, output_path: Path, depth_at: DepthLookup | None = None) -> list[MappedModel]:
+def mapped(path: Path, output_path: Path) -> list[MappedModel]:
     output_path.mkdir()
-    task = task_with_given_cameras(path, depth_at=depth_at)
+    task = task_with_given_cameras(path)
     return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None)
 
 
@@ -134,62 +131,6 @@ def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path
         assert bridge.pair[1] in bridge.names or bridge.pair[0] == bridge.pair[1]
         assert bridge.num_agreeing > 0.8 * bridge.num_ratios
         assert 0.0 < bridge.scale_error_frac < MAX_SCALE_ERROR
-
-
-SLOPE, SHIFT = 0.13, 0.4
-"""From inverse depths to those that a network predicts."""
-
-
-def halves(poses: Poses) -> Callable[..., NDArray[np.float64]]:
-    """Return a cloud that fills the left of image 1 for one pair, the right for the other."""
-
-    def cloud(random: np.random.Generator, count: int, pair: tuple[int, int]) -> NDArray:
-        left = 20.0 if pair == (0, 1) else 600.0
-        places = random.uniform((left, 20), (left + 380, HEIGHT - 20), (count, 2))
-        rays = np.column_stack([places, np.ones(count)]) @ np.linalg.inv(MATRIX).T
-        rotation, translation = poses["1.jpg"]
-        return (rays * depth_in_image_1(places)[:, None] - translation) @ rotation
-
-    return cloud
-
-
-def depth_in_image_1(places: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Depths without planes."""
-    waves = np.sin(places[:, 0] / 31.0) * np.cos(places[:, 1] / 43.0)
-    return np.asarray(7.0 + 2.0 * waves + 1.5 * (places[:, 1] > 300))
-
-
-@pytest.mark.long
-def test_depth_map_gives_the_scale_where_no_neighbours_and_no_plane_do(tmp_path: Path) -> None:
-    truth = views(3)
-    path = tmp_path / "database.db"
-    # Half an image leaves relative poses, and so depths, uncertain: little noise.
-    write_scene(path, truth, [(0, 1), (1, 2)], 900, halves(truth), noise_px=0.1)
-    asked = set()
-
-    def depth_at(name: str, places: NDArray[np.floating]) -> NDArray[np.float64]:
-        asked.add(name)
-        if name != "1.jpg":
-            return np.full(len(places), np.nan)
-        return 1.0 / (SLOPE / depth_in_image_1(places) + SHIFT)
-
-    def wrong(name: str, places: NDArray[np.floating]) -> NDArray[np.float64]:
-        return depth_at(name, np.array([WIDTH, HEIGHT]) - places[:, ::-1] + (90, -40))
-
-    assert [len(model_poses(m.reconstruction)) for m in mapped(path, tmp_path / "none")] == [2]
-    assert [len(model_poses(m.reconstruction)) for m in mapped(path, tmp_path / "w", wrong)] == [2]
-    (model,) = mapped(path, tmp_path / "models", depth_at)
-    assert "1.jpg" in asked
-    found = model_poses(model.reconstruction)
-    assert sorted(found) == sorted(truth)
-    (bridge,) = model.bridges
-    assert bridge.num_agreeing > 0.8 * bridge.num_ratios
-    assert 0.0 < bridge.scale_error_frac < MAX_SCALE_ERROR
-    steps, true_steps = (
-        np.linalg.norm(np.diff(centers(poses), axis=0), axis=1) for poses in (found, truth)
-    )
-    ratio = (steps[1] / true_steps[1]) / (steps[0] / true_steps[0])
-    assert ratio == pytest.approx(1.0, abs=MAX_SCALE_ERROR)
 
 
 @pytest.mark.long
