@@ -192,7 +192,7 @@ def evaluate(options: argparse.Namespace) -> int:
     )
     show(evaluation.to_json() if options.json else evaluation.summary())
     if not options.json:
-        show(f"\nplot, all pairs: {options.output_path}")
+        show(f"\nall pairs: {options.output_path / 'evaluation.json'}")
     failures = {name: why for recipe in evaluation.recipes for name, why in recipe.failures.items()}
     return _exit_code(failures, options)
 

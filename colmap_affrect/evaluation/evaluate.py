@@ -1,4 +1,4 @@
-"""Evaluate recipes on a dataset by a protocol: features, matches, scores, tables, a plot.
+"""Evaluate recipes on a dataset by a protocol: features, matches, scores, tables.
 
 ``features/`` and ``pairs/`` (scores of pairs) are by recipe and a digest of what decides them: only
 what changed is made again.
@@ -13,39 +13,22 @@ from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import EvaluationError, OptionError, such_as
 from colmap_affrect.evaluation import datasets, truths
 from colmap_affrect.evaluation.datasets import Dataset
-from colmap_affrect.evaluation.results import (
-    SECONDS,
-    Evaluation,
-    RecipeResult,
-    published,
-    write_plot,
-)
+from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, published
 from colmap_affrect.evaluation.runner import RecipeRun
 from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
-from colmap_affrect.images.reading import require_png
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Resources
 
-
-@dataclass(frozen=True)
-class Protocol:
-    """How a dataset is read and summed up."""
-
-    load: Callable[[Path], Dataset]
-    columns: Callable[[Sequence[PairResult]], dict[str, float]]  # of the table, in order
-    error_title: str  # what the error of a score is, with its unit
-
-
-ERROR_PX, ERROR_DEG = "mean reprojection error of the visible part (px)", "rotation error [deg]"
-PROTOCOLS = {
-    "evd": Protocol(datasets.load_evd, truths.homography_columns, ERROR_PX),
-    "svp": Protocol(datasets.load_svp, truths.pose_columns, ERROR_DEG),
-    "imc": Protocol(datasets.load_imc, truths.pose_columns, ERROR_DEG),
-    "pairs": Protocol(datasets.load_pairs, truths.columns_by_kind, "error (px; poses: degrees)"),
+PROTOCOLS: dict[str, Callable[[Path], Dataset]] = {
+    "evd": datasets.load_evd,
+    "svp": datasets.load_svp,
+    "imc": datasets.load_imc,
+    "pairs": datasets.load_pairs,
 }
+"""How datasets are read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,13 +63,12 @@ def evaluate(
     """Score recipes on a dataset by one of ``PROTOCOLS``.
 
     An image or pair that cannot be used counts as failed. One that was stopped goes on, unless
-    ``overwrite`` discards features and scores of these recipes. Writes ``evaluation.json`` and
-    ``errors.png``, too. AffrectError for what the caller can mend, before any image is worked on.
+    ``overwrite`` discards features and scores of these recipes. Writes ``evaluation.json``, too.
+    AffrectError for what the caller can mend, before any image is worked on.
     """
-    require_png()
     if protocol not in PROTOCOLS:
         raise OptionError(f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}")
-    chosen, options = PROTOCOLS[protocol], options or EvaluateOptions()
+    options = options or EvaluateOptions()
     methods = options.methods()
     if not dataset_path.is_dir():
         raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
@@ -98,7 +80,7 @@ def evaluate(
     }
     inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
     with Workspace(output_path).locked():
-        dataset = chosen.load(dataset_path)
+        dataset = PROTOCOLS[protocol](dataset_path)
         problems = [f"{pair.name}: {pair.problem}" for pair in dataset.pairs if pair.problem]
         note = f"{len(problems)} of {len(dataset.pairs)} pairs count as failed: {such_as(problems)}"
         if len(problems) == len(dataset.pairs):
@@ -108,36 +90,31 @@ def evaluate(
         results = {run.label: run.results(progress) for run in runs}
         evaluation = Evaluation(
             protocol=protocol,
-            error_title=chosen.error_title,
             dataset_path=inputs["dataset_path"],
             settings=settings,
             notes=(*dataset.notes, *([note] if problems else [])),
-            recipes=tuple(_summed(run, results[run.label], chosen) for run in runs),
+            recipes=tuple(_summed(run, results[run.label]) for run in runs),
             published=published(protocol),
             versions=installed_versions(),
         )
         replace_text(output_path / "evaluation.json", evaluation.to_json())
-        write_plot(evaluation, output_path / "errors.png")
     return evaluation
 
 
-def _summed(run: RecipeRun, results: Sequence[PairResult], protocol: Protocol) -> RecipeResult:
-    extracted = sorted(
-        run.extracted.values(), key=lambda record: (record["image"], record["level"])
-    )
-    num_images = len({record["image"] for record in extracted})
-    extract_s = sum(record["seconds"] for record in extracted)
-    timed = [result.seconds_by_step for result in results if result.seconds_by_step]
-    steps = {s: sum(each[s] for each in timed) / max(1, len(timed)) for s in ("match", "estimate")}
-    total_s = extract_s + sum(result.seconds for result in results)
+def _summed(run: RecipeRun, results: Sequence[PairResult]) -> RecipeResult:
     return RecipeResult(
         name=run.label,
         description=run.recipe.summary,
-        summary={**protocol.columns(results), SECONDS: total_s},
-        solved=fmean(result.solved for result in results),
-        num_images=num_images,
-        seconds_per_step={"extract": extract_s / max(1, num_images), **steps},
+        summary=truths.columns(results),
+        costs={
+            "solved": fmean(result.solved for result in results),
+            "failed": sum(bool(result.failure) for result in results),
+            "keypoints": fmean(fmean(result.num_keypoints) for result in results),
+            "matches": fmean(result.num_matches for result in results),
+            "inliers": fmean(result.num_inliers for result in results),
+            SECONDS: sum(result.seconds for result in results),
+        },
         failures=run.failures,
-        warnings={r["image"]: r["warning"] for r in extracted if r["warning"]},
+        warnings=run.warnings,
         pairs=tuple(results),
     )

@@ -4,11 +4,9 @@ A pair is matched as a run of its two images alone would match it, with cameras 
 of escalation the one with most inliers of COLMAP's verification counts.
 """
 
-import json
 import logging
 import math
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,8 +29,8 @@ from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.options import digest_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
-from colmap_affrect.progress import Progress
-from colmap_affrect.project.atomic_files import replace_bytes, replace_text
+from colmap_affrect.progress import Progress, Stopwatch
+from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.stages.context import Resources
@@ -50,8 +48,8 @@ class RecipeRun:
     """One recipe on the pairs of a dataset.
 
     Attributes:
-        extracted: records by image and level: ``image``, ``level``, ``seconds``, ``warning``.
         failures: images that could not be used in this run, with the reason.
+        warnings: images that this run did not rectify though they were to be.
     """
 
     def __init__(
@@ -80,14 +78,12 @@ class RecipeRun:
             names = [f"*/{method.folder_name}-????????{end}" for end in ("", ".h5")]
             remove_own(path for name in names for path in output_path.glob(name))
         made = digest_of([inputs, extraction.to_mapping(), digests(self._extractor.weights)])
-        self._features = output_path / "features" / f"{method.folder_name}-{made[:8]}"
-        self._store = FeatureStore(self._features.with_suffix(".h5"), made)
         scored = digest_of([made, matching.to_mapping(), settings])
         self._scores = output_path / "pairs" / f"{method.folder_name}-{scored[:8]}"
-        for folder in (self._features, self._scores):
+        features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
+        for folder in (features.parent, self._scores):
             folder.mkdir(parents=True, exist_ok=True)
-        paths = self._features.glob("*.json")
-        self.extracted = {path.name: json.loads(path.read_bytes()) for path in paths}
+        self._store = FeatureStore(features, made)
         budget = settings["max_num_keypoints"]
         self._matchings = []
         for level, chosen in enumerate(extraction.levels):
@@ -95,6 +91,7 @@ class RecipeRun:
             task = Matching(self._store, of, level, chosen.base, kind, resources, budget)
             self._matchings.append(task)
         self.failures: dict[str, str] = {}
+        self.warnings: dict[str, str] = {}
         self._lock = Lock()  # of extraction and of the store
 
     def results(self, progress: Progress) -> list[PairResult]:
@@ -115,17 +112,17 @@ class RecipeRun:
 
     def _result(self, matchers: Sequence[CachedMatcher], pair: EvaluationPair) -> PairResult:
         """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
-        result, points = self._matched(matchers, pair)
-        if not result.num_levels:
-            failures = (self.failures.get(image.name, "") for image in pair.images)
-            return self._failed(pair, "; ".join(filter(None, failures)))
-        start = time.perf_counter()
+        watch = Stopwatch("extract", "match", "estimate")
+        result, points = self._matched(matchers, pair, watch)
+        if result.failure:
+            return result
         try:
-            score = pair.truth.score(*points, *self._options)
+            with watch.step("estimate"):
+                score = pair.truth.score(*points, *self._options)
         except Exception as error:
             logger.exception("%s: %s cannot be scored", self.label, pair.name)
             return self._failed(pair, f"{type(error).__name__}: {error}")
-        steps = {"match": result.seconds, "estimate": time.perf_counter() - start}
+        steps = watch.seconds
         return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
 
     def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
@@ -133,52 +130,56 @@ class RecipeRun:
         return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
 
     def _matched(
-        self, matchers: Sequence[CachedMatcher], pair: EvaluationPair
+        self, matchers: Sequence[CachedMatcher], pair: EvaluationPair, watch: Stopwatch
     ) -> tuple[PairResult, tuple[Array, Array]]:
-        """Return a result without score, and (M, 2) and (M, 2) points of the best level, if any."""
-        best = PairResult(**vars(NO_SCORE), name=pair.name, category=pair.category)
-        points, most, seconds, num_levels = NOTHING, 0, 0.0, 0
+        """Return a result without score, and (M, 2) and (M, 2) points of the best level.
+
+        The result has a failure where an image cannot be used.
+        """
+        best, points, most = None, NOTHING, 0
         for level, matcher in enumerate(matchers):
-            with self._lock:
+            with self._lock, watch.step("extract"):
                 usable = [self._extract(image, level) for image in pair.images]
                 if not all(usable):
                     break
                 first, second = (matcher.prepared(image.name) for image in pair.images)
-            start = time.perf_counter()
-            rows1, rows2 = matcher.match(first, second).indices.T
-            frames = first.frames[rows1], second.frames[rows2]
-            count, decided = 0, ""
-            if len(matchers) > 1:
-                count = self._verified_inliers(pair, frames, level)
-                decided = self.recipe.extraction.levels[level].name if count else "none"
-            seconds, num_levels = seconds + time.perf_counter() - start, level + 1
+            with watch.step("match"):
+                rows1, rows2 = matcher.match(first, second).indices.T
+                frames = first.frames[rows1], second.frames[rows2]
+                count, decided = 0, ""
+                if len(matchers) > 1:
+                    count = self._verified_inliers(pair, frames, level)
+                    decided = self.recipe.extraction.levels[level].name if count else "none"
             if count > most or not most:
                 most, points = count, (frames[0][:, :, 2], frames[1][:, :, 2])
-                counts = len(first.frames), len(second.frames)
-                best = replace(best, num_matches=len(rows1), num_keypoints=counts, level=decided)
+                best = PairResult(
+                    **vars(NO_SCORE),
+                    name=pair.name,
+                    category=pair.category,
+                    num_matches=len(rows1),
+                    num_keypoints=(len(first.frames), len(second.frames)),
+                    level=decided,
+                )
             if most >= max(1, self.recipe.escalate.strong_num_inliers):
                 break
-        return replace(best, seconds=seconds, num_levels=num_levels), points
+        failures = (self.failures.get(image.name, "") for image in pair.images)
+        return best or self._failed(pair, "; ".join(filter(None, failures))), points
 
     def _extract(self, image: EvaluationImage, level: int) -> bool:
         """Extract what an image lacks up to a level; tell whether it can be used."""
         name, store = image.name, self._store
         num_levels = len(store.level_ends(name)) if name in store.names() else 0
         for missing in range(num_levels, level + 1):
-            start = time.perf_counter()
+            if name in self.failures:
+                return False
             try:
-                if name in self.failures:
-                    return False
                 found = self._extractor.extract_file(image.path, name, image.intrinsics, missing)
             except AffrectError as error:
                 logger.warning("%s", error)
                 self.failures[name] = str(error)
                 return False
-            seconds, warning = time.perf_counter() - start, found.warning
-            record = {"image": name, "level": missing, "seconds": seconds, "warning": warning}
-            path = self._features / f"{digest_of([name, missing])}.json"
-            replace_text(path, json.dumps(record))  # first, so that features never lack it
-            self.extracted[path.name] = record
+            if found.warning:
+                self.warnings[name] = found.warning
             if missing:
                 store.extend(name, found.features)
             else:

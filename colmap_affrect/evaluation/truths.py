@@ -5,7 +5,7 @@ all that it knows. Results of failed pairs have infinite errors.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -31,7 +31,6 @@ Points = Floats
 Sides = tuple[Floats, Floats]  # points or rays of both images
 Size = tuple[int, int]  # (width, height) in px
 
-GROUP = ": "  # separates the name of a table from that of its column in the names of columns
 CONFIDENCE = 0.9999  # at which estimators may end before all iterations
 NUM_ESTIMATES = 5  # orders of the matches, of which the one of median error counts
 MIN_POSE_MATCHES = 6  # five leave several essential matrices, none of which another supports
@@ -79,9 +78,9 @@ class PairResult(PairScore):
     num_matches: int = 0
     num_keypoints: tuple[int, int] = (0, 0)
     seconds: float = 0.0
-    seconds_by_step: Mapping[str, float] = field(default_factory=dict)  # ``match``, ``estimate``
+    # ``extract`` (of images that no other pair had before), ``match``, ``estimate``
+    seconds_by_step: Mapping[str, float] = field(default_factory=dict)
     level: str = ""  # of escalation, that decided: its rectifier, ``none`` if none was verified
-    num_levels: int = 0  # that were matched
     failure: str = ""  # why the pair counts as failed, with an infinite error
 
 
@@ -198,14 +197,6 @@ def third_coordinates(homography: Array, points: Points) -> Array:
     return np.asarray(points @ homography[2, :2] + homography[2, 2])
 
 
-def homography_columns(results: Results) -> dict[str, float]:
-    """Count the pairs whose error is below each limit."""
-    return {
-        f"< {limit:g} px": float(sum(result.error < limit for result in results))
-        for limit in HOMOGRAPHY_LIMITS_PX
-    }
-
-
 @dataclass(frozen=True, eq=False)
 class TruePose:
     """The cameras of a pair, which are COLMAP's, and its true camera2_from_camera1."""
@@ -237,27 +228,6 @@ def rays(camera: pycolmap.Camera, points: Points) -> Points:
     """Turn (N, 2) pixel-centre points into (N, 2) x/z, y/z; NaN for what a lens cannot produce."""
     pixels = colmap_from_pixel(np.asarray(points, dtype=np.float64).reshape(-1, 2))
     return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
-
-
-def area_under_curve(errors_deg: Sequence[float], threshold_deg: float) -> float:
-    """Return the area under the steps of recall over errors, divided by the threshold: 0 to 1."""
-    shares = (max(0.0, 1.0 - error / threshold_deg) for error in errors_deg)
-    return math.fsum(shares) / max(1, len(errors_deg))
-
-
-def pose_columns(results: Results, *, by_category: bool = True) -> dict[str, float]:
-    """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
-
-    And the area under the curve of the larger of rotation and direction error up to 10 degrees.
-    """
-    groups: dict[str, list[bool]] = {}
-    for result in results if by_category else ():
-        groups.setdefault(result.category, []).append(result.error < MAX_ERROR_DEG)
-    groups["all"] = [result.error < MAX_ERROR_DEG for result in results]
-    columns = {title: sum(below) / max(1, len(below)) for title, below in groups.items()}
-    largest = [max(r.error, r.details.get("direction_error_deg", math.inf)) for r in results]
-    area = area_under_curve(largest, MAX_AUC_ERROR_DEG)
-    return {**columns, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": area}
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,21 +272,37 @@ def wxbs_score(distances_px: Array) -> float:
     return float(np.mean([(distances_px <= limit).mean() for limit in range(NUM_WXBS_LIMITS)]))
 
 
-def correspondence_columns(results: Results) -> dict[str, float]:
-    """Return the mean score."""
-    return {"WxBS score": fmean(result.solved for result in results)}
-
-
-def columns_by_kind(results: Results) -> dict[str, float]:
-    """Return the columns of each kind of truth; results without a truth are in none."""
-    makers: dict[str, Callable[[Results], dict[str, float]]] = {
+def columns(results: Results) -> dict[str, dict[str, float]]:
+    """Return the columns of a table for each kind of truth; results without a truth are in none."""
+    makers = {
         "homographies": homography_columns,
-        "correspondences": correspondence_columns,
-        "poses": partial(pose_columns, by_category=False),
+        "correspondences": lambda own: {"WxBS score": fmean(result.solved for result in own)},
+        "poses": pose_columns,
     }
+    by_kind = {kind: [result for result in results if result.kind == kind] for kind in makers}
+    return {kind: makers[kind](own) for kind, own in by_kind.items() if own}
+
+
+def homography_columns(results: Results) -> dict[str, float]:
+    """Count the pairs whose error is below each limit."""
     return {
-        f"{kind}{GROUP}{name}": value
-        for kind, make in makers.items()
-        if (members := [result for result in results if result.kind == kind])
-        for name, value in make(members).items()
+        f"< {limit:g} px": float(sum(result.error < limit for result in results))
+        for limit in HOMOGRAPHY_LIMITS_PX
     }
+
+
+def pose_columns(results: Results) -> dict[str, float]:
+    """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
+
+    And the area under the curve of recall over the larger of rotation and direction error, up to
+    10 degrees, as a share of 1.
+    """
+    groups: dict[str, list[bool]] = {}
+    for result in results:
+        if result.category:
+            groups.setdefault(result.category, []).append(result.error < MAX_ERROR_DEG)
+    groups["all"] = [result.error < MAX_ERROR_DEG for result in results]
+    shares = {title: sum(below) / len(below) for title, below in groups.items()}
+    largest = [max(r.error, r.details.get("direction_error_deg", math.inf)) for r in results]
+    area = fmean(max(0.0, 1.0 - error / MAX_AUC_ERROR_DEG) for error in largest)
+    return {**shares, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": area}

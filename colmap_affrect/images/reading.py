@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags
 
-from colmap_affrect import PYCOLMAP_CAME_FIRST
 from colmap_affrect.data import ColorImage, GrayImage
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
@@ -100,15 +99,6 @@ def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
     """Return an (H, W) or (H, W, 3) uint8 image as JPEG; quality is 0 to 100."""
     ordered = image[:, :, ::-1] if image.ndim == 3 else image
     return cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-
-
-def require_png() -> None:
-    """Raise ImageError, before work that ends with pictures, where writing PNG would crash."""
-    if PYCOLMAP_CAME_FIRST:  # compressing would kill the process
-        raise ImageError(
-            "pictures cannot be written in a script that imports pycolmap first; put "
-            '"import colmap_affrect" before "import pycolmap"'
-        )
 
 
 def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:

@@ -17,7 +17,7 @@ from colmap_affrect.evaluation.truths import (
     ScoreOptions,
     TrueHomography,
     TruePose,
-    columns_by_kind,
+    columns,
     homography_columns,
     pose_columns,
     symmetric_epipolar_distances,
@@ -206,10 +206,8 @@ def test_tables_are_by_kind_of_truth() -> None:
     scores = [truth.score(nothing, nothing, OPTIONS, 0) for truth in truths]
     results = [PairResult(**vars(score), name="p") for score in scores]
     results += [PairResult(math.inf, 0, name="bad"), pose_result("indoors", 4.0, 1.0)]
-    columns = columns_by_kind(results)
-    assert list(columns)[-2:] == ["poses: all", "poses: pose AUC 10°"]
-    kinds = {name.split(":")[0] for name in columns}
-    assert kinds == {"homographies", "correspondences", "poses"}
-    assert not any(columns[name] for name in columns if "poses" not in name)
-    assert columns["poses: all"] == 1.0
-    assert columns_by_kind([]) == {}
+    found = columns(results)
+    assert found["poses"] == {"indoors": 1.0, "all": 1.0, "pose AUC 10°": pytest.approx(0.6)}
+    assert found["correspondences"] == {"WxBS score": 0.0}
+    assert set(found["homographies"].values()) == {0.0}
+    assert columns([]) == {}

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import matplotlib.pyplot  # noqa: F401 - before HOME is another, where it would write its cache
 import pytest
 from command import CAMERA, FAST, Call, Ended, run_in_process_of_its_own
 from damaged import damage, execute
