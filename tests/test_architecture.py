@@ -113,21 +113,3 @@ def test_scripts_may_import_pycolmap_first(tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", 2)
     done = run_python("-c", PYCOLMAP_FIRST, tmp_path / "a.db", tmp_path / "photos")
     assert (done.returncode, done.stdout) == (0, "1\n")
-
-
-EVALUATE = """
-import pycolmap
-from pathlib import Path
-import colmap_affrect
-try:
-    colmap_affrect.evaluate('evd', Path('EVD'), Path('out'))
-except colmap_affrect.AffrectError as error:
-    print(error)
-"""
-
-
-@pytest.mark.long
-def test_what_ends_with_pictures_is_refused_after_pycolmap() -> None:
-    done = run_python("-c", EVALUATE)
-    assert done.returncode == 0, done.stderr
-    assert 'put "import colmap_affrect" before "import pycolmap"' in done.stdout

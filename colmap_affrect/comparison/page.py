@@ -89,7 +89,6 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
         "views": views,
         "kinds": KINDS,
         "script_data": {
-            "matrices": [],
             "views": [view.script_data(index, k) for view, k in zip(views, kinds, strict=True)],
         },
     }

@@ -12,11 +12,12 @@ import jinja2
 
 from colmap_affrect.errors import shown
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.report import view_graph
 
 TEMPLATES = Path(__file__).parent / "templates"
-
-
+INLIER_COLORS = {
+    1: "#e3b341", 30: "#f08c3c", 60: "#e2604f", 120: "#cf4080", 240: "#a14bb5", 480: "#6f60dd",
+}  # fmt: skip
+"""Colours of pairs by their smallest number of inliers; all stand out from white and black."""
 FOLDERS = re.compile(r"(?<![^\s'\"(=\[])(?:[A-Za-z]:[\\/]|~?/)(?:[^/\\\s'\"]+[/\\])*(?=[^\s/])")
 """The folders at the beginning of a path of this machine."""
 
@@ -48,12 +49,12 @@ def write_page(
     script = (TEMPLATES / "page.js").read_text(encoding="utf-8")
     digest = hashlib.sha256(script.encode("utf-8")).digest()
     environment.globals |= {
-        "graph_constants": view_graph,
+        "inlier_colors": INLIER_COLORS,
         "script": script,
         "script_digest": base64.b64encode(digest).decode("ascii"),
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
     }
-    classes = {"starts": view_graph.CLASS_STARTS, "colors": view_graph.CLASS_COLORS}
+    classes = {"starts": list(INLIER_COLORS), "colors": list(INLIER_COLORS.values())}
     names = list(map(shown, content["image_index"]))
     data = {"names": names, "classes": classes, **content["script_data"]}
     page = environment.get_template(template.name)

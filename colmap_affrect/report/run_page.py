@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from colmap_affrect.errors import such_as
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport, by_story
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report import view_graph
 from colmap_affrect.report.page import TEMPLATES, write_page
-from colmap_affrect.report.pictures import thumbnails
+from colmap_affrect.report.pictures import base64_text, thumbnails
 from colmap_affrect.report.scene import read_scene
 
 KINDS = {
@@ -37,14 +38,18 @@ SOURCES = {
     "guess": "guess",
 }
 
+MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 
 
 @dataclass(frozen=True)
-class Fate(view_graph.Node):
-    """What became of a photograph: one of ``KINDS``, or ``missing``."""
+class Card:
+    """What became of a photograph, which has the same number everywhere on the page."""
 
-    kind: str
+    number: int
+    name: str
+    kind: str  # one of ``KINDS``, or ``missing``
+    text: str
     groups: tuple[str, ...]
 
 
@@ -62,13 +67,11 @@ def write_run_page(
     are of the verified pairs.
     """
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
-    cards = [_fate(number, name, report, model) for number, name in enumerate(names, 1)]
+    cards = [_card(number, name, report, model) for number, name in enumerate(names, 1)]
     index = {name: number for number, name in enumerate(names)}
     pair_inliers = {pair: n for pair, n in pair_inliers.items() if index.keys() >= set(pair)}
     (view,) = read_scene({"this run": workspace.sparse / "0" if report.models else None})
     kinds = Counter(card.kind for card in cards)
-    layout = view_graph.lay_out(names, [pair_inliers])
-    matrix = view_graph.matrix(names, pair_inliers)
     content = {
         "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
         "about": _about(report),
@@ -85,12 +88,10 @@ def write_run_page(
         "thumbnails": thumbnails(image_path, names, progress) if image_path else {},
         "image_index": index,
         "num_pairs": len(pair_inliers),
-        "layout": layout,
-        "edges": view_graph.edge_paths(names, layout, pair_inliers),
-        "matrix": matrix,
+        "has_matrix": len(names) <= MAX_NUM_IN_MATRIX,
         **_cameras(report, index),
         "script_data": {
-            "matrices": [matrix],
+            "matrix": _matrix(names, pair_inliers),
             "views": [view.script_data(index, {card.name: card.kind for card in cards})],
         },
     }
@@ -106,11 +107,11 @@ def _about(report: ReconstructionReport) -> str:
     )
 
 
-def _fate(number: int, name: str, report: ReconstructionReport, model: ModelSummary) -> Fate:
+def _card(number: int, name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
     if name not in set(model.registered_names):
         text = report.unregistered.get(name, "not registered")
         text += f": {report.failures[name]}" if name in report.failures else ""
-        return Fate(number, name, "never", False, text, kind="missing", groups=("all", "missing"))
+        return Card(number, name, "missing", text, ("all", "missing"))
     arrival = model.arrivals.get(name)
     kind = arrival.how if arrival else "tracks"
     text = "registered" if not arrival or kind == "tracks" else arrival.text()
@@ -119,11 +120,10 @@ def _fate(number: int, name: str, report: ReconstructionReport, model: ModelSumm
     groups = ["all", kind, *(["added"] if name in report.added else [])]
     if name in model.probabilities:
         text += f", right with a probability of {model.probabilities[name]:.0%}"
-    is_doubtful = name in model.doubtful
-    if is_doubtful:
+    if name in model.doubtful:
         kind, text = "doubtful", f"{text}; doubtful: {model.doubtful[name]}"
         groups.append("doubtful")
-    return Fate(number, name, "always", is_doubtful, text, kind=kind, groups=tuple(groups))
+    return Card(number, name, kind, text, tuple(groups))
 
 
 def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
@@ -184,3 +184,15 @@ def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str
     if total > len(rows):
         note += f" The first {len(rows)} are listed, report.json has all."
     return {"cameras": rows, "camera_note": note}
+
+
+def _matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> str:
+    """Return the symmetric (N, N) uint16 inliers of pairs, row by row, as base64."""
+    if len(names) > MAX_NUM_IN_MATRIX:
+        return ""
+    index = {name: number for number, name in enumerate(names)}
+    counts = np.zeros((len(names), len(names)), dtype="<u2")
+    for (name1, name2), inliers in pair_inliers.items():
+        row, column = index[name1], index[name2]
+        counts[row, column] = counts[column, row] = min(inliers, np.iinfo(np.uint16).max)
+    return base64_text(counts.tobytes())

@@ -126,7 +126,6 @@ def test_models_turn_and_zoom(browser: Browser) -> None:
     assert until_changed(browser, seen[-1]) == seen[0]
 
 
-@of_comparison
 def test_pointing_at_a_cell_reads_it(browser: Browser) -> None:
     script = """const [selector, right, down] = arguments;
         const matrix = document.querySelector(selector);
@@ -134,11 +133,9 @@ def test_pointing_at_a_cell_reads_it(browser: Browser) -> None:
         const place = {clientX: at.left + right * at.width, clientY: at.top + down * at.height};
         matrix.dispatchEvent(new PointerEvent("pointermove", place));
         return matrix.parentElement.querySelector(".readout").textContent"""
-    text = browser.run(script, "[data-matrix='0']", 1.5 / 6, 0.5 / 6)
+    text = browser.run(script, "[data-matrix]", 1.5 / 6, 0.5 / 6)
     assert text.startswith("1 <img src=x onerror=alert(1)>.png \N{EN DASH} 2 a & b.png: ")
     assert int(text.split(": ")[1].removesuffix(" inliers")) > 0
-    text = browser.run(script, "[data-matrix='1']", 1.5 / 6, 0.5 / 6)
-    assert text.endswith(": no inliers")
 
 
 @pytest.mark.parametrize("browser", ["run", "comparison"], indirect=True)

@@ -10,7 +10,6 @@
   // Photographs: each is in the page once, on the contact sheet.
   const cards = all("#sheet > li");
   const source = (index) => cards[index]?.querySelector("img")?.src ?? "";
-  for (const image of all("[data-photo]")) image.setAttribute("href", source(image.dataset.photo));
 
   const dialog = document.getElementById("photo");
   let opened = 0;
@@ -79,7 +78,7 @@
   });
   addEventListener("afterprint", () => folded.forEach((item) => (item.open = false)));
 
-  // Matrices: colours of the classes, numbers in a few large cells, and that under the pointer.
+  // Matrix of inliers: colours of the classes, numbers in a few large cells, and that under the pointer.
   const MAX_NUMBERED = 14;
   function drawMatrix(svg, counts, size) {
     const canvas = document.createElement("canvas");
@@ -104,7 +103,7 @@
     svg.querySelector("image").setAttribute("href", canvas.toDataURL());
   }
   for (const matrix of all("[data-matrix]")) {
-    const counts = new DataView(bytes(data.matrices[matrix.dataset.matrix]).buffer);
+    const counts = new DataView(bytes(data.matrix).buffer);
     const readout = matrix.parentElement.querySelector(".readout");
     const size = data.names.length;
     drawMatrix(matrix, counts, size);
