@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
 
-from colmap_affrect.errors import INTERRUPTED, say
+from colmap_affrect.errors import EXIT_INTERRUPTED, INTERRUPTED, say
 from colmap_affrect.parallel.subprocesses import end_with
 
 PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
@@ -81,6 +81,7 @@ def _exit_code(code: int, signals: list[int]) -> int:
 def _work() -> NoReturn:
     """Run the command in this process, which Ctrl-C and SIGTERM interrupt."""
     signals: list[int] = []
+    code: int | str | None
 
     def interrupt(number: int, _: object) -> None:
         if number == signal.SIGTERM and signals:
@@ -90,15 +91,27 @@ def _work() -> NoReturn:
 
     try:
         _handle(interrupt)
-        from colmap_affrect.cli import main_of_process
+        from colmap_affrect.cli import main
 
-        main_of_process()
+        code = main()
+    except SystemExit as end:  # argparse has shown help
+        code = end.code
     except (KeyboardInterrupt, Exception) as error:
         # Libraries turn a KeyboardInterrupt in their callbacks into errors of their own.
         if not (signals or isinstance(error, KeyboardInterrupt)):
             raise
         say(INTERRUPTED)
-        os._exit(128 + signal.SIGINT)
+        code = EXIT_INTERRUPTED
+    if code == EXIT_INTERRUPTED:  # threads may be in the middle of something long
+        os._exit(code)
+    for number in SIGNALS:  # too late to change anything
+        signal.signal(number, signal.SIG_IGN)
+    try:
+        if sys.stdout:  # it may have been closed
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -29,11 +29,21 @@ def lacks_memory(error: BaseException) -> bool:
 
 
 class AffrectError(Exception):
-    """Base of all errors that the command line prints as one line (exit code 1)."""
+    """Base of all errors that the command line prints as one line."""
+
+    exit_code = 1
 
 
 class OptionError(AffrectError, ValueError):
     """An option is unknown, out of range, contradicts another one, or names what is not there."""
+
+    exit_code = 2
+
+
+class NoModelError(AffrectError):
+    """There is no model, or none that can be trusted."""
+
+    exit_code = 3
 
 
 class ImageError(AffrectError):
@@ -119,6 +129,7 @@ def made_again(stage: str, folder: Path) -> str:
 # Everything that is shown goes through here: names come out of files, and may be made to mislead.
 
 MAX_NAMES = 3  # examples in a line
+EXIT_INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 INTERRUPTED = "interrupted; run the same command again to go on"
 
 

@@ -52,28 +52,17 @@ from colmap_affrect.stages.verify import verify_matches
 
 @dataclass(frozen=True, kw_only=True)
 class InputOptions:
-    """What runs and comparisons of methods both depend on, beside images and recipes.
+    """What runs and comparisons of methods both depend on, beside images and recipes."""
 
-    Attributes:
-        cameras: how images share cameras.
-        masks: where features may be.
-        pairs: how the pairs to match are chosen.
-        verification: thresholds of two-view geometry.
-        mapping: mapper and its options.
-        image_list_path: list of the images to use; None for all below the folder.
-        from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
-            used; it stays as it is.
-        resources: weights and device of networks.
-    """
-
-    cameras: CameraOptions = field(default_factory=CameraOptions)
-    masks: MaskOptions = field(default_factory=MaskOptions)
-    pairs: PairOptions = field(default_factory=PairOptions)
+    cameras: CameraOptions = field(default_factory=CameraOptions)  # how images share cameras
+    masks: MaskOptions = field(default_factory=MaskOptions)  # where features may be
+    pairs: PairOptions = field(default_factory=PairOptions)  # which pairs are matched
     verification: VerificationOptions = field(default_factory=VerificationOptions)
-    mapping: MapperOptions = field(default_factory=SparseOptions)
-    image_list_path: Path | None = None
+    mapping: MapperOptions = field(default_factory=SparseOptions)  # the mapper and its options
+    image_list_path: Path | None = None  # the images to use; None: all below the folder
+    # COLMAP database whose images, cameras, rigs, frames and pose priors are used
     from_database: Path | None = None
-    resources: Resources = field(default_factory=Resources)
+    resources: Resources = field(default_factory=Resources)  # weights and device of networks
 
     @property
     def may_share(self) -> bool:
@@ -93,20 +82,11 @@ class InputOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(InputOptions):
-    """Everything a run depends on beside its images and its output folder.
-
-    The other attributes are those of :class:`InputOptions`.
-
-    Attributes:
-        recipe: options of extraction and matching.
-        database_descriptors: also write descriptors into the database, as COLMAP's matchers
-            need them.
-        extend: register the photographs into this model instead of beginning one.
-    """
+    """Everything a run depends on beside its images and its output folder."""
 
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
-    database_descriptors: bool = False
-    extend: Extension | None = None
+    database_descriptors: bool = False  # also into the database, as COLMAP's matchers need them
+    extend: Extension | None = None  # the model that the photographs are registered into
 
 
 def run(
@@ -187,22 +167,8 @@ def map_from_database(
 ) -> ReconstructionReport:
     """Map a database of any program; it is copied and stays as it is.
 
-    Args:
-        database_path: COLMAP database with matches; pairs without two-view geometry are verified.
-        output_path: folder for all results, made if missing.
-        image_path: folder of the photographs, for the colours of the points.
-        mapping: mapper and its options.
-        verification: of pairs that are not verified yet.
-        extend: register the images into this model instead of beginning one.
-        overwrite: discard results that are there.
-        page: also write ``report.html``.
-        progress: where to show progress.
-
-    Returns:
-        The report that is also written to ``report.json``.
-
-    Raises:
-        AffrectError: for anything that the caller can mend; what is done stays.
+    Pairs without two-view geometry are verified. ``image_path`` is the folder of the photographs,
+    for the colours of the points; see :func:`run` for all else.
     """
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
     schema_version(database_path)  # refuses what is no database before anything is made
@@ -285,15 +251,7 @@ def _says_the_same(path: Path, report: str) -> bool:
 
 def _require_photographs(context: Context) -> None:
     """Refuse to map photographs that are not where they were when they were extracted."""
-    if context.workspace.is_copy:
-        return
-    inputs = context.inputs
-    if not Path(inputs.image_path).is_dir():
-        raise ImageError(
-            f"{inputs.image_path}: no such folder; if the photographs have moved, run extract "
-            "again with --image-path"
-        )
-    if gone := sorted(set(context.features.names()) - set(inputs.names())):
-        raise ImageError(
-            f"{inputs.image_path}: {gone[0]} has features, and is gone; run extract again"
-        )
+    if not context.workspace.is_copy:
+        path, names = context.inputs.image_path, set(context.inputs.names())
+        if gone := sorted(set(context.features.names()) - names):
+            raise ImageError(f"{path}: {gone[0]} has features, and is gone; run extract again")

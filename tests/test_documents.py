@@ -64,9 +64,9 @@ def test_commands_and_scripts_are_understood(name: str) -> None:
     for words in shell_commands(name):
         if Path(words[0]).name == "colmap-affrect":
             options = PARSER.parse_args(words[1:])
-            recipe = getattr(options, "recipe", None) or "default"
-            if not recipe.endswith(".toml") and "recipe" in options:
-                load_recipe(recipe, options.set)
+            recipe = options.recipe or "default"
+            if not recipe.endswith(".toml"):
+                load_recipe(recipe, options.set or ())
         if words[0] == "python":
             script = (ROOT / words[1]).read_text(encoding="utf-8")
             own = words[: words.index("--")] if "--" in words else words

@@ -3,48 +3,42 @@
 import argparse
 import logging
 import os
-import signal
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import TextIO
 
 from colmap_affrect import __version__
 from colmap_affrect.cli.parser import build_parser
 from colmap_affrect.errors import (
+    EXIT_INTERRUPTED,
     INTERRUPTED,
     MEMORY_HINT,
     AffrectError,
-    OptionError,
     lacks_memory,
     one_line,
     say,
 )
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger("colmap_affrect")
-
-REPEAT_S = 0.01  # after which a Ctrl-C is repeated
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     try:
         options = build_parser().parse_args(arguments)
-        if not hasattr(options, "verbose"):  # a command that only prints
-            return options.function(options) or EXIT_OK
         with _no_empty_folder(options.output_path), _logging(options):
-            return options.function(options) or EXIT_OK
-    except OptionError as error:
-        return _fail(str(error), EXIT_USAGE)
+            commands = import_module("colmap_affrect.cli.commands")
+            command = getattr(commands, options.command.replace("-", "_"))
+            return command(options) or 0
     except AffrectError as error:
-        return _fail(str(error))
+        return _fail(str(error), error.exit_code)
     except BrokenPipeError:  # who reads what is printed has seen enough, as head has
-        return EXIT_OK
+        return 0
     except OSError as error:
         return _fail(
             f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
@@ -59,41 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
 
 
-def main_of_process() -> NoReturn:
-    """Run the command line as what this process is for, and end the process.
-
-    Python takes a moment to end; a Ctrl-C within it is too late to change anything.
-    """
-    sys.unraisablehook = _interrupt_again
-    try:
-        code: int | str | None = main()
-    except SystemExit as end:  # argparse: help, or wrong usage
-        code = end.code
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    try:
-        if sys.stdout:  # it may have been closed
-            sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if code == EXIT_INTERRUPTED:  # threads may be in the middle of something long
-        sys.stderr.flush()
-        os._exit(EXIT_INTERRUPTED)
-    sys.exit(code)
-
-
-def _interrupt_again(passed_over: "sys.UnraisableHookArgs") -> None:
-    """Repeat a Ctrl-C that came where Python cannot raise it, as while objects are deleted.
-
-    Else its traceback would be printed, and the command would go on to its end.
-    """
-    if passed_over.exc_type is not KeyboardInterrupt:
-        sys.__unraisablehook__(passed_over)
-        return
-    threading.Timer(REPEAT_S, signal.raise_signal, [signal.SIGINT]).start()
-
-
-def _fail(message: str, code: int = EXIT_FAILED) -> int:
+def _fail(message: str, code: int = 1) -> int:
     """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
     say(f"error: {one_line(message)}")
     return code
@@ -121,8 +81,7 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     log_path = Path(os.devnull)
     if options.output_path:
         workspace = Workspace(options.output_path)
-        photographs = getattr(options, "image_path", None) or getattr(options, "dataset_path", None)
-        workspace.require_own(photographs)
+        workspace.require_own(options.image_path or options.dataset_path)
         log_path = workspace.log
     log_path.parent.mkdir(parents=True, exist_ok=True)
     python_stderr, terminal_fd = sys.stderr, os.dup(2)

@@ -1,7 +1,7 @@
 """What each command does with its options: one library function and its result printed.
 
-Every command takes the parsed options and returns an exit code, or nothing when all is well.
-Modules are imported when a command needs them: ``--help`` loads no heavy package.
+Every command takes the parsed options; what is wrong it raises. Modules are imported when a command
+needs them.
 """
 
 from __future__ import annotations
@@ -9,35 +9,31 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from colmap_affrect.cli import given
-from colmap_affrect.errors import ComparisonError, OptionError, such_as
+from colmap_affrect.errors import ComparisonError, ImageError, NoModelError, OptionError, such_as
 from colmap_affrect.progress import SILENT, Progress, show
-from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, by_level
 from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
-    from colmap_affrect.comparison.results import Comparison
     from colmap_affrect.project.report import ReconstructionReport
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> None:
     from colmap_affrect import pipeline
 
-    record = given.record(options)
-    recipe = given.recipe(options, record)
+    recipe = given.recipe(options)
     run_options = pipeline.RunOptions(
         recipe=recipe,
-        database_descriptors=options.database_descriptors,
+        database_descriptors=bool(options.database_descriptors),
         extend=given.extension(options),
-        **given.inputs(options, recipe, record),
+        **given.inputs(options, recipe),
     )
     with given.executor(options) as executor:
         report = pipeline.run(
-            options.image_path or Path(record["extract"]["image_path"]),
+            options.image_path,
             options.output_path,
             run_options,
             executor=executor,
@@ -45,27 +41,20 @@ def run(options: argparse.Namespace) -> int:
             page=options.page,
             progress=given.progress(options),
         )
-    return _print_reconstruction(report, options)
+    _print_reconstruction(report, options)
 
 
-def extract(options: argparse.Namespace) -> int:
-    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+def extract(options: argparse.Namespace) -> None:
+    from colmap_affrect.pipeline import InputOptions
     from colmap_affrect.stages import extract as stage
-    from colmap_affrect.stages.inputs import Inputs
 
-    inputs = Inputs.of(
-        options.image_path,
-        image_list_path=options.image_list_path,
-        from_database=options.from_database,
-        cameras=given.built(options, "cameras", CameraOptions),
-        masks=given.built(options, "masks", MaskOptions),
-    )
+    inputs = InputOptions(**given.inputs(options)).inputs(options.image_path)
     with given.context(options) as context:
         report = stage.extract(context, inputs, given.recipe(options), overwrite=options.overwrite)
         if options.database_descriptors:
             stage.write_descriptors(context)
         show(report.summary())
-    return _exit_code(report.failures, options)
+    _refuse_failures(report.failures, options)
 
 
 def pairs(options: argparse.Namespace) -> None:
@@ -80,11 +69,8 @@ def match(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.match import match
 
     with given.context(options) as context:
-        if options.recipe:
-            matching = given.recipe(options).matching
-        else:
-            matching = given.changed(context.matching, options, "matching")
-        show(match(context, matching, overwrite=options.overwrite).summary())
+        chosen = given.changed(context.matching, options, "matching")
+        show(match(context, chosen, overwrite=options.overwrite).summary())
 
 
 def verify(options: argparse.Namespace) -> None:
@@ -96,30 +82,27 @@ def verify(options: argparse.Namespace) -> None:
 
 
 def escalate(options: argparse.Namespace) -> None:
-    from colmap_affrect.stages.escalate import escalate, pair_levels
+    from colmap_affrect.stages.escalate import escalate
 
     with given.context(options) as context:
         chosen = given.changed(context.escalation, options, "escalate")
         show(escalate(context, chosen, overwrite=options.overwrite).summary())
-        if levels := pair_levels(context):
-            show(", ".join(by_level(*item) for item in levels.items()))
 
 
 def guide(options: argparse.Namespace) -> None:
-    from colmap_affrect.stages.guide import guide, guided_counts
+    from colmap_affrect.stages.guide import guide
 
     with given.context(options) as context:
         chosen = given.changed(context.guiding, options, "guided")
         show(guide(context, chosen, overwrite=options.overwrite).summary())
-        if counts := guided_counts(context):
-            show("{pairs} pairs, {matches_before} to {matches_after} inliers".format(**counts))
 
 
-def map(options: argparse.Namespace) -> int:
+def map(options: argparse.Namespace) -> None:
     from colmap_affrect.mappers.base import MAPPERS
     from colmap_affrect.pipeline import map_and_report, map_from_database
 
     extend = given.extension(options)
+    how = {"overwrite": options.overwrite, "page": options.page}
     if options.from_database:
         report = map_from_database(
             options.from_database,
@@ -128,28 +111,25 @@ def map(options: argparse.Namespace) -> int:
             mapping=given.mapping(options),
             verification=given.verification(options),
             extend=extend,
-            overwrite=options.overwrite,
-            page=options.page,
             progress=given.progress(options),
+            **how,
         )
-        return _print_reconstruction(report, options)
-    if options.image_path:
+    elif options.image_path:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
-    with given.context(options) as context:
-        mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
-        how = {"overwrite": options.overwrite, "page": options.page}
-        report = map_and_report(context, mapper, extend, **how)
-    return _print_reconstruction(report, options)
+    else:
+        with given.context(options) as context:
+            mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
+            report = map_and_report(context, mapper, extend, **how)
+    _print_reconstruction(report, options)
 
 
-def compare(options: argparse.Namespace) -> int:
+def compare(options: argparse.Namespace) -> None:
     from colmap_affrect.comparison.compare import compare
     from colmap_affrect.comparison.method_run import CompareOptions
     from colmap_affrect.comparison.methods import parse_methods
     from colmap_affrect.comparison.tables import summary, to_json
 
-    depth = given.depth_settings(options)
-    methods = options.methods and parse_methods(options.methods, depth)
+    methods = options.methods and parse_methods(options.methods, given.depth_settings(options))
     comparison = compare(
         options.image_path,
         options.output_path,
@@ -165,17 +145,22 @@ def compare(options: argparse.Namespace) -> int:
     show(to_json(comparison) if options.json else summary(comparison))
     if not options.json:
         show(f"\npictures: {options.output_path / 'report.html'}")
-    return _comparison_exit_code(comparison, options)
+    failed = [method.name for method in comparison.methods if method.failed]
+    if failed:
+        where = options.output_path / "comparison.json"
+        raise ComparisonError(f"failed: {', '.join(failed)}; {where} says why")
+    if not any(seed.models for method in comparison.methods for seed in method.seeds):
+        raise NoModelError("no method found a model")
+    _refuse_failures((name for method in comparison.methods for name in method.failures), options)
 
 
-def evaluate(options: argparse.Namespace) -> int:
+def evaluate(options: argparse.Namespace) -> None:
     from colmap_affrect.comparison.methods import parse_methods
     from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
     from colmap_affrect.evaluation.truths import ScoreOptions
     from colmap_affrect.recipes import with_settings
 
-    given.key_values("--protocol-options", options.protocol_options)
-    changed = with_settings({}, options.protocol_options)
+    scores = with_settings({}, options.protocol_options)
     evaluation = evaluate(
         options.protocol,
         options.dataset_path,
@@ -183,8 +168,8 @@ def evaluate(options: argparse.Namespace) -> int:
         EvaluateOptions(
             recipes=parse_methods(options.recipes, given.depth_settings(options)),
             max_num_keypoints=options.max_num_keypoints,
-            random_seed=options.random_seed,
-            scores=ScoreOptions.from_mapping(changed, "--protocol-options"),
+            random_seed=options.random_seed or 0,
+            scores=ScoreOptions.from_mapping(scores, "--protocol-options"),
             resources=given.resources(options),
         ),
         overwrite=options.overwrite,
@@ -193,20 +178,7 @@ def evaluate(options: argparse.Namespace) -> int:
     show(evaluation.to_json() if options.json else evaluation.summary())
     if not options.json:
         show(f"\nall pairs: {options.output_path / 'evaluation.json'}")
-    failures = {name: why for recipe in evaluation.recipes for name, why in recipe.failures.items()}
-    return _exit_code(failures, options)
-
-
-def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -> int:
-    failed = [method.name for method in comparison.methods if method.failed]
-    if failed:
-        where = options.output_path / "comparison.json"
-        raise ComparisonError(f"failed: {', '.join(failed)}; {where} says why")
-    if not any(seed.models for method in comparison.methods for seed in method.seeds):
-        show("error: no method found a model", file=sys.stderr)
-        return EXIT_NO_MODEL
-    failures = {name: why for m in comparison.methods for name, why in m.failures.items()}
-    return _exit_code(failures, options)
+    _refuse_failures((name for recipe in evaluation.recipes for name in recipe.failures), options)
 
 
 def import_h5(options: argparse.Namespace) -> None:
@@ -218,9 +190,9 @@ def import_h5(options: argparse.Namespace) -> None:
         options.features_path,
         options.matches_path,
         options.database_path,
-        cameras=given.built(options, "cameras", CameraOptions),
+        cameras=given.over(CameraOptions(), options, "cameras"),
         skip_verification=options.skip_verification,
-        random_seed=options.random_seed,
+        random_seed=options.random_seed or 0,
         progress=given.progress(options),
     )
     show(report.summary())
@@ -268,61 +240,57 @@ def align(options: argparse.Namespace) -> None:
         gps_database=options.gps,
         positions_path=options.positions,
         points_path=options.points,
-        distances=tuple(given.distance(text) for text in options.distance),
+        distances=tuple(options.distance),
     )
     show(align(options.model_path, options.target_path, reference).summary())
     show(f"model       {options.target_path}")
 
 
-def doctor(options: argparse.Namespace) -> int:
+def doctor(options: argparse.Namespace) -> int | None:
     from colmap_affrect.doctor import diagnose
 
     diagnosis = diagnose(options.path, image_path=options.image_path, weights_path=options.weights)
     show(diagnosis.to_json() if options.json else diagnosis.summary())
-    return EXIT_FAILED if diagnosis.num_errors else EXIT_OK
+    return 1 if diagnosis.num_errors else None
 
 
-def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
+def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> None:
     show(report.to_json() if options.json else report.summary(with_warnings=options.quiet))
+    workspace = Workspace(options.output_path)
     if not (options.json or options.quiet):
-        show("\n".join(_next_steps(report, options.output_path)))
+        show("\n".join(_next_steps(report, workspace)))
     why = report.why_no_model
     if report.status == "doubtful":
         why = "nothing in the model can be trusted"
     if why:
-        workspace = Workspace(options.output_path)
         where = workspace.page if workspace.page.exists() else workspace.report
-        show(f"error: {why}; see {where}", file=sys.stderr)
-        return EXIT_NO_MODEL
-    return _exit_code(report.failures, options)
+        raise NoModelError(f"{why}; see {where}")
+    _refuse_failures(report.failures, options)
 
 
-def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
-    photos = Workspace(out).photographs()
-    model, page = out / "sparse" / "0", out / "report.html"
+def _next_steps(report: ReconstructionReport, workspace: Workspace) -> list[str]:
+    """Say where the results are, and with which commands to go on."""
+    out, photos, model = workspace.path, workspace.photographs(), workspace.path / "sparse" / "0"
     commands: list[list[object]] = []
     if report.models:
-        look = ["colmap", "gui", "--import_path", model, "--database_path", out / "database.db"]
+        look = ["colmap", "gui", "--import_path", model, "--database_path", workspace.database]
         commands.append(look + (["--image_path", photos] if photos else []))
     if report.status in ("ok", "partial"):
-        where = ["--model-path", model, "--output-path", out / "export"]
-        commands.append(["colmap-affrect", "export", *where])
+        export = ["colmap-affrect", "export", "--model-path", model]
+        commands.append([*export, "--output-path", out / "export"])
     if report.unregistered.keys() - report.failures and report.num_pairs and photos:
-        where = ["--image-path", photos, "--output-path", out / "compare"]
-        commands.append(["colmap-affrect", "compare", *where])
-    lines = [f"results     {out}" + (f", to look at: {page}" if page.exists() else "")]
-    lines += ["next"] if commands else []
-    return lines + [
-        f"            {shlex.join([str(word) for word in words])}" for words in commands
-    ]
+        compare = ["colmap-affrect", "compare", "--image-path", photos]
+        commands.append([*compare, "--output-path", out / "compare"])
+    page = f", to look at: {workspace.page}" if workspace.page.exists() else ""
+    lines = [f"results     {out}{page}", *(["next"] if commands else [])]
+    return lines + [f"            {shlex.join([str(word) for word in line])}" for line in commands]
 
 
-def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
-    if len(failures) <= options.max_failures:
-        return EXIT_OK
-    names = ", ".join(failures)
-    show(f"error: could not read {len(failures)} of the images: {names}", file=sys.stderr)
-    return EXIT_FAILED
+def _refuse_failures(failures: Iterable[str], options: argparse.Namespace) -> None:
+    """End with an error if more images than allowed could not be read."""
+    names = list(dict.fromkeys(failures))
+    if len(names) > (options.max_failures or 0):
+        raise ImageError(f"could not read {len(names)} of the images: {', '.join(names)}")
 
 
 def inspect(options: argparse.Namespace) -> None:
@@ -333,23 +301,21 @@ def inspect(options: argparse.Namespace) -> None:
     recipe = given.recipe(options)
     if not options.image.is_file():
         raise OptionError(f"{options.image}: no such file; give a photograph")
-    photographs = Photographs(options.image.parent, given.built(options, "masks", MaskOptions))
+    photographs = Photographs(options.image.parent, given.over(MaskOptions(), options, "masks"))
     photographs.check()
     mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])
     show(inspect_image(extractor, options.image, options.output_path, mask))
 
 
-def convert(options: argparse.Namespace) -> int:
+def convert(options: argparse.Namespace) -> None:
     from colmap_affrect.images.conversion import convert_images
 
-    report = convert_images(options.image_path, options.converted_path, given.progress(options))
+    report = convert_images(options.image_path, options.target_path, given.progress(options))
     show(report.summary())
-    if not report.failures:
-        return EXIT_OK
-    names = such_as(sorted(report.failures))
-    show(f"error: could not convert {len(report.failures)} files: {names}", file=sys.stderr)
-    return EXIT_FAILED
+    if report.failures:
+        names = such_as(sorted(report.failures))
+        raise ImageError(f"could not convert {len(report.failures)} files: {names}")
 
 
 def recipes(options: argparse.Namespace) -> None:

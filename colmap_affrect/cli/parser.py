@@ -1,26 +1,18 @@
-"""The commands, with help texts."""
-
-from __future__ import annotations
+"""The commands: their flags, help texts and examples."""
 
 import argparse
-from collections.abc import Callable
+import re
+import sys
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from colmap_affrect import __version__
-from colmap_affrect.cli import arguments as args
-from colmap_affrect.cli import commands
+from colmap_affrect.cli.flags import FLAGS
 from colmap_affrect.errors import OptionError
-
-if TYPE_CHECKING:
-    # The type of what takes arguments has no public name.
-    Container = argparse._ActionsContainer
 
 EXAMPLES = (
     "run --image-path photos --output-path out",
     "run --image-path photos --output-path out --recipe on-demand --camera-mode single",
-    "run --image-path all-photos --output-path out --extend finished/sparse/0",
-    "run --config out/config.toml --image-path other-photos --output-path out2",
     "extract --image-path photos --output-path out",
     "pairs --output-path out --pairs retrieval,sequence --num-neighbors 30",
     "match --output-path out",
@@ -43,10 +35,7 @@ EXAMPLES = (
     "      --matches-path matches.h5",
     "export-database out old.db --colmap 3.8",
     "export --model-path out/sparse/0 --output-path for-others --format ply,text",
-    "export --model-path out/sparse/0 --output-path for-others --format nerfstudio \\\n"
-    "      --image-path photos",
     "align --model-path out/sparse/0 --output-path metric --gps out/database.db",
-    "align --model-path out/sparse/0 --output-path metric --points control.csv",
     "align --model-path out/sparse/0 --output-path metric --distance a.jpg,b.jpg,2.5",
 )
 
@@ -72,8 +61,9 @@ class Parser(argparse.ArgumentParser):
         raise OptionError(f"{message}; see {self.prog} --help")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; what is unknown is refused with the option that may have been meant."""
-        found, unknown = super().parse_known_args(args, namespace)
+        """Parse; names of flags may have underscores, and an unknown one is refused."""
+        words = [_with_hyphens(word) for word in (sys.argv[1:] if args is None else args)]
+        found, unknown = super().parse_known_args(words, namespace)
         if unknown:
             name = next((word for word in unknown if word.startswith("-")), unknown[0])
             close = get_close_matches(name.partition("=")[0], self._option_string_actions, n=1)
@@ -82,115 +72,115 @@ class Parser(argparse.ArgumentParser):
         return found, unknown
 
 
+def _with_hyphens(word: str) -> str:
+    return re.sub(r"^--[^=]+", lambda name: name[0].replace("_", "-"), word)
+
+
 def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
+    """Return the parser of all commands; what a command has no flag for is None."""
+    usual: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
     parser = Parser(
         prog="colmap-affrect",
         description="Rectified wide-baseline features for COLMAP: photographs in, model out.",
         epilog=epilog(),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        **usual,
     )
     parser.add_argument("--version", action="version", version=f"colmap-affrect {__version__}")
-    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, (function, summary, options) in COMMANDS.items():
-        command = subparsers.add_parser(
-            name,
-            help=summary,
-            description=summary,
-            epilog=epilog(name),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, command in COMMANDS.items():
+        summary = command.summary
+        subparser = commands.add_parser(
+            name, help=summary, description=summary, epilog=epilog(name), **usual
         )
-        command.set_defaults(function=function, **ABSENT)
-        _add(command, options)
+        found = {action.dest for word in command.flags.split() for action in _add(subparser, word)}
+        parser.set_defaults(**dict.fromkeys(found))
     return parser
 
 
-ABSENT: dict[str, Any] = {
-    **dict.fromkeys(("output_path", "weights", "scheduler", "random_seed")),
-    "device": "auto",
-    "max_failures": 0,
-}
-"""What commands read that not all of them have as options."""
+def _add(parser: argparse.ArgumentParser, word: str) -> list[argparse.Action]:
+    """Add a flag, or several that exclude each other; see :class:`Command`."""
+    names, required = word.rstrip("!").split("|"), word.endswith("!")
+    target: Any = parser
+    if len(names) > 1:
+        target = parser.add_mutually_exclusive_group(required=required)
+    more = {"required": True} if required and target is parser else {}
+    return [
+        target.add_argument(*spelled.split(","), **{"default": None, **FLAGS[name]}, **more)
+        for name in names
+        for spelled in [name.partition("@")[0]]
+    ]
 
 
-def _add(container: Container, options: Options) -> None:
-    for option in options:
-        if isinstance(option, args.OneOf):
-            group = container.add_mutually_exclusive_group(required=option.required)
-            _add(group, option.options)
-        else:
-            container.add_argument(*option.flags, **option.settings)
+class Command(NamedTuple):
+    """A command: what it does in one line, and its flags of :data:`.flags.FLAGS`.
+
+    One with an exclamation mark must be given; of those that ``|`` joins only one may be.
+    """
+
+    summary: str
+    flags: str
 
 
-Options = tuple[args.Option | args.OneOf, ...]
-Command = tuple[Callable[[argparse.Namespace], int | None], str, Options]
-"""What is called with the options, what it does in one line, and the options."""
+VOLUME = "-q,--quiet|-v,--verbose"
+RESULTS = f"--output-path! --overwrite {VOLUME}"
+MASKS = "--mask-path --camera-mask-path"
+CAMERAS = """--camera-mode --camera-model --camera-params --cameras-path --focal-length-px
+    --principal-point --ignore-exif"""
+IMAGES = f"--image-path! --image-list-path {MASKS} --from-database {CAMERAS} --max-failures"
+RECIPE = "--recipe --set"
+PAIRS = "--match-list-path --pairs --num-neighbors --max-distance-m"
+NETWORKS = "--weights --device"
+MAPPER = "--preset --mapper --mapper-options"
+MODEL = "--extend --refine-existing --random-seed --json --no-page"
 
-COMMANDS: dict[str, Command] = {
-    "run": (commands.run, "all stages: photographs in, COLMAP model out",
-        (*args.RESULTS, *args.CONFIG, *args.SELECTION, args.DESCRIPTORS, *args.recipe(),
-        args.MATCHER, args.GUIDED,
-        *args.RESOURCES, args.SCHEDULER, *args.DEPTH, *args.PAIRS, args.PRESET,
-        *args.MAPPER,
-        *args.EXTEND, args.seed(), args.json(), args.NO_PAGE)),
-    "extract": (commands.extract, "features into features.h5 and database.db",
-        (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER,
-        *args.RESOURCES, args.SCHEDULER, *args.DEPTH)),
-    "pairs": (commands.pairs, "which images to match, into pairs.txt",
-        (*args.RESULTS, *args.PAIRS)),
-    "match": (commands.match, "matches into matches.h5 and database.db",
-        (*args.RESULTS, *args.recipe(default=None), args.MATCHER, *args.RESOURCES,
-        args.SCHEDULER)),
-    "verify": (commands.verify, "two-view geometries into database.db",
-        (*args.RESULTS, args.PRESET, args.seed())),
-    "escalate": (commands.escalate,
+COMMANDS = {
+    "run": Command("all stages: photographs in, COLMAP model out",
+        f"{RESULTS} {IMAGES} {RECIPE} --depth-path --database-descriptors {NETWORKS} --scheduler "
+        f"{PAIRS} {MAPPER} {MODEL}"),
+    "extract": Command("features into features.h5 and database.db",
+        f"{RESULTS} {IMAGES} {RECIPE} --depth-path --database-descriptors {NETWORKS} --scheduler"),
+    "pairs": Command("which images to match, into pairs.txt", f"{RESULTS} {PAIRS}"),
+    "match": Command("matches into matches.h5 and database.db",
+        f"{RESULTS} --set {NETWORKS} --scheduler"),
+    "verify": Command("two-view geometries into database.db", f"{RESULTS} --preset --random-seed"),
+    "escalate": Command(
         "match pairs that failed again, with more warps (recipes that escalate, as on-demand)",
-        (*args.RESULTS, args.setting("escalate.min_num_tracks=10"), *args.RESOURCES,
-            args.SCHEDULER)),
-    "guide": (commands.guide,
-        "match verified pairs again, guided by their geometry",
-        (*args.RESULTS, args.GUIDED, args.setting("guided.band_px=2"),
-            args.SCHEDULER)),
-    "map": (commands.map, "COLMAP models into sparse/",
-        (*args.RESULTS, *args.COPIED, *args.EXTEND, args.PRESET,
-        *args.MAPPER, args.seed(), args.json(), args.NO_PAGE)),
-    "compare": (commands.compare,
+        f"{RESULTS} --set {NETWORKS} --scheduler"),
+    "guide": Command("match verified pairs again, guided by their geometry",
+        f"{RESULTS} --set --scheduler"),
+    "map": Command("COLMAP models into sparse/",
+        f"{RESULTS} --from-database@map --image-path@map {MAPPER} {MODEL}"),
+    "compare": Command(
         "how many photographs, and which, COLMAP's SIFT and recipes register; with pictures",
-        (*args.RESULTS, *args.IMAGES, *args.COMPARISON, *args.RESOURCES, *args.DEPTH,
-        args.PAIR_LIST, args.PRESET, *args.MAPPER,
-        args.json("print comparison.json, no summary"))),
-    "evaluate": (commands.evaluate,
+        f"{RESULTS} {IMAGES} --methods --seeds --ground-truth-path --depth-path {NETWORKS} "
+        f"--match-list-path {MAPPER} --json"),
+    "evaluate": Command(
         "score recipes on pairs of images with a known truth, as the paper does on its datasets",
-        (*args.RESULTS, *args.EVALUATION, *args.RESOURCES, *args.DEPTH,
-        args.seed("of the estimators and the statistics", default=0),
-        args.json("print evaluation.json, no tables"))),
-    "convert": (commands.convert,
+        f"{RESULTS} protocol --dataset-path! --recipes --max-num-keypoints --protocol-options "
+        f"--depth-path {NETWORKS} --random-seed --json"),
+    "convert": Command(
         "a folder of photographs in formats that COLMAP reads: JPEG 2000, WebP, HEIC, pages",
-        (args.IMAGE_PATH, args.CONVERTED_PATH, args.VOLUME)),
-    "inspect": (commands.inspect,
+        f"--image-path! --output-path@photographs! {VOLUME}"),
+    "inspect": Command(
         "draw what a recipe does to one image: regions, warps, features; the plan as JSON",
-        (args.OUTPUT_PATH, args.VOLUME, args.IMAGE, *args.MASKS, *args.recipe(), *args.RESOURCES,
-        *args.DEPTH)),
-    "import-h5": (commands.import_h5,
-        "features and matches in hloc's files into a new COLMAP database",
-        (args.IMAGE_PATH, *args.H5_FILES, args.IMPORT_TARGET, *args.CAMERAS,
-        args.SKIP_VERIFICATION, args.seed(default=0), args.VOLUME)),
-    "export-h5": (commands.export_h5,
-        "features and matches of any COLMAP database for hloc",
-        (args.EXPORT_SOURCE, *args.H5_FILES, args.VOLUME)),
-    "export-database": (commands.export_database,
+        f"image --output-path! {VOLUME} {MASKS} {RECIPE} --depth-path {NETWORKS}"),
+    "import-h5": Command("features and matches in hloc's files into a new COLMAP database",
+        "--image-path! --features-path! --matches-path! --database-path! --skip-verification "
+        f"{CAMERAS} --random-seed {VOLUME}"),
+    "export-h5": Command("features and matches of any COLMAP database for hloc",
+        f"--database-path@read! --features-path! --matches-path! {VOLUME}"),
+    "export-database": Command(
         "any database for COLMAP 3.8 to 3.13, as Linux distributions have them",
-        (*args.OLD_DATABASE, args.VOLUME)),
-    "export": (commands.export,
+        f"path database_path --colmap {VOLUME}"),
+    "export": Command(
         "a model for other programs: points, text, undistorted photographs, tables",
-        (*args.EXPORT, args.VOLUME)),
-    "align": (commands.align,
-        "give a model its scale and place, by GPS, control points or a known distance",
-        (*args.ALIGN, args.VOLUME)),
-    "doctor": (commands.doctor,
+        f"--model-path! --output-path@files! --format --image-path@export {VOLUME}"),
+    "align": Command("give a model its scale and place, by GPS, control points or a distance",
+        f"--model-path! --output-path@model! --gps|--positions|--points --distance {VOLUME}"),
+    "doctor": Command(
         "look for what is wrong with results or the installation, and say what to do about it",
-        (*args.DOCTOR, args.json("print JSON"), args.VOLUME)),
-    "recipes": (commands.recipes, "list the recipes and what they need", (args.SHOWN_RECIPE,)),
-    "weights": (commands.weights, "list the files of weights, or fetch them beforehand",
-        (*args.WEIGHTS, args.VOLUME)),
+        f"path@optional --image-path@doctor --weights --json {VOLUME}"),
+    "recipes": Command("list the recipes and what they need", "name"),
+    "weights": Command("list the files of weights, or fetch them beforehand",
+        f"action keys --weights {VOLUME}"),
 }  # fmt: skip

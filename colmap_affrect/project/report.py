@@ -12,9 +12,6 @@ from typing import Any
 
 from colmap_affrect.errors import such_as
 
-EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
-
-
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")  # how cells begin that spreadsheets compute
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 

@@ -12,11 +12,9 @@ import pytest
 from command import Call, on_photographs
 from small_scene import write_photographs
 
-from colmap_affrect import pipeline
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
 from colmap_affrect.colmap.poses import model_poses
-from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.reliability import Judgement
@@ -98,8 +96,11 @@ def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
         ("rum", "invalid choice: 'rum'"),
         ("run --image-path x", "required: --output-path"),
         ("map --output-path {out} --camera-mode single", "unknown argument --camera-mode"),
-        ("match --output-path {out} -q -v", "not allowed with argument"),
-        ("run --output-path {out} --recipie x", "--recipie (did you mean --recipe?)"),
+        ("match --output_path {out} -q -v", "not allowed with argument"),
+        (
+            "run --image-path x --output-path {out} --recipie x",
+            "--recipie (did you mean --recipe?)",
+        ),
     ],
 )
 def test_wrong_usage_ends_with_2_and_does_nothing(
@@ -173,7 +174,7 @@ H5 = "--features-path OUT/features.h5 --matches-path OUT/matches.h5 --database-p
 MODEL = "--model-path OUT/sparse/0 --output-path NEW"
 
 INPUTS = {
-    f"run {RUN}": f"--config {SELECTED} --recipe --weights --depth-path --match-list-path --extend",
+    f"run {RUN}": f"{SELECTED} --recipe --weights --depth-path --match-list-path --extend",
     f"compare {RUN}": "--ground-truth-path",
     "escalate --output-path OUT": "--weights",
     "map --output-path NEW --from-database OUT/database.db": "--image-path",
@@ -262,21 +263,6 @@ def test_wrong_options_are_refused_before_any_image_is_read(
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("right", "wrong"), [("verify", "verrify"), ("stretch_contrast", "stretch_kontrast")]
-)
-def test_typo_in_a_config_is_refused(
-    tmp_path: Path, verified: Path, call: Call, right: str, wrong: str
-) -> None:
-    config = tmp_path / "config.toml"
-    text = (verified / "config.toml").read_text(encoding="utf-8")
-    config.write_text(text.replace(right, wrong), encoding="utf-8")
-    done = call("run", "--config", config, "--output-path", tmp_path / "out")
-    assert done.code == 2
-    assert wrong in done.stderr[0]
-    assert f"(did you mean '{right}'?)" in done.stderr[0]
-
-
 def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:
     def keys(*names: str) -> list[str]:
         lines = call("weights", "list", *names).stdout.splitlines()
@@ -292,46 +278,6 @@ def test_what_is_printed_may_end_early() -> None:
     command = f"{sys.executable} -m colmap_affrect recipes on-demand | head -n 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
     assert (len(done.stdout.splitlines()), done.stderr) == (1, "")
-
-
-Taken = list[tuple[Path, pipeline.RunOptions]]
-
-
-@pytest.fixture
-def taken(monkeypatch: pytest.MonkeyPatch) -> Taken:
-    """Folders of photographs and options with which ``run`` begins, and does no more."""
-    taken: Taken = []
-
-    def keep(images: Path, _: Path, options: pipeline.RunOptions, **__: object) -> None:
-        taken.append((images, options))
-        raise OptionError("enough")
-
-    monkeypatch.setattr(pipeline, "run", keep)
-    return taken
-
-
-def test_run_repeats_what_is_on_record_and_options_win(
-    tmp_path: Path, call: Call, taken: Taken
-) -> None:
-    write_photographs(tmp_path / "photos", 2)
-    (tmp_path / "list.txt").write_text("a.png\n")
-    done = call(
-        "extract", "--image-path", tmp_path / "photos", "--output-path", tmp_path / "out",
-        "--recipe", "unrectified-rootsift", "--set", "matching.max_ratio=0.7",
-        "--camera-mode", "single", "--image-list-path", tmp_path / "list.txt",
-    )  # fmt: skip
-    assert done.code == 0
-    again = ["run", "--config", tmp_path / "out" / "config.toml", "--output-path", tmp_path / "b"]
-    call(*again)
-    call(*again, "--image-path", tmp_path, "--camera-mode", "per-image", "--recipe", "default")
-    (images, options), (others, changed) = taken
-    assert images == tmp_path / "photos"
-    assert options.recipe.name == "unrectified-rootsift"
-    assert (options.recipe.matching.max_ratio, options.cameras.mode) == (0.7, "single")
-    assert options.recipe.extraction == load_recipe("unrectified-rootsift").extraction
-    assert options.image_list_path == tmp_path / "list.txt"
-    assert (others, changed.image_list_path) == (tmp_path, None)
-    assert (changed.recipe, changed.cameras.mode) == (load_recipe("default"), "per-image")
 
 
 @pytest.mark.long

@@ -59,41 +59,6 @@ def test_interrupt_ends_with_130_and_a_later_run_completes(
     assert done.stdout.startswith("registered  3 of 3 images")
 
 
-INTERRUPTED_WHILE_DELETING = """
-import argparse, os, signal, time
-from colmap_affrect import cli
-
-class Deleted:
-    def __del__(self):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.2)
-
-def command(options):
-    Deleted()
-    time.sleep(20.0)
-    return 0
-
-class Parser:
-    def parse_args(self, arguments):
-        return argparse.Namespace(function=command)
-
-signal.signal(signal.SIGINT, signal.default_int_handler)
-cli.build_parser = Parser
-cli.main_of_process()
-"""
-
-
-@pytest.mark.long
-def test_interrupt_that_python_cannot_raise_is_repeated() -> None:
-    """It was printed with its traceback, and the command went on and ended with 0."""
-    done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED_WHILE_DELETING],
-        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
-    )  # fmt: skip
-    assert done.returncode == 130
-    assert done.stderr == "interrupted; run the same command again to go on\n"
-
-
 ENDLESS = ["ba_global_max_refinements=1000000000", "ba_global_max_refinement_change=0"]
 
 
@@ -124,7 +89,7 @@ def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
 AS_PROCESS = """
 import collections, ctypes, itertools
 from colmap_affrect import __main__, cli
-cli.main_of_process = lambda: (print("begun", flush=True), WORK)
+cli.main = lambda: (print("begun", flush=True), WORK)
 __main__.main()
 """
 STUCK = "collections.deque(itertools.repeat(0), maxlen=0)"  # holds Python's lock for ever

@@ -52,7 +52,7 @@ def _ends_in_time() -> Iterator[None]:
 def run_words(scene: Path, out: Path) -> Words:
     """Arguments of the run of the scene."""
     given = ["--image-path", scene / "photos", "--output-path", out]
-    return ["run", "-q", *given, *FAST, "--guided", "always"]
+    return ["run", "-q", *given, *FAST, "--set", "guided.enabled=always"]
 
 
 @pytest.fixture(scope="session")

@@ -191,7 +191,7 @@ def test_photographs_that_moved_or_are_gone_are_named_by_map(tmp_path: Path, sta
     (tmp_path / "photos" / FIRST).rename(tmp_path / "away.png")
     assert f"{FIRST} has features, and is gone" in stage("map")[-1]
     (tmp_path / "photos").rename(tmp_path / "moved")
-    assert "if the photographs have moved, run extract again" in stage("map")[-1]
+    assert "no such folder; give the folder of the photographs" in stage("map")[-1]
 
 
 def test_changed_photograph_of_a_users_database_is_named(tmp_path: Path) -> None:

@@ -198,11 +198,10 @@ def test_verification_over_again_forgets_guided_matches(
 
 def test_command(context: Context, call: Call) -> None:
     out = ["--output-path", context.workspace.path]
-    ended = call("guide", *out, "--guided", "always", "--set", "guided.band_px=2")
+    ended = call("guide", *out, "--set", "guided.enabled=always", "--set", "guided.band_px=2")
     assert ended.code == 0
     assert "guide: 6 done" in ended.stdout
-    assert "inliers" in ended.stdout
-    refused = call("guide", *out, "--guided", "auto")
+    refused = call("guide", *out, "--set", "guided.enabled=auto")
     assert "was run there with band_px=2.0" in refused.errors[0] or "enabled" in refused.errors[0]
     wrong = call("guide", *out, "--set", "matching.max_ratio=0.8")
     assert wrong.errors == ["error: --set: only options of guided can be changed here"]

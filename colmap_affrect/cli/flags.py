@@ -1,0 +1,203 @@
+"""All flags and arguments, with help texts; which command has which, see :mod:`.parser`.
+
+What :mod:`.given` makes an options class of has the field as destination, as ``cameras.mode``.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS
+from colmap_affrect.options import PRESETS
+
+Settings = dict[str, Any]
+"""What ``add_argument`` takes."""
+MANY: Settings = {"nargs": "+", "action": "extend", "default": []}
+
+
+def _value(metavar: str, text: str, field: str = "", **settings: Any) -> Settings:
+    destination = {"dest": field} if field else {}
+    return {"metavar": metavar, "help": text, **destination, **settings}
+
+
+def _path(metavar: str, text: str, field: str = "", **settings: Any) -> Settings:
+    return _value(metavar, text, field, **{"type": absolute if "." in field else Path, **settings})
+
+
+def _switch(text: str, field: str = "") -> Settings:
+    destination = {"dest": field} if field else {}
+    return {"action": "store_true", "help": text, **destination}
+
+
+def absolute(text: str) -> str:
+    return str(Path(text).resolve())
+
+
+def integers(text: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in text.split(","))
+
+
+def words(text: str) -> tuple[str, ...]:
+    return tuple(text.split(","))
+
+
+def setting(text: str) -> str:
+    key, separator, _ = text.partition("=")
+    if not separator or not key.strip():
+        raise argparse.ArgumentTypeError(f"{text}: expected KEY=VALUE")
+    return text
+
+
+def distance(text: str) -> tuple[str, str, float]:
+    first, second, metres = text.split(",")
+    return first, second, float(metres)
+
+
+FLAGS: dict[str, Settings] = {
+    # what all commands share
+    "-q,--quiet": _switch("errors and the result only"),
+    "-v,--verbose": _switch("every image, tracebacks"),
+    "--json": _switch("print the report as JSON, no summary"),
+    "--output-path": _path("PATH", "folder for all results"),
+    "--overwrite": _switch("discard the results of this and later stages"),
+    "--max-failures": _value("N", "exit code 1 if more images than this cannot be read "
+        "(default: 0)", type=int),
+    "--no-page": {"dest": "page", "action": "store_false", "default": True,
+        "help": "leave out report.html, the page to look at"},
+    "--random-seed": _value("N", "seed of all that is left to chance (default: 0)", type=int),
+    "--weights": _path("FOLDER", "weights of networks, looked for here first (then in "
+        "$COLMAP_AFFRECT_WEIGHTS, torch's cache, installed packages; then downloaded)"),
+    "--device": _value("DEVICE", "for networks: auto, cpu, cuda, cuda:1, mps (default: auto)"),
+    "--scheduler": _value("ADDRESS", "extract and match on the dask.distributed cluster of this "
+        "scheduler, such as tcp://10.0.0.1:8786 (pip install 'colmap-affrect[cluster]'); "
+        "default: on this machine"),
+    # photographs, masks and cameras
+    "--image-path": _path("PATH", "folder of the photographs, searched with its sub-folders"),
+    "--image-list-path": _path("FILE",
+        "names of the images to use, one per line, relative to --image-path"),
+    "--from-database": _path("FILE",
+        "take images, cameras, rigs, frames and priors of this COLMAP database; it is copied"),
+    "--mask-path": _path("FOLDER", "masks, black where features are not wanted: a/b.jpg has "
+        "a/b.jpg.png or a/b.png; photographs without one are used whole", "masks.path"),
+    "--camera-mask-path": _path("FILE", "one mask for all images", "masks.camera_path"),
+    "--camera-mode": _value("MODE", "which images share a camera: auto, single, per-folder or "
+        "per-image (default: auto, as --cameras-path says, else those of one body, lens, focal "
+        "length and size by EXIF; without EXIF one camera each, unless matches show that images "
+        "of one size share one)", "cameras.mode"),
+    "--camera-model": _value("MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
+        "cameras.model"),
+    "--camera-params": _value("A,B,...",
+        "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5", "cameras.params"),
+    "--cameras-path": _path("FILE", "known cameras: folder of a COLMAP model of these images, or "
+        "a CSV file with the columns name and any of focal_px, focal_mm with "
+        "plate_width_mm (of what the whole image shows), model, params, cx, cy, camera (images "
+        "with one label share a camera)", "cameras.cameras_path"),
+    "--focal-length-px": _value("PX", "known focal length of images that --cameras-path does not "
+        "name; the rest is refined", "cameras.focal_length_px", type=float),
+    "--principal-point": _value("CX,CY", "where the optical axis meets the image, in px from its "
+        "corner (default: its middle, wrong for prints and scans that were cropped off centre)",
+        "cameras.principal_point"),
+    "--ignore-exif": _switch("take neither focal lengths nor who shares a camera from EXIF",
+        "cameras.ignore_exif"),
+    # features, pairs and matches
+    "--recipe": _value("NAME",
+        "one that 'recipes' lists, or the path of a TOML file (default: default)"),
+    "--set": _value("SECTION.OPTION=VALUE", "change one option of the recipe, e.g. --set "
+        "rectifier.tilt_radius=1.8; may be repeated", type=setting, action="append", default=[]),
+    "--depth-path": _path("FOLDER",
+        "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
+    "--database-descriptors": _switch(
+        "descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers"),
+    "--match-list-path": _path("FILE", "pairs to match, two names per line (default: all pairs)",
+        "pairs.match_list_path"),
+    "--pairs": _value("A,B,...", "which pairs to match, all of: exhaustive, retrieval "
+        "(photographs that are alike), low-resolution (whose strongest features match), gps (near "
+        "to each other), sequence (following by name); with those of --match-list-path, which "
+        "takes the place of exhaustive (default: exhaustive)", "pairs.methods", type=words),
+    "--num-neighbors": _value("N", "retrieval, low-resolution: neighbours of a photograph on "
+        "average; gps: at most; sequence: before and after it (default: 20)",
+        "pairs.num_neighbors", type=int),
+    "--max-distance-m": _value("METRES", "gps: largest distance of neighbours (default: 100)",
+        "pairs.max_distance_m", type=float),
+    # verification and mapping
+    "--preset": _value("NAME", "options of two-view geometry and mapping: ours for few "
+        "photographs, or COLMAP's defaults (default: sparse)", choices=PRESETS),
+    "--mapper": _value("NAME", "sparse (ours: adjustments that know what is known of the cameras), "
+        "or COLMAP's incremental or global (default: sparse)"),
+    "--mapper-options": _value("KEY=VALUE", "options of pycolmap's IncrementalPipelineOptions or "
+        "GlobalPipelineOptions, e.g. ba_refine_principal_point=true "
+        "mapper.abs_pose_min_num_inliers=10; they win over the preset. With num_threads other "
+        "than 1 results vary from run to run", type=setting, **MANY),
+    "--extend": _path("MODEL", "register new photographs into this COLMAP model, whose poses and "
+        "cameras stay; it may be of another program, and its photographs must be among those "
+        "given"),
+    "--refine-existing": _switch("let the poses and cameras of --extend move"),
+    "--from-database@map": _path("FILE",
+        "map this COLMAP database of any program, verified or matched; it is copied"),
+    "--image-path@map": _path("PATH",
+        "folder of its photographs, for the colours of the points (with --from-database)"),
+    # comparison and evaluation
+    "--methods": _value("A,B,...", "sift-colmap (all as COLMAP does it by default), sift, "
+        "sift-affine-dsp (with our preset), recipes by name or path; "
+        "NAME=RECIPE:section.option=value changes options (default: "
+        f"{','.join(DEFAULT_METHODS)}, and {', '.join(LEARNED_METHODS)} where their weights are)",
+        nargs="+"),
+    "--seeds": _value("N,...", "seeds of verification and mapping, which run once for each "
+        "(default: 0,1,2)", type=integers, default=(0, 1, 2)),
+    "--ground-truth-path": _path("MODEL",
+        "folder of a COLMAP model with true poses of the photographs, in any frame"),
+    "protocol": {"choices": ["evd", "svp", "imc", "pairs"],
+        "help": "evd: homographies; svp, imc: camera poses; pairs: what pairs.json describes"},
+    "--dataset-path": _path("FOLDER", "the dataset, in the layout of the protocol"),
+    "--recipes": _value("A,B,...", "by name or path; NAME=RECIPE:section.option=value changes "
+        "options (default: unrectified-rootsift,default)", nargs="+",
+        default=["unrectified-rootsift", "default"]),
+    "--max-num-keypoints": _value("N", "equal budget: match only the strongest N features of each "
+        "image, warps included", type=int),
+    "--protocol-options": _value("KEY=VALUE", "settings of the protocol, e.g. threshold_px=1, "
+        "max_num_iterations=1000 (svp, imc: what the code of the paper did)", type=setting, **MANY),
+    # features and models from and for other programs
+    "--output-path@photographs": _path("PATH", "new folder for the photographs", "target_path"),
+    "--features-path": _path("FILE", "HDF5 file of features"),
+    "--matches-path": _path("FILE", "HDF5 file of matches"),
+    "--database-path": _path("FILE", "the database to make; must not exist"),
+    "--skip-verification": _switch("no two-view geometries"),
+    "--database-path@read": _path("FILE", "any COLMAP database; a copy of it is read"),
+    "--colmap": _value("VERSION", "whose tables to write; COLMAP 3.8 to 3.13 read those of 3.8",
+        choices=["3.8"], default="3.8"),
+    "path": _path("PATH", "output folder, or any COLMAP database; a copy of it is read"),
+    "database_path": _path("OUT.db", "the database to make; must not exist"),
+    "--model-path": _path("MODEL", "folder of a COLMAP model, such as out/sparse/0"),
+    "--output-path@files": _path("FOLDER", "folder for the files; nothing in it is overwritten",
+        "target_path"),
+    "--format": _value("A,B,...", "ply (points), text (COLMAP's), undistorted (photographs and "
+        "model, for dense reconstruction), nerfstudio (the same with transforms.json, for "
+        "Gaussian splatting too), cameras (CSV) "
+        "(default: ply,text,cameras)", type=words, default=("ply", "text", "cameras")),
+    "--image-path@export": _path("PATH",
+        "folder of the photographs, to undistort them (default: that of the run)"),
+    "--output-path@model": _path("MODEL", "folder for the new model, in metres; must not exist",
+        "target_path"),
+    "--gps": _path("DATABASE",
+        "positions by GPS that a COLMAP database holds, such as out/database.db"),
+    "--positions": _path("FILE", "CSV of where photographs were taken: name and x,y,z in metres, "
+        "or name and latitude,longitude,altitude"),
+    "--points": _path("FILE", "CSV of points that are marked in two photographs or more: "
+        "point,image,px,py, and x,y,z of control points in metres (px, py: from the upper left "
+        "corner)"),
+    "--distance": _value("A,B,METRES", "a known distance, of two photographs or two points of "
+        "--points: gives the scale alone; may be repeated", type=distance, action="append",
+        default=[]),
+    # looking into things
+    "image": _path("IMAGE", "the photograph"),
+    "path@optional": _path("PATH", "output folder, or any COLMAP database", nargs="?"),
+    "--image-path@doctor": _path("PATH",
+        "folder of the photographs, to compare their sizes with the cameras"),
+    "name": {"nargs": "?", "help": "print this recipe with all of its options"},
+    "action": {"choices": ["list", "fetch"], "nargs": "?", "default": "list",
+        "help": "fetch downloads what is missing or damaged, for a machine without network "
+        "(default: list)"},
+    "keys": _value("KEY", "which files, all of a name (aliked, lightglue), or those of a recipe "
+        "(default: list all, fetch affnet, orinet and hardnet)", nargs="*"),
+}  # fmt: skip
+"""By name, with what stands behind @ where commands use one name for several things."""
