@@ -15,7 +15,7 @@ shape than ours."""
 MAX_REASON = 200  # characters of what a reader says
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
-    "photographs, or --set max_image_size_px=1600"
+    "photographs, --set max_image_size_px=1600, or --device cpu where that of a GPU is full"
 )
 NO_MEMORY = (
     "insufficient memory", "out of memory", "can't allocate memory", "cannot allocate memory",

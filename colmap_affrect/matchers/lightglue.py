@@ -7,13 +7,10 @@ matched, and the matches united.
 
 from __future__ import annotations
 
-import logging
 import re
 import threading
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
@@ -24,7 +21,7 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
-from colmap_affrect.geometry.arrays import Array, Indices, Singles
+from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.geometry.shapes import of_unit_area
@@ -35,12 +32,10 @@ from colmap_affrect.matchers.base import (
     Matches,
 )
 from colmap_affrect.options import within
-from colmap_affrect.parallel.executor import one_openmp_thread, unless_gpu_is_full
+from colmap_affrect.parallel.executor import one_openmp_thread
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
-
-logger = logging.getLogger(__name__)
 
 MIN_VIEW_FEATURES = 8  # of a view: no geometry could be verified by what fewer add
 TRAINING_SIZE_PX = 1024  # longer side in training, whose pixels scales of features are in
@@ -131,7 +126,7 @@ class LightGlue:
     """Matches with one network, a pair of views at a time.
 
     On a CPU each thread uses one core, so that results do not depend on their number; a GPU takes
-    one pair at a time, and where its memory is full the CPU matches.
+    one pair at a time.
     """
 
     Options = LightGlueOptions
@@ -141,9 +136,9 @@ class LightGlue:
         from colmap_affrect.features.networks import resolve_device
 
         self.options, self.training = options, TRAININGS[options.trained_for]
-        self._path = context.weights[self.training.weights]
         self._device = resolve_device(context.device)
-        self._network = load_network(self._path, options).to(self._device)
+        path = context.weights[self.training.weights]
+        self._network = load_network(path, options).to(self._device)
         self._gpu_lock = threading.Lock()
 
     def prepare(self, image: ImageFeatures) -> PreparedViews:
@@ -184,33 +179,20 @@ class LightGlue:
     def _match_views(self, first: PreparedView, second: PreparedView) -> Matches:
         if not len(first.rows) or not len(second.rows):
             return Matches.none()
-        rows, columns, scores = unless_gpu_is_full(
-            lambda: self._run(self._network, first, second),
-            lambda: self._run(self._network_on_cpu, first, second),
-        )
-        return Matches(np.stack([first.rows[rows], second.rows[columns]], axis=1), scores)
-
-    def _run(self, network: nn.Module, *views: PreparedView) -> tuple[Indices, Indices, Singles]:
         import torch
 
-        device = next(network.parameters()).device
-        on_gpu = device.type != "cpu"
         torch.get_num_threads()  # lets torch set up this thread, which would undo the next line
-        limit = nullcontext() if on_gpu else one_openmp_thread()
-        with torch.inference_mode(), limit, self._gpu_lock if on_gpu else nullcontext():
-            found = network({
-                f"image{k}": {name: tensor.to(device) for name, tensor in view.inputs.items()}
-                for k, view in enumerate(views)
+        alone = one_openmp_thread() if self._device.type == "cpu" else self._gpu_lock
+        with torch.inference_mode(), alone:
+            found = self._network({
+                f"image{k}": {name: tensor.to(self._device) for name, tensor in view.inputs.items()}
+                for k, view in enumerate((first, second))
             })  # fmt: skip
             rows, columns = found["matches"][0].cpu().numpy().T
             scores = found["scores"][0].float().cpu().numpy()
         order = np.argsort(rows, kind="stable")
-        return rows[order], columns[order], scores[order]
-
-    @cached_property
-    def _network_on_cpu(self) -> nn.Module:
-        logger.warning("the memory of the GPU is full; the CPU matches what does not fit")
-        return load_network(self._path, self.options)
+        indices = np.stack([first.rows[rows], second.rows[columns]], axis=1)
+        return Matches(indices[order], scores[order])
 
 
 def load_network(path: Path, options: LightGlueOptions) -> nn.Module:

@@ -14,29 +14,25 @@ import platform
 import re
 import threading
 import uuid
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import cv2
 from threadpoolctl import threadpool_limits
 
 from colmap_affrect.errors import ClusterError
-from colmap_affrect.parallel.executor import Result, Task
+from colmap_affrect.parallel.executor import Result, Task, in_order
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Security
 
-logger = logging.getLogger(__name__)
-
 CONNECT_TIMEOUT_S = 10.0
-POLL_S = 2.0  # how often to look whether there are workers at all
 TASKS_PER_THREAD = 2  # one that is being worked on and one that waits, so that no worker has to
 
 PACKAGES = (
@@ -45,37 +41,9 @@ PACKAGES = (
 """Packages whose versions must be the same everywhere."""
 
 
-@dataclass(frozen=True)
-class WorkerEnvironment:
-    """What results depend on besides the task: versions of ``PACKAGES``, and sizes of files."""
-
-    host: str
-    versions: tuple[tuple[str, str], ...]
-    files: tuple[tuple[str, int], ...]
-
-    @classmethod
-    def of(cls, paths: Sequence[str]) -> Self:
-        """Describe the machine this is called on."""
-        return cls(
-            platform.node(),
-            tuple((name, _version(name)) for name in PACKAGES),
-            tuple((path, _size(Path(path))) for path in paths),
-        )
-
-    def require_here(self) -> None:
-        """Refuse a worker, where this is called, that would give other results: ClusterError."""
-        worker = self.of([path for path, _ in self.files])
-        for (name, here), (_, there) in zip(self.versions, worker.versions, strict=True):
-            if here != there:
-                raise ClusterError(
-                    f"worker on {worker.host}: has {name} {there}, and the machine that leads the "
-                    f"work {here}; results could differ, install the same versions on both"
-                )
-        if other := set(self.files) - set(worker.files):
-            raise ClusterError(
-                f"worker on {worker.host}: does not see {min(other)[0]} as this machine does; put "
-                "it on storage that all machines share, under the same path"
-            )
+def environment(paths: Iterable[str]) -> dict[str, str]:
+    """Return what results depend on besides the task: versions of ``PACKAGES``, sizes of files."""
+    return {name: _version(name) for name in PACKAGES} | {path: _size(path) for path in paths}
 
 
 def _version(package: str) -> str:
@@ -86,53 +54,51 @@ def _version(package: str) -> str:
         return "missing"
 
 
-def _size(path: Path) -> int:
-    """Return the size of a file in bytes, 0 for a folder, -1 for what is not there."""
+def _size(path: str) -> str:
     try:
-        return 0 if path.is_dir() else path.stat().st_size
+        return "a folder" if Path(path).is_dir() else f"{Path(path).stat().st_size} bytes"
     except OSError:
-        return -1
+        return "missing"
 
 
-@dataclass(frozen=True)
-class _Job:
-    """What comes with every task of a map: a pickled function and the environment it expects."""
-
-    function: bytes
-    environment: WorkerEnvironment
+def require_environment(expected: Mapping[str, str]) -> None:
+    """Refuse a worker, where this is called, that would give other results: ClusterError."""
+    found = environment(key for key in expected if key not in PACKAGES)
+    for key, value in expected.items():
+        if found[key] != value:
+            raise ClusterError(
+                f"worker on {platform.node()}: {key} is {found[key]}, and {value} on the machine "
+                "that leads the work; results could differ: install the same versions, and have "
+                "files on storage that all machines share, under the same path"
+            )
 
 
 _loading = threading.Lock()
 
 
 @lru_cache(maxsize=1)
-def _function(job: _Job) -> Callable[[Any], Any]:
+def _function(pickled: bytes, expected: tuple[tuple[str, str], ...]) -> Callable[[Any], Any]:
     """Unpickle a function once per process; the next one replaces it and frees its memory."""
-    job.environment.require_here()
+    require_environment(dict(expected))
     threadpool_limits(1, user_api="blas")
     cv2.setNumThreads(1)
-    function: Callable[[Any], Any] = pickle.loads(job.function)  # noqa: S301 - from the driver
+    function: Callable[[Any], Any] = pickle.loads(pickled)  # noqa: S301 - from the driver
     return function
 
 
-def _work(job: _Job, task: bytes) -> Any:
-    """Do one task on a worker."""
+def _work(pickled: bytes, expected: tuple[tuple[str, str], ...], task: bytes) -> Any:
+    """Do one task on a worker that has what is expected, by a pickled function."""
     with _loading:
-        function = _function(job)
+        function = _function(pickled, expected)
     return function(pickle.loads(task))  # noqa: S301 - from the driver
-
-
-def _forget() -> None:
-    """Free the memory of the last function."""
-    _function.cache_clear()
 
 
 @contextmanager
 def connected(address: str) -> Iterator[Cluster]:
     """Use the cluster of a scheduler, such as ``tcp://10.0.0.1:8786``, and leave it running.
 
-    Raises ClusterError when distributed is not installed, the scheduler does not answer, there are
-    no workers, or they differ from this machine.
+    Raises ClusterError when distributed is not installed, the scheduler does not answer, or there
+    are no workers.
     """
     try:
         from dask import config
@@ -149,58 +115,49 @@ def connected(address: str) -> Iterator[Cluster]:
             f"--scheduler {address}: needs certificates, distributed.comm.tls in the "
             "configuration of dask"
         )
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors that matter are raised
     # Tasks may contain large images: dask need not warn of that.
-    images_are_large = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
-    with _silent("distributed"), config.set(images_are_large):
+    with config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
         _require_scheduler(address, security)
         with Client(
             address, timeout=CONNECT_TIMEOUT_S, security=security, set_as_default=False
         ) as client:
-            cluster = Cluster(client, address)
-            cluster.require_workers()
             try:
-                yield cluster
+                client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+            except TimeoutError as error:
+                raise ClusterError(
+                    f"{address}: the cluster has no workers; start some, with 'dask worker "
+                    f"{address}' on each machine"
+                ) from error
+            try:
+                yield Cluster(client, address)
             finally:
                 with suppress(OSError, RuntimeError, CancelledError):
-                    client.run(_forget, on_error="ignore")
+                    client.run(_function.cache_clear, on_error="ignore")
 
 
 def _require_scheduler(address: str, security: Security) -> None:
     """Ask what listens at an address: a client waits for ever for what is not a scheduler."""
-    from distributed.comm import CommClosedError
     from distributed.core import rpc
 
-    async def kind() -> str:
+    async def kind() -> object:
         arguments = security.get_connection_args("client")
         async with (
-            asyncio.timeout(CONNECT_TIMEOUT_S + 1.0),  # after that of connecting
+            asyncio.timeout(CONNECT_TIMEOUT_S),
             rpc(address, timeout=CONNECT_TIMEOUT_S, connection_args=arguments) as there,
         ):
-            return str((await there.identity())["type"])
+            return (await there.identity())["type"]
 
     try:
         with ThreadPoolExecutor(1) as own_thread:  # the caller's may have an event loop
             found = own_thread.submit(asyncio.run, kind()).result()
-        if found != "Scheduler":
-            raise ConnectionError(f"it is a {found.lower()}")
-    except Exception as error:  # what listens there may say anything
-        is_told = isinstance(error, OSError) and type(error) is not CommClosedError and str(error)
+    except Exception as error:  # noqa: BLE001 - what listens there may say anything
+        found = f"{type(error).__name__} {error}".strip()
+    if found != "Scheduler":
         raise ClusterError(
-            f"--scheduler {address}: no scheduler answers "
-            f"({error if is_told else 'what listens there does not speak as dask does'}); give the "
-            "address that 'dask scheduler' prints"
-        ) from error
-
-
-@contextmanager
-def _silent(package: str) -> Iterator[None]:
-    """Keep a package from logging to the terminal: errors that matter are raised."""
-    its = logging.getLogger(package)
-    handlers, its.handlers = its.handlers, [logging.NullHandler()]
-    try:
-        yield
-    finally:
-        its.handlers = handlers
+            f"--scheduler {address}: no scheduler answers ({found}); give the address that 'dask "
+            "scheduler' prints"
+        )
 
 
 class Cluster:
@@ -208,28 +165,6 @@ class Cluster:
 
     def __init__(self, client: Client, address: str) -> None:
         self._client, self._address = client, address
-
-    def require_workers(self) -> None:
-        """Refuse, by a ClusterError, a cluster without workers or whose results would differ."""
-        with suppress(TimeoutError):
-            self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
-        here = WorkerEnvironment.of([])
-        try:
-            self._client.run_on_scheduler(WorkerEnvironment.of, [])  # which unpickles tasks
-            workers = self._client.run(here.require_here)
-        except (ModuleNotFoundError, AttributeError) as error:
-            raise self._not_installed(error) from error
-        if not workers:
-            raise ClusterError(
-                f"{self._address}: the cluster has no workers; start some, with 'dask worker "
-                f"{self._address}' on each machine"
-            )
-
-    def _not_installed(self, error: Exception) -> ClusterError:
-        return ClusterError(
-            f"{self._address}: scheduler or workers do not have this version of colmap-affrect "
-            f"({error}); install it on all machines of the cluster"
-        )
 
     def map(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
@@ -239,51 +174,36 @@ class Cluster:
         Raises ClusterError when the scheduler is lost, several workers are lost with one task, or a
         worker differs or does not see the files.
         """
-        job = _Job(pickle.dumps(function), WorkerEnvironment.of([str(path) for path in files]))
-        name = f"{type(function).__name__}-{uuid.uuid4().hex}"
-        pending: deque[tuple[Future, Task]] = deque()
-        try:
-            for number, task in enumerate(tasks):
-                future = self._client.submit(
-                    _work, job, pickle.dumps(task), key=f"{name}-{number}", pure=False
-                )
-                pending.append((future, task))
-                while len(pending) >= TASKS_PER_THREAD * max(1, self._num_threads()):
-                    yield self._result(*pending.popleft())
-            while pending:
-                yield self._result(*pending.popleft())
-        finally:
-            if pending:
-                with suppress(OSError, RuntimeError, CancelledError):
-                    self._client.cancel([future for future, _ in pending])
-
-    def _num_threads(self) -> int:
-        return sum(self._client.nthreads().values())
-
-    def _result(self, future: Future, task: object) -> Any:
         from distributed import KilledWorker
 
+        expected = environment(str(path) for path in files)
+        job = pickle.dumps(function), tuple(expected.items())
+        name, numbers = f"{type(function).__name__}-{uuid.uuid4().hex}", count()
+
+        def submit(task: Task) -> Future:
+            key = f"{name}-{next(numbers)}"
+            return self._client.submit(_work, *job, pickle.dumps(task), key=key, pure=False)
+
         try:
-            self._wait(future)
-            return future.result()
+            yield from in_order(submit, tasks, self._num_tasks)
         except KilledWorker as error:
             raise ClusterError(
-                f"{task}: {error.allowed_failures + 1} workers were lost while working on it, for "
-                "want of memory perhaps; run the same command again"
+                f"{self._address}: {error.allowed_failures + 1} workers were lost while working on "
+                "one task, for want of memory perhaps; run the same command again"
             ) from error
         except CancelledError as error:
             raise ClusterError(
                 f"{self._address}: the scheduler was lost; start it and run the same command again"
             ) from error
-        except ModuleNotFoundError as error:
-            raise self._not_installed(error) from error
+        except (ModuleNotFoundError, RuntimeError) as error:
+            if not isinstance(why := error.__cause__ or error, ModuleNotFoundError):
+                raise
+            raise ClusterError(
+                f"{self._address}: scheduler or workers do not have this version of colmap-affrect "
+                f"({why}); install it on all machines of the cluster"
+            ) from error
 
-    def _wait(self, future: Future) -> None:
-        """Wait until a task has ended, and for new workers if all are lost."""
-        is_warned = False
-        while not future.done():
-            with suppress(TimeoutError):
-                future.result(timeout=POLL_S)
-            if not is_warned and not self._num_threads():
-                logger.warning("%s: no workers are left; waiting for some", self._address)
-                is_warned = True
+    def _num_tasks(self) -> int:
+        """Return how many tasks may be on their way."""
+        num_threads: int = sum(self._client.nthreads().values())
+        return TASKS_PER_THREAD * max(1, num_threads)

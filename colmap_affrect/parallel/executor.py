@@ -9,21 +9,30 @@ import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from threading import Lock
 from typing import Protocol, TypeVar
 
 import cv2
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024  # unit of ``getrusage``
 ASSUMED_MEMORY_BYTES = 8 << 30  # of systems that do not say what they have
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+Result_co = TypeVar("Result_co", covariant=True)
+
+
+class Pending(Protocol[Result_co]):
+    """Work that has been submitted, to a thread or a worker."""
+
+    def result(self) -> Result_co:
+        """Wait for what it returns, or raise what it raises."""
+
+    def cancel(self) -> object:
+        """Do not begin it, if it has not begun."""
 
 
 class Executor(Protocol):
@@ -68,44 +77,18 @@ def available_memory_bytes() -> int:
     with suppress(OSError, ValueError):  # no container, or one without a limit
         limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")
         available = min(available, int(limit))
-    with suppress(ImportError, OSError):  # other systems
-        import resource
-
-        limited, _ = resource.getrlimit(resource.RLIMIT_AS)  # ulimit -v
-        if limited != resource.RLIM_INFINITY:
-            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-            available = min(available, max(0, limited - pages * resource.getpagesize()))
     return available
 
 
-def unless_gpu_is_full(work: Callable[[], Result], instead: Callable[[], Result]) -> Result:
-    """Return what the work does, or what is done instead when torch has no memory left on a GPU."""
-    try:
-        return work()
-    except RuntimeError as error:
-        if "out of memory" not in str(error):
-            raise
-    return instead()
-
-
 def peak_memory_bytes() -> int:
-    """Return the most memory that this process or one that it waited for has had; 0 on Windows.
-
-    Not by ``getrusage`` where it can be helped: Linux counts there what the process that started
-    this one had.
-    """
+    """Return the most memory that this process or one that it waited for has had; 0 on Windows."""
     try:
         import resource
     except ImportError:
         return 0
-    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * BYTES_PER_RSS
-    status = Path("/proc/self/status")
-    if status.exists():
-        lines = status.read_text(encoding="ascii", errors="replace").splitlines()
-        own = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
-    else:
-        own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_RSS
-    return max(own, children)
+    whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes
+    return unit * max(resource.getrusage(which).ru_maxrss for which in whose)
 
 
 def return_freed_memory() -> None:
@@ -136,51 +119,44 @@ def map_ordered(
 ) -> Iterator[Result]:
     """Yield ``function(task)`` in task order; at most two tasks per thread are in flight.
 
-    Meanwhile numpy's linear algebra keeps to the calling thread: thread pools of its own in
-    every task would only wait for each other. An exception of the function is raised at the place
-    of its task. Work that has not begun is dropped when the iteration ends early; KeyboardInterrupt
-    does not wait for what has begun either, which may take long.
+    Meanwhile numpy's linear algebra keeps to the calling thread, and OpenCV to its share of the
+    cores: thread pools of their own in every task would only wait for each other. An exception of
+    the function is raised at the place of its task. Work that has not begun is dropped when the
+    iteration ends early; KeyboardInterrupt does not wait for what has begun either, which may take
+    long.
     """
-    pending: deque[Future[Result]] = deque()
-    pool, is_waited_for = ThreadPoolExecutor(num_threads), True
+    pool, is_waited_for, num_before = ThreadPoolExecutor(num_threads), True, cv2.getNumThreads()
+    cv2.setNumThreads(max(1, num_before // num_threads))
     try:
         with threadpool_limits(1, user_api="blas"):
-            for task in tasks:
-                pending.append(pool.submit(function, task))
-                if len(pending) >= 2 * num_threads:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
+            yield from in_order(
+                lambda task: pool.submit(function, task), tasks, lambda: 2 * num_threads
+            )
     except KeyboardInterrupt:
         is_waited_for = False
         raise
     finally:
         pool.shutdown(wait=is_waited_for, cancel_futures=True)
+        cv2.setNumThreads(num_before)
 
 
-class _OpenCvThreads:
-    """OpenCV's threads, shared equally among the threads that are inside at the time.
+def in_order(
+    submit: Callable[[Task], Pending[Result]],
+    tasks: Iterable[Task],
+    limit: Callable[[], int],
+) -> Iterator[Result]:
+    """Yield results in task order; fewer than ``limit()`` tasks are submitted beforehand.
 
-    With all of them for each of two images at once, extraction takes longer.
+    What has not ended is cancelled when the iteration ends early.
     """
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._num_inside, self._num_threads = 0, 1
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if not self._num_inside:
-                self._num_threads = cv2.getNumThreads()
-            self._share(self._num_inside + 1)
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._share(self._num_inside - 1)
-
-    def _share(self, num_inside: int) -> None:
-        self._num_inside = num_inside
-        cv2.setNumThreads(max(1, self._num_threads // max(1, num_inside)))
-
-
-SHARED_OPENCV_THREADS = _OpenCvThreads()  # to be held while an image is worked on
+    pending: deque[Pending[Result]] = deque()
+    try:
+        for task in tasks:
+            pending.append(submit(task))
+            while len(pending) >= limit():
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        for future in pending:
+            future.cancel()

@@ -167,7 +167,7 @@ def extract_images(
         return
     if later := {name for name, level in images if level}:
         _refuse_changed(context, inputs, later)
-    executor = context.executor or Threads(num_images_at_once(extractor))
+    executor = context.executor or Threads(min(num_images_at_once(extractor), len(images)))
     files = inputs.photographs.files(images[0][0])
     if depth_folder := extractor.options.depth.folder:
         files.append(depth_folder)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -29,10 +29,8 @@ from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.images.reading import decode, in_eight_bits, read_color, shrink_to, tones
 from colmap_affrect.parallel.executor import (
-    SHARED_OPENCV_THREADS,
     available_cores,
     available_memory_bytes,
-    unless_gpu_is_full,
 )
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions, Level
@@ -41,7 +39,6 @@ from colmap_affrect.rectifiers.execute import extract_rectified
 from colmap_affrect.stages.context import Resources, require_same_files
 
 MIN_RECTIFIABLE_PX = 32  # shorter side; else no block would see its surroundings
-MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
 
 
 @dataclass(frozen=True)
@@ -127,11 +124,9 @@ class ImageExtractor:
         size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
-        with self.network_lock, SHARED_OPENCV_THREADS:
-            features, warning = unless_gpu_is_full(
-                lambda: self._features(photograph, level),
-                lambda: self._features_on_cpu(photograph, level),
-            )
+        with self.network_lock:
+            plan, warning = self.plan_or_warn(photograph, level)
+            features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
             resized = resized_from_original(original_size, photograph.size)
             frames = transform_frames(np.linalg.inv(resized), features.lafs)
@@ -141,19 +136,6 @@ class ImageExtractor:
             keep &= in_mask(mask, features.keypoints)
         kept = features.select(keep)
         return ExtractedImage(kept, original_size, warning, photograph.stretched)
-
-    def _features(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
-        """Plan and execute; frames are in px of the photograph at the size of processing."""
-        plan, warning = self.plan_or_warn(photograph, level)
-        return self.execute(photograph, plan, level), warning
-
-    def _features_on_cpu(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
-        features, warning = self._on_cpu._features(photograph, level)
-        return features, "; ".join(filter(None, (MEMORY_IS_FULL, warning)))
-
-    @cached_property
-    def _on_cpu(self) -> "ImageExtractor":
-        return prepare(self.options, replace(self.resources, device="cpu"))
 
     def photograph(
         self,

@@ -175,20 +175,6 @@ def test_threads_find_the_same(matcher: LightGlue) -> None:
         assert_array_equal(one.scores, other.scores)
 
 
-def test_gpu_without_memory_leaves_the_work_to_the_cpu(
-    matcher: LightGlue, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pair = [matcher.prepare(image(features(50, seed))) for seed in (1, 1)]
-    expected = matcher.match(*pair)
-
-    def full(_: object) -> None:
-        raise RuntimeError("CUDA out of memory")
-
-    monkeypatch.setattr(matcher._network, "forward", full)
-    assert_array_equal(matcher.match(*pair).indices, expected.indices)
-    assert len(expected.scores) == 50
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("trained_for", TRAININGS)
 def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -24,7 +23,7 @@ from small_scene import INTRINSICS, write_photographs
 from colmap_affrect.errors import ClusterError, StaleStoreError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.parallel import cluster as cluster_module
-from colmap_affrect.parallel.cluster import Cluster, WorkerEnvironment, connected
+from colmap_affrect.parallel.cluster import Cluster, connected, environment, require_environment
 from colmap_affrect.parallel.executor import Executor, Threads
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.report import StageReport
@@ -122,7 +121,9 @@ def test_files_that_workers_do_not_see_are_named(photos: Path, address: str) -> 
     with connected(address) as cluster:
         assert list(cluster.map(len, ["task"], [photos, photos / "a.png"])) == [4]
         unseen = Path(os.path.relpath(photos / "a.png"))
-        with pytest.raises(ClusterError, match=rf"does not see {unseen} as this machine does"):
+        with pytest.raises(
+            ClusterError, match=rf"{unseen} is missing, and .* bytes on the machine"
+        ):
             list(cluster.map(len, ["task"], [photos, unseen]))
 
 
@@ -162,15 +163,13 @@ def greet(server: socket.socket, said: bytes) -> None:
 
 def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"1")
-    paths = [str(tmp_path / "a.png"), str(tmp_path)]
-    here = WorkerEnvironment.of(paths)
-    here.require_here()
-    other = replace(here, versions=(*here.versions[:-1], ("kornia", "0.1")))
-    with pytest.raises(ClusterError, match=r"has kornia .*, and the machine that leads .* 0\.1"):
-        other.require_here()
+    here = environment([str(tmp_path / "a.png"), str(tmp_path)])
+    require_environment(here)
+    with pytest.raises(ClusterError, match=r"kornia is .*, and 0\.1 on the machine that leads"):
+        require_environment({**here, "kornia": "0.1"})
     (tmp_path / "a.png").write_bytes(b"22")
-    with pytest.raises(ClusterError, match=r"does not see .*a\.png"):
-        here.require_here()
+    with pytest.raises(ClusterError, match=r"a\.png is 2 bytes, and 1 bytes on the machine"):
+        require_environment(here)
 
 
 WITH_NETWORK = load_recipe("sift-lightglue", ["matching.max_num_features=120"])

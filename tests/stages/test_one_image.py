@@ -139,21 +139,6 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
         assert not (tmp_path / "out" / "features.h5").exists()
 
 
-class OnFullGpu:
-    """A feature extractor whose device has no memory left."""
-
-    def detect(self, _):
-        raise RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-
-
-def test_features_of_a_gpu_without_memory_are_those_of_the_cpu():
-    photo = COURTYARD / "images" / "court_4.jpg"
-    extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
-    found = replace(extractor, extractors=(OnFullGpu(),)).extract_file(photo)
-    assert found.warning == "extracted on the CPU, the memory of the GPU is full"
-    assert_array_equal(found.features.lafs, extractor.extract_file(photo).features.lafs)
-
-
 def test_device_that_is_not_there_is_one_clear_line(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(DeviceError, match=r"--device cuda: .*use --device cpu or auto") as error:
