@@ -4,7 +4,6 @@ Rows that COLMAP does not expect end the process inside COLMAP, so SQLite reads 
 """
 
 import sqlite3
-import struct
 from collections import defaultdict
 from collections.abc import Collection
 from pathlib import Path
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap.model_files import camera_like
 from colmap_affrect.colmap.tables import (
     DAMAGED,
-    SENSOR_CAMERA,
     Tables,
     columns_of,
     open_read_only,
@@ -26,7 +24,6 @@ from colmap_affrect.colmap.tables import (
 )
 from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.geometry.arrays import Singles
-from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.project.outputs import leads_outside
 
@@ -45,17 +42,11 @@ CHECKS: dict[str, Check] = {
         "cameras of a model that COLMAP does not have, of a size that no photograph has, with more "
         "or fewer parameters than their model, or without a finite and positive focal length",
         "import their images again into a new database"),
-    "implausible-focal": ("warning",
-        "cameras with focal lengths that hardly any photograph has, in px of the image and longer "
-        "sides",
-        "give the right ones in a table (--cameras-path), or none: --ignore-exif"),
     "no-frame": ("error", "images without a frame while others have one, at which mapping aborts",
         "give each of them a frame (pycolmap.Database.write_frame), or begin anew with "
         "'colmap-affrect run --database-path {path}', which adds frames to its copy"),
-    "matrix-data": ("error",
-        "rows whose matrices or cameras have more or less data than they should, or no finite "
-        "numbers", "delete these rows; two-view geometries are made anew by 'colmap "
-        "geometric_verifier'"),
+    "matrix-data": ("error", "rows whose matrices have more or less data than they should",
+        "delete these rows; two-view geometries are made anew by 'colmap geometric_verifier'"),
     "bad-name": ("error", "images without a name, or with one that is not UTF-8",
         "rename these files and import them again into a new database"),
     "keypoint-data": ("error",
@@ -67,8 +58,6 @@ CHECKS: dict[str, Check] = {
     "keypoints-at-one-place": ("error",
         "images with most keypoints at one place, at which COLMAP may never end",
         "extract and match these images again"),
-    "keypoints-outside": ("warning", "images with keypoints outside of them",
-        "see that they were found in the images as stored: not rotated, not resized"),
     "match-data": ("error",
         "pairs with matches of keypoints that do not exist, of images that do not exist or of one "
         "with itself, or not in 2 columns, at which COLMAP crashes",
@@ -90,20 +79,14 @@ FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
 
 MATRICES = {
-    ("two_view_geometries", "pair_id"): {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
-    ("pose_priors", "rowid"): {"position": 3, "position_covariance": 9, "gravity": 3},
-    ("rig_sensors", "sensor_id"): {"sensor_from_rig": 7},
+    "two_view_geometries": {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
+    "pose_priors": {"position": 3, "position_covariance": 9, "gravity": 3},
+    "rig_sensors": {"sensor_from_rig": 7},
 }
-"""Columns that hold so many float64 or nothing, by table and its key; that of priors is another
-before COLMAP 4."""
-
-CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
-"""What a camera of a two-view geometry begins with: id, model, width, height, whether its focal
-length is a prior, and the number of parameters that follow, float64."""
+"""Columns that hold so many float64 or nothing, by table."""
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
 MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
-OUTSIDE_TOLERANCE_PX = 1.0  # keypoints of images shrunk for detection may lie outside
 MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
 
 
@@ -130,7 +113,6 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
             _check_images(connection, tables, found)
             _check_links(connection, found)
             _check_matrices(connection, found)
-            _check_cameras_of_pairs(connection, found)
             _check_keypoints(connection, tables, found)
             _check_pairs(connection, tables, found)
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
@@ -169,11 +151,6 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
             or (params[0, like.focal_length_idxs()] <= 0.0).any()
         ):
             found["bad-camera"].append(label)
-        elif indices := like.focal_length_idxs():
-            focal_px, longer = float(params[0, indices].mean()), max(camera.width, camera.height)
-            focal = focal_px / max(longer, 1)
-            if longer <= MAX_SIDE_PX and not PLAUSIBLE_FOCALS[0] <= focal <= PLAUSIBLE_FOCALS[1]:
-                found["implausible-focal"].append(f"{label}: {focal_px:.0f} px, {focal:.2g}")
         if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
             found["bad-camera"].append(f"{label}: {camera.width} x {camera.height} px")
 
@@ -195,41 +172,18 @@ def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
     for table in [name for name in tables if columns_of(connection, name)]:
         for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
             found["no-parent"].append(f"row {row} of {table}, {parent}")
-    if columns_of(connection, "rigs"):
-        query = (
-            "SELECT rig_id FROM rigs WHERE ref_sensor_type = ? AND ref_sensor_id NOT IN "
-            "(SELECT camera_id FROM cameras)"
-        )
-        for (rig_id,) in connection.execute(query, [SENSOR_CAMERA]):
-            found["no-parent"].append(f"rig {rig_id}, cameras")
 
 
 def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
-    for (table, key), columns in MATRICES.items():
+    for table, columns in MATRICES.items():
         for name in columns.keys() & columns_of(connection, table):
-            for row, blob in rows_of(connection, f"{key} {name}", table):
-                values = _array(blob, 1, columns[name], np.dtype("<f8")) if blob else True
-                # Priors of position that are not known are not a number.
-                if values is None or (name in "FEH" and not np.isfinite(values).all()):
-                    found["matrix-data"].append(f"{name} of {key} {row}")
+            for row, blob in rows_of(connection, f"rowid {name}", table):
+                if blob and _array(blob, 1, columns[name], np.dtype("<f8")) is None:
+                    found["matrix-data"].append(f"{name} of row {row} of {table}")
     if {"qvec", "tvec"} <= columns_of(connection, "two_view_geometries"):
         query = "SELECT pair_id FROM two_view_geometries WHERE (qvec IS NULL) != (tvec IS NULL)"
         for (row,) in connection.execute(query):
             found["matrix-data"].append(f"qvec and tvec of pair_id {row}")
-
-
-def _check_cameras_of_pairs(connection: sqlite3.Connection, found: Problems) -> None:
-    for name in sorted({"camera1", "camera2"} & columns_of(connection, "two_view_geometries")):
-        for pair_id, blob in rows_of(connection, f"pair_id {name}", "two_view_geometries"):
-            if blob is None:
-                continue
-            size = CAMERA_OF_PAIR.size
-            if isinstance(blob, bytes) and len(blob) >= size:
-                _, model, *_, count = CAMERA_OF_PAIR.unpack(blob[:size])
-                like = camera_like(model)
-                if like and count == len(like.params) == (len(blob) - size) / 8:
-                    continue
-            found["matrix-data"].append(f"{name} of pair_id {pair_id}")
 
 
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
@@ -246,25 +200,16 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
         if keypoints is None:
             found["keypoint-data"].append(name)
         elif count:
-            camera = tables.cameras.get(tables.camera_ids[image_id])
-            size = (camera.width, camera.height) if camera else None
-            for kind in keypoint_problems(keypoints, size):
+            for kind in keypoint_problems(keypoints):
                 found[kind].append(name)
 
 
-def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:
-    """Return which kinds of problems some of (N, 2 or more) keypoints have, in COLMAP's px.
-
-    ``size`` is the (width, height) of the image, None if not known.
-    """
+def keypoint_problems(keypoints: Singles) -> list[str]:
+    """Return which kinds of problems some of (N, 2 or more) keypoints have, in COLMAP's px."""
     finite = np.asarray((np.abs(keypoints) <= MAX_SIDE_PX).all(axis=1))
     points, found = keypoints[finite, :2], list[str]()
     if not finite.all():
         found.append("keypoints-not-finite")
-    if size is not None:
-        beyond = np.maximum(-points, points - np.asarray(size, np.float32))
-        if (beyond > OUTSIDE_TOLERANCE_PX).any():
-            found.append("keypoints-outside")
     if len(points) >= MIN_AT_ONE_PLACE:  # what more than half have is the median
         median = np.partition(points, len(points) // 2, axis=0)[len(points) // 2]
         num_there = int((points == median).all(axis=1).sum())

@@ -113,14 +113,10 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
      ["UPDATE cameras SET width = 9223372036854775807"],
      ["camera 1: 9223372036854775807 x 60 px"]),
     ("bad-camera", ["UPDATE cameras SET params = substr(params, 1, 24)"], ["camera 1"]),
-    ("implausible-focal",
-     [("UPDATE cameras SET params = ?", [np.array([9000.0, 9000, 40, 30]).tobytes()])],
-     ["camera 1: 9000 px, 1e+02"]),
     ("matrix-data",
      [f"UPDATE two_view_geometries SET F = substr(zeroblob(72), 1, 71) {OF_13}"],
-     [f"F of pair_id {pair_id(1, 3)}"]),
+     [f"F of row {pair_id(1, 3)} of two_view_geometries"]),
     ("keypoints-not-finite", [changed_keypoint(6, 1, np.nan)], ["b c.png"]),
-    ("keypoints-outside", [changed_keypoint(3, 0, 91.5)], ["b c.png"]),
     ("keypoints-at-one-place", [at_one_place(11, 10)], ["b c.png"]),
     ("match-data",
      [f"UPDATE matches SET rows = 3 {OF_13}"], ["a.png - side/č.png (raw matches)"]),
@@ -146,7 +142,6 @@ def test_what_is_broken_is_found_and_nothing_else(
     "statement",
     [
         "DELETE FROM frames",  # none has one: as in databases of old
-        changed_keypoint(0, 0, 90.5),  # within the tolerance
         at_one_place(11, 9),
         replace_data("keypoints", 2, np.full((7, 4), 3, np.float32)),
         replace_data("matches", pair_id(1, 2), np.array([[4, 6]], np.uint32)),  # the last ones
@@ -200,14 +195,3 @@ def test_damaged_file_is_a_database_error_or_problems(tmp_path: Path, database_p
             errors.append(str(error).startswith(f"{path}: "))
     assert len(errors) > 10
     assert all(errors)
-
-
-def test_cameras_of_pairs_that_colmap_writes_are_no_problem(database_path: Path) -> None:
-    geometry = pycolmap.TwoViewGeometry()
-    geometry.camera2 = pycolmap.Camera.create_from_model_name(3, "FULL_OPENCV", 50.0, 90, 60)
-    with open_database(database_path) as database:
-        database.delete_two_view_geometry(1, 2)
-        database.write_two_view_geometry(1, 2, geometry)
-    assert check_database(database_path)[1] == {}
-    execute(database_path, "UPDATE two_view_geometries SET camera2 = substr(camera2, 1, 60)")
-    assert list(check_database(database_path)[1]) == ["matrix-data"]
