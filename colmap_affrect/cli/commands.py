@@ -214,13 +214,13 @@ def export_database(options: argparse.Namespace) -> None:
     from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
 
     path = Workspace(options.path).database if options.path.is_dir() else options.path
-    notes = export_database(path, options.database_path)
-    notes.append(
+    export_database(path, options.database_path)
+    show(
+        f"{options.database_path}: for COLMAP {options.colmap} to 3.13\n"
         "then, for few photographs (the folder of models must be there): colmap mapper "
         f"--database_path {options.database_path} --image_path PHOTOS --output_path MODELS "
         f"{MAPPER_OPTIONS}"
     )
-    show("\n".join([f"{options.database_path}: for COLMAP {options.colmap} to 3.13", *notes]))
 
 
 def export(options: argparse.Namespace) -> None:
@@ -249,7 +249,7 @@ def align(options: argparse.Namespace) -> None:
 def doctor(options: argparse.Namespace) -> int | None:
     from colmap_affrect.doctor import diagnose
 
-    diagnosis = diagnose(options.path, image_path=options.image_path, weights_path=options.weights)
+    diagnosis = diagnose(options.path, weights_path=options.weights)
     show(diagnosis.to_json() if options.json else diagnosis.summary())
     return 1 if diagnosis.num_errors else None
 

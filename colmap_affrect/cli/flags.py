@@ -191,8 +191,6 @@ FLAGS: dict[str, Settings] = {
     # looking into things
     "image": _path("IMAGE", "the photograph"),
     "path@optional": _path("PATH", "output folder, or any COLMAP database", nargs="?"),
-    "--image-path@doctor": _path("PATH",
-        "folder of the photographs, to compare their sizes with the cameras"),
     "name": {"nargs": "?", "help": "print this recipe with all of its options"},
     "action": {"choices": ["list", "fetch"], "nargs": "?", "default": "list",
         "help": "fetch downloads what is missing or damaged, for a machine without network "

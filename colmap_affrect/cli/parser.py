@@ -179,7 +179,7 @@ COMMANDS = {
         f"--model-path! --output-path@model! --gps|--positions|--points --distance {VOLUME}"),
     "doctor": Command(
         "look for what is wrong with results or the installation, and say what to do about it",
-        f"path@optional --image-path@doctor --weights --json {VOLUME}"),
+        f"path@optional --weights --json {VOLUME}"),
     "recipes": Command("list the recipes and what they need", "name"),
     "weights": Command("list the files of weights, or fetch them beforehand",
         f"action keys --weights {VOLUME}"),

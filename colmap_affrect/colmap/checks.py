@@ -24,8 +24,6 @@ from colmap_affrect.colmap.tables import (
 )
 from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.geometry.arrays import Singles
-from colmap_affrect.images.headers import header_size
-from colmap_affrect.project.outputs import leads_outside
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -62,10 +60,6 @@ CHECKS: dict[str, Check] = {
         "pairs with matches of keypoints that do not exist, of images that do not exist or of one "
         "with itself, or not in 2 columns, at which COLMAP crashes",
         "delete the matches of these pairs and match them again"),
-    "file-missing": ("warning", "images whose file is missing or cannot be read",
-        "put the files back, or give another --image-path"),
-    "file-size": ("error", "images of another size than their camera",
-        "use the photographs that the database was made from: not resized, not rotated"),
 }  # fmt: skip
 """The problems of a database by kind."""
 
@@ -118,21 +112,6 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
             raise DatabaseError(f"{path}: damaged ({error})") from error
     return tables, dict(found)
-
-
-def check_image_files(tables: Tables, image_path: Path) -> Problems:
-    """Compare a database with the (width, height) of its images' files."""
-    found: Problems = defaultdict(list)
-    for image_id, name in tables.names.items():
-        camera = tables.cameras.get(tables.camera_ids[image_id])
-        size = None if leads_outside(name) else header_size(image_path / name)
-        if size is None:
-            found["file-missing"].append(name)
-        elif camera and size != (camera.width, camera.height):
-            found["file-size"].append(
-                f"{name} is {size[0]} x {size[1]}, its camera {camera.width} x {camera.height}"
-            )
-    return dict(found)
 
 
 def _check_cameras(tables: Tables, found: Problems) -> None:

@@ -1,11 +1,8 @@
 """Databases of COLMAP 3.8, which COLMAP up to 3.13 reads; they hold no rigs and frames."""
 
 import sqlite3
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-
-import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL
@@ -26,7 +23,6 @@ MAPPER_OPTIONS = (
 
 # COLMAP 3.8 has camera models up to this number
 LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
-METRIC = pycolmap.PosePriorCoordinateSystem.CARTESIAN
 
 TABLES = f"""
 PRAGMA user_version = {VERSION};
@@ -51,11 +47,7 @@ CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL,
 CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL,
     rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL,
     F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB);
-CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY NOT NULL,
-    position BLOB, coordinate_system INTEGER NOT NULL, position_covariance BLOB,
-    FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE);
 """
-"""The last one is of COLMAP 3.10 to 3.13, which do not read positions of images any more."""
 
 CONTENT = """
 INSERT INTO cameras SELECT camera_id, model, width, height, params, prior_focal_length
@@ -73,10 +65,11 @@ INSERT INTO two_view_geometries
 geometries of configuration 9, calibrated with rigs, as 2, calibrated."""
 
 
-def export_database(source: Path, target: Path) -> list[str]:
+def export_database(source: Path, target: Path) -> None:
     """Write a database as COLMAP 3.8 makes them; ids stay, and the source is only read.
 
-    Returns what is left out, a line each. DatabaseError when the source cannot be used or has a
+    Rigs and descriptors of networks are left out. Positions are those of the priors, latitude,
+    longitude and altitude, or in metres. DatabaseError when the source cannot be used or has a
     camera model that COLMAP 3.8 does not know, OptionError when the target exists.
     """
     photographs = Workspace(source.parent).photographs()
@@ -92,41 +85,14 @@ def export_database(source: Path, target: Path) -> list[str]:
                         "which COLMAP 3.8 does not know; extract with another --camera-model"
                     )
             priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
-            notes = _left_out(database)
-        if any(prior.coordinate_system == METRIC for prior in priors):
-            notes.append("positions are metric: COLMAP 3.8 needs --SpatialMatching.is_gps 0")
         try:
             with closing(sqlite3.connect(old)) as connection:
                 connection.execute("ATTACH ? AS new", (str(new),))
                 connection.executescript(f"{TABLES} BEGIN; {CONTENT} COMMIT;")
-                _write_positions(connection, priors)
+                connection.executemany(
+                    "UPDATE images SET prior_tx = ?, prior_ty = ?, prior_tz = ? WHERE image_id = ?",
+                    [(*prior.position.tolist(), prior.corr_data_id.id) for prior in priors],
+                )
                 connection.commit()
         except sqlite3.Error as error:
             raise cannot_write(target, error) from error
-    return notes
-
-
-def _write_positions(connection: sqlite3.Connection, priors: Sequence[pycolmap.PosePrior]) -> None:
-    """Write positions; of GPS these are latitude, longitude and altitude."""
-    for prior in priors:
-        image_id, position = prior.corr_data_id.id, np.asarray(prior.position, np.float64)
-        connection.execute(
-            "UPDATE images SET prior_tx = ?, prior_ty = ?, prior_tz = ? WHERE image_id = ?",
-            (*position.tolist(), image_id),
-        )
-        covariance = np.asarray(prior.position_covariance, np.float64).tobytes("F")
-        system = int(prior.coordinate_system)
-        row = (image_id, position.tobytes(), system, covariance)
-        connection.execute("INSERT INTO pose_priors VALUES (?, ?, ?, ?)", row)
-
-
-def _left_out(database: pycolmap.Database) -> list[str]:
-    sift, notes = pycolmap.FeatureExtractorType.SIFT, list[str]()
-    if num_rigs := sum(rig.num_sensors() > 1 for rig in database.read_all_rigs()):
-        notes.append(f"{num_rigs} rigs are left out: each image is on its own")
-    images = [image.image_id for image in database.read_all_images()]
-    described = [i for i in images if database.exists_descriptors(i)]
-    others = sum(database.read_descriptors(i).type != sift for i in described)
-    if others:
-        notes.append(f"descriptors of {others} images are left out: they are not SIFT's")
-    return notes

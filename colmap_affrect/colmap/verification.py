@@ -1,6 +1,5 @@
 """Geometric verification of raw matches by pycolmap, and its significance."""
 
-import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,13 +20,12 @@ from colmap_affrect.colmap.database import (
     unverified_pairs,
 )
 from colmap_affrect.colmap.native_options import Plain, differences
-from colmap_affrect.colmap.two_views import pair_model, significance, telling_shapes
+from colmap_affrect.colmap.two_views import pair_model, significance
 from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
-logger = logging.getLogger(__name__)
 T = TypeVar("T", int, str)
 
 PAIRS_PER_WRITE = 200  # a killed run loses at most as many
@@ -207,11 +205,6 @@ def verify(
             keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
             return Side(cameras[image_id], keypoints)
 
-        if options.min_significance and any(
-            telling_shapes(side(image_id).keypoints) is None for image_id in todo[0]
-        ):
-            _say_that_shapes_are_missing(path)
-
         def estimate(task: _Task) -> _Done:
             ids, sides, matches = task
             size_px = of_pair(extracted_px, ids)
@@ -229,15 +222,6 @@ def verify(
                     _write(database, done, advance)
         finally:
             _write(database, done, advance)
-
-
-@lru_cache(maxsize=64)  # a run verifies some of its pairs again, with better cameras
-def _say_that_shapes_are_missing(path: Path) -> None:
-    """Say it once of each database."""
-    logger.info(
-        "%s: keypoints have no shapes; pairs need more inliers, and sides that look alike are not "
-        "told apart", path,
-    )  # fmt: skip
 
 
 def _write(

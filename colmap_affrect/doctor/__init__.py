@@ -14,25 +14,21 @@ from colmap_affrect.project.report import installed_versions
 __all__ = ["Diagnosis", "Finding", "diagnose"]
 
 
-def diagnose(
-    path: Path | None = None, *, image_path: Path | None = None, weights_path: Path | None = None
-) -> Diagnosis:
+def diagnose(path: Path | None = None, *, weights_path: Path | None = None) -> Diagnosis:
     """Examine the installation and, if a path is given, an output folder or a COLMAP database.
 
-    With the folder of the photographs their sizes are compared with the cameras. OptionError when
-    something that is given is not there.
+    OptionError when something that is given is not there.
     """
     if path is not None and not path.exists():
         raise OptionError(
             f"{path}: no such file or folder; give a COLMAP database or output folder"
         )
-    for folder, option in ((image_path, "--image-path"), (weights_path, "--weights")):
-        if folder is not None and not folder.is_dir():
-            raise OptionError(f"{option} {folder}: no such folder")
+    if weights_path is not None and not weights_path.is_dir():
+        raise OptionError(f"--weights {weights_path}: no such folder")
     diagnosis = Diagnosis()
     if path is not None:
         examine = examine_folder if path.is_dir() else examine_database
-        examine(diagnosis, path, image_path)
+        examine(diagnosis, path)
     _examine_installation(diagnosis, weights_path)
     return diagnosis
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from colmap_affrect.colmap.cameras import read_camera_records
-from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_files
+from colmap_affrect.colmap.checks import CHECKS, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import SUMMARY, registered_names
 from colmap_affrect.doctor.findings import Diagnosis
@@ -25,10 +25,8 @@ MAX_ITEMS_SHOWN = 5
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
-def examine_database(
-    diagnosis: Diagnosis, path: Path, image_path: Path | None, advice: str = ""
-) -> bool:
-    """Examine a COLMAP database and the sizes of its photographs; return whether it is usable.
+def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool:
+    """Examine a COLMAP database; return whether it is usable.
 
     ``advice`` is what to do about problems, where it is not what ``CHECKS`` says.
     """
@@ -50,9 +48,6 @@ def examine_database(
             f"keep a copy: cp {quoted} {copy}",
         )  # fmt: skip
     diagnosis.checked.append(f"{path}: {tables.summary()}")
-    if image_path is not None:
-        problems |= check_image_files(tables, image_path)
-        diagnosis.checked.append(f"{image_path}: sizes of the photographs")
     for kind in sorted(problems, key=list(CHECKS).index):
         severity, what, usual = CHECKS[kind]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
@@ -60,7 +55,7 @@ def examine_database(
     return True
 
 
-def examine_folder(diagnosis: Diagnosis, path: Path, image_path: Path | None) -> None:
+def examine_folder(diagnosis: Diagnosis, path: Path) -> None:
     """Examine an output folder, unless somebody is working in it."""
     workspace = Workspace(path)
     if path.suffix == ".affrect" and not workspace.database.exists():
@@ -76,7 +71,7 @@ def examine_folder(diagnosis: Diagnosis, path: Path, image_path: Path | None) ->
             "note", path, f"{what}; only its database is checked",
             "use another --output-path for colmap-affrect",
         )  # fmt: skip
-        examine_database(diagnosis, workspace.database, image_path)
+        examine_database(diagnosis, workspace.database)
         return
     with ExitStack() as stack:
         try:
@@ -88,7 +83,7 @@ def examine_folder(diagnosis: Diagnosis, path: Path, image_path: Path | None) ->
             diagnosis.add("warning", path, _without_path(path, error), advice)
             if in_use:
                 return
-        _Examination(diagnosis, workspace).examine(image_path)
+        _Examination(diagnosis, workspace).examine()
 
 
 class _Examination:
@@ -98,7 +93,7 @@ class _Examination:
         self.diagnosis, self.workspace = diagnosis, workspace
         self.path, self.quoted = workspace.path, shlex.quote(str(workspace.path))
 
-    def examine(self, image_path: Path | None) -> None:
+    def examine(self) -> None:
         """Read every file as runs do."""
         database, context = self.workspace.database, Context(self.workspace)
         record = self._read(self.workspace.config, self._record)
@@ -119,7 +114,7 @@ class _Examination:
         if database.exists():
             remake = f"remove it and {SAME_RUN}: it is made anew"
             advice = remake if done and not self.workspace.users_database else ""
-            is_usable = examine_database(self.diagnosis, database, image_path, advice)
+            is_usable = examine_database(self.diagnosis, database, advice)
             if is_usable and "map" in done:
                 self._models()
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from damaged import Statement, execute
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import check_database, check_image_files
+from colmap_affrect.colmap.checks import check_database
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.tables import pair_images
 from colmap_affrect.errors import DatabaseError
@@ -154,23 +153,6 @@ def test_what_is_allowed_is_no_problem(database_path: Path, statement: Statement
     path = database_path
     execute(path, "DELETE FROM frame_data" if "frames" in statement else "SELECT 1", statement)
     assert check_database(path)[1] == {}
-
-
-def test_files_that_are_missing_unreadable_or_of_another_size_are_found(
-    tmp_path: Path, database_path: Path
-) -> None:
-    tables, _ = check_database(database_path)
-    (tmp_path / "side").mkdir()
-    for name in NAMES:
-        cv2.imwrite(str(tmp_path / name), np.zeros(SIZE[::-1], np.uint8))
-    assert check_image_files(tables, tmp_path) == {}
-    cv2.imwrite(str(tmp_path / NAMES[0]), np.zeros(SIZE, np.uint8))
-    (tmp_path / NAMES[1]).write_bytes(b"no image")
-    (tmp_path / NAMES[2]).unlink()
-    assert check_image_files(tables, tmp_path) == {
-        "file-missing": NAMES[1:],
-        "file-size": ["a.png is 60 x 90, its camera 90 x 60"],
-    }
 
 
 @pytest.mark.parametrize(("first", "second"), [(1, 2), (2**31 - 3, 2**31 - 2)])

@@ -64,9 +64,9 @@ def folders(finished: Folders, tmp_path: Path) -> Folders:
     return copy
 
 
-def findings(path: Path | None, image_path: Path | None = None) -> list[Finding]:
+def findings(path: Path | None) -> list[Finding]:
     """Findings that are not about the installation."""
-    diagnosis = diagnose(path, image_path=image_path)
+    diagnosis = diagnose(path)
     return [found for found in diagnosis.findings if found.where not in INSTALLATION]
 
 
@@ -75,7 +75,7 @@ def test_healthy_run_has_no_findings_and_stays_as_it_is(folders: Folders) -> Non
         return {path: path.read_bytes() for path in folders.out.rglob("*") if path.is_file()}
 
     before = state()
-    assert findings(folders.out, folders.photos) == []
+    assert findings(folders.out) == []
     assert state() == before
     checked = "\n".join(diagnose(folders.out).checked)
     for text in (
@@ -215,7 +215,7 @@ def test_command_prints_and_ends_with_1_if_there_are_errors(
     assert printed.out.endswith("no problems found\n")
     assert printed.err == ""
     (folders.out / "features.h5").unlink()
-    arguments = ["doctor", str(folders.out), "--image_path", str(folders.photos), "--json", "-q"]
+    arguments = ["doctor", str(folders.out), "--json", "-q"]
     assert main(arguments) == 1
     printed = capsys.readouterr()
     report = json.loads(printed.out)
