@@ -83,7 +83,7 @@ class RecipeRun:
         features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
         for folder in (features.parent, self._scores):
             folder.mkdir(parents=True, exist_ok=True)
-        self._store = FeatureStore(features, made)
+        self._store = FeatureStore(features)
         budget = settings["max_num_keypoints"]
         self._matchings = []
         for level, chosen in enumerate(extraction.levels):

@@ -13,7 +13,6 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import islice
-from math import ceil
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,8 +23,10 @@ logger = logging.getLogger(__name__)
 PAGE_BYTES = 4096
 LINES_AT_ONCE = 10_000
 NEW_SUFFIX = ".affrect-new"  # of files that are being written; a killed program leaves them
-JOURNAL_MARK = b"AFFRECT1"
-JOURNAL_HEADER = struct.Struct("<8sQ")  # mark, size of the file; then numbered pages, SHA-256
+JOURNAL_MARK = b"AFFRECT2"
+JOURNAL_HEADER = struct.Struct("<8sQQ")
+"""Mark, number of old bytes that stay unless a page changes them, and size of the file; numbered
+pages follow, and a SHA-256."""
 SHA256_BYTES = 32
 
 
@@ -41,25 +42,21 @@ def replace_text(path: Path, text: str) -> None:
     replace_bytes(path, content)
 
 
-def replace_bytes(path: Path, content: bytes) -> None:
+def replace_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write a text file that need not fit into memory, as :func:`replace_bytes`."""
+    remaining = iter(lines)
+    replace_bytes(path, iter(lambda: "".join(islice(remaining, LINES_AT_ONCE)).encode(), b""))
+
+
+def replace_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write or replace a file; WorkspaceError when that fails, and an old one stays as it is."""
     try:
-        _replace(path, [content])
+        _replace(path, [content] if isinstance(content, bytes) else content)
     except OSError as error:
         raise cannot_write(path, error) from error
 
 
-def replace_lines(path: Path, lines: Iterable[str]) -> None:
-    """Write or replace a text file that need not fit into memory, as :func:`replace_bytes`."""
-    remaining = iter(lines)
-    batches = iter(lambda: "".join(islice(remaining, LINES_AT_ONCE)), "")
-    try:
-        _replace(path, (batch.encode("utf-8") for batch in batches))
-    except OSError as error:
-        raise cannot_write(path, error) from error
-
-
-def _replace(path: Path, chunks: Iterable[bytes | bytearray]) -> None:
+def _replace(path: Path, chunks: Iterable[bytes]) -> None:
     """Write a file under another name and give it its own; on the disk in this order."""
     with _new_beside(path) as (file, new):
         for chunk in chunks:
@@ -156,8 +153,7 @@ def uninterrupted() -> Iterator[None]:
 class FileTransaction(io.RawIOBase):
     """A binary file for h5py, whose changes stay in memory until :meth:`commit` makes them all.
 
-    What lies behind the old end is appended first, where nobody looks. The changed pages of the
-    old part go into a journal beside the file; once that is complete, the changes count, and
+    Changed pages go into a journal beside the file; once that is complete, the changes count, and
     :func:`apply_journal` puts them in place, now or when the file is next opened.
     """
 
@@ -166,7 +162,7 @@ class FileTransaction(io.RawIOBase):
         apply_journal(path)
         self._path = path
         self._stored = path.open("rb")
-        self._stored_size = self._readable_size = self._size = path.stat().st_size
+        self._kept_size = self._size = path.stat().st_size
         self._position = 0
         self._pages: dict[int, bytearray] = {}
 
@@ -192,7 +188,10 @@ class FileTransaction(io.RawIOBase):
         """Write, as :class:`io.RawIOBase`, into memory."""
         view = memoryview(data).cast("B")
         for number, within, there in self._spans(len(view)):
-            self._page(number)[within] = view[there]
+            if number not in self._pages:
+                self._pages[number] = bytearray(PAGE_BYTES)
+                self._read_stored(number * PAGE_BYTES, memoryview(self._pages[number]))
+            self._pages[number][within] = view[there]
         self._position += len(view)
         if len(view):  # writing nothing behind the end does not move the end
             self._size = max(self._size, self._position)
@@ -201,7 +200,7 @@ class FileTransaction(io.RawIOBase):
     def truncate(self, size: int | None = None) -> int:
         """Change the size, as :class:`io.RawIOBase`."""
         self._size = self._position if size is None else size
-        self._readable_size = min(self._readable_size, self._size)
+        self._kept_size = min(self._kept_size, self._size)
         for number in [number for number in self._pages if number * PAGE_BYTES >= self._size]:
             del self._pages[number]
         if (last := self._size // PAGE_BYTES) in self._pages:
@@ -215,44 +214,17 @@ class FileTransaction(io.RawIOBase):
         super().close()
 
     def commit(self) -> None:
-        """Make all changes; OSError when they cannot be written; the file stays as it was."""
-        for number in range(
-            self._readable_size // PAGE_BYTES, ceil(min(self._stored_size, self._size) / PAGE_BYTES)
-        ):
-            self._page(number)  # cut off and now 0
-        pages = sorted(self._pages.items())
-        page_end = ceil(self._stored_size / PAGE_BYTES) * PAGE_BYTES  # of the last stored page
-        inside = [(number, page) for number, page in pages if number * PAGE_BYTES < page_end]
-        try:
-            with self._path.open("r+b") as file:
-                file.seek(self._stored_size)
-                file.write(bytes(max(0, min(self._size, page_end) - self._stored_size)))
-                following = -1
-                for number, page in pages[len(inside) :]:
-                    if number != following:
-                        file.seek(number * PAGE_BYTES)
-                    file.write(page)
-                    following = number + 1
-                _sync(file)
-            header = JOURNAL_HEADER.pack(JOURNAL_MARK, self._size)
-            content = header + b"".join(struct.pack("<Q", k) + page for k, page in inside)
-            _replace(journal_of(self._path), [content, hashlib.sha256(content).digest()])
-        except OSError:
-            os.truncate(self._path, self._stored_size)
-            raise
+        """Make all changes; OSError when they cannot be written: what is in the journal counts."""
+        header = JOURNAL_HEADER.pack(JOURNAL_MARK, self._kept_size, self._size)
+        pages = (struct.pack("<Q", number) + page for number, page in sorted(self._pages.items()))
+        content = header + b"".join(pages)
+        _replace(journal_of(self._path), [content, hashlib.sha256(content).digest()])
         apply_journal(self._path)
 
-    def _page(self, number: int) -> bytearray:
-        """Return a page that may be changed."""
-        if number not in self._pages:
-            self._pages[number] = bytearray(PAGE_BYTES)
-            self._read_stored(number * PAGE_BYTES, memoryview(self._pages[number]))
-        return self._pages[number]
-
     def _read_stored(self, position: int, view: memoryview) -> None:
-        if position < self._readable_size:
+        if position < self._kept_size:
             self._stored.seek(position)
-            self._stored.readinto(view[: self._readable_size - position])
+            self._stored.readinto(view[: self._kept_size - position])
 
     def _spans(self, count: int) -> Iterator[tuple[int, slice, slice]]:
         """Split what follows the position: number of a page, part of it, part of the whole."""
@@ -279,8 +251,9 @@ def apply_journal(path: Path) -> None:
         return
     content, digest = (whole := journal.read_bytes())[:-SHA256_BYTES], whole[-SHA256_BYTES:]
     if hashlib.sha256(content).digest() == digest and content.startswith(JOURNAL_MARK):
-        _, size = JOURNAL_HEADER.unpack_from(content)
+        _, kept_size, size = JOURNAL_HEADER.unpack_from(content)
         with path.open("r+b") as file:
+            file.truncate(kept_size)
             for start in range(JOURNAL_HEADER.size, len(content), 8 + PAGE_BYTES):
                 (number,) = struct.unpack_from("<Q", content, start)
                 file.seek(number * PAGE_BYTES)

@@ -1,9 +1,10 @@
 """A HDF5 file of groups that are complete or do not count, which changes as a whole."""
 
 import io
+import json
 import zlib
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import StaleStoreError, StoreError, damage, made_again
+from colmap_affrect.errors import StoreError, damage, made_again
 from colmap_affrect.project.atomic_files import (
     FileTransaction,
     apply_journal,
@@ -22,7 +23,7 @@ from colmap_affrect.project.atomic_files import (
 )
 
 FORMAT_VERSION = 2
-CHECKSUM = "crc32"  # of the values of a dataset, its attribute; files of before have none
+CHECKSUM = "crc32"  # of the values of a dataset, its attribute
 
 DATASETS = {
     "descriptors", "image_size", "keypoints", "lafs", "level_ends", "matches0",
@@ -32,15 +33,13 @@ DATASETS = {
 
 
 class GroupStore:
-    """A HDF5 file of complete groups that were all made with the same options."""
+    """A HDF5 file of complete groups."""
 
     kind = ""
     stage = ""  # that makes it again
 
-    def __init__(self, path: Path, options_digest: str = "") -> None:
-        """Name the file, and the options that its content must have been made with (any if '')."""
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self.options_digest = options_digest
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
@@ -50,14 +49,14 @@ class GroupStore:
         between two of its writes leaves a file that cannot be read.
         """
         if mode == "r":
-            with self._opened(None) as file:
+            with self._opened(self.path, "r") as file:
                 yield file
             return
         with uninterrupted():
             if not self.path.exists():
                 self._create()
             with FileTransaction(self.path) as changes:
-                with self._opened(changes) as file:
+                with self._opened(changes, "r+") as file:
                     yield file
                 try:
                     changes.commit()
@@ -65,17 +64,13 @@ class GroupStore:
                     raise cannot_write(self.path, error) from error
 
     @contextmanager
-    def _opened(self, changes: FileTransaction | None) -> Iterator[h5py.File]:
-        with self._damage():
-            if changes is None:
-                apply_journal(self.path)
-            with h5py.File(changes or self.path, "r+" if changes else "r") as file:
+    def _opened(self, where: Path | FileTransaction, mode: str) -> Iterator[h5py.File]:
+        mend = f"unless another program has it open, {made_again(self.stage, self.path.parent)}"
+        with damage(self.path, mend):
+            apply_journal(self.path)
+            with h5py.File(where, mode) as file:
                 self._check_format(file)
                 yield file
-
-    def _damage(self) -> AbstractContextManager[None]:
-        mend = f"unless another program has it open, {made_again(self.stage, self.path.parent)}"
-        return damage(self.path, mend)
 
     def _create(self) -> None:
         content = io.BytesIO()
@@ -83,7 +78,6 @@ class GroupStore:
             file.attrs["format"] = f"colmap_affrect/{self.kind}"
             file.attrs["format_version"] = FORMAT_VERSION
             file.attrs["pixel_origin"] = "center"
-            file.attrs["options_digest"] = self.options_digest
         journal_of(self.path).unlink(missing_ok=True)
         replace_bytes(self.path, content.getvalue())
 
@@ -95,23 +89,18 @@ class GroupStore:
                 f"{self.path}: expected {self.kind} of format version {FORMAT_VERSION}, found "
                 f"{found}; use another --output-path"
             )
-        if self.options_digest and file.attrs.get("options_digest") != self.options_digest:
-            raise StaleStoreError(
-                f"{self.path}: was made with other options than config.toml beside it records; "
-                "run again with --overwrite"
-            )
 
-    def _text(self, key: str) -> str | None:
-        """Return a text that is kept with the whole file, None where there is none."""
+    def note(self, key: str) -> Any:
+        """Return what is kept with the whole file, as JSON has it; None where nothing is."""
         if not self.path.exists():
             return None
         with self._open("r") as file:
-            found = file.attrs.get(key)
-            return None if found is None else str(found)
+            return json.loads(file.attrs.get(key, "null"))
 
-    def _record_text(self, key: str, text: str) -> None:
+    def keep_note(self, key: str, value: Any) -> None:
+        """Keep something with the whole file."""
         with self._open("a") as file:
-            file.attrs[key] = text
+            file.attrs[key] = json.dumps(value)
 
     def check_all(self) -> int:
         """Read all that is there, and return how many groups; StoreError if it is damaged."""

@@ -1,8 +1,7 @@
 """The one door for what is written outside of a work folder: exports, copies, pictures.
 
 What is made stands in a hidden folder beside its place until all of it is whole, and gets its name
-then. So there is never half of it under a name of the user's, also when the program is killed, and
-nothing but what this call has made is ever taken away.
+then. So there is never half of it under a name of the user's, also when the program is killed.
 """
 
 import os
@@ -19,15 +18,10 @@ from colmap_affrect.project.atomic_files import cannot_write, require_space, uni
 
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
 LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works there
-MARKS = (
-    ("config.toml", b"format_version"), ("run.log", b"colmap-affrect"),
-    ("request.json", b'"method"'), ("comparison.json", b'"verdict"'),
-)  # fmt: skip
-"""Files of ours, also of older versions, and what each has at its beginning."""
+MARKS = {"config.toml": b"format_version", "run.log": b"colmap-affrect"}
+"""Files of ours, and what each has at its beginning."""
 SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
 BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
-
-
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}
 """What file managers and file systems put into folders that are empty for their user, beside hidden
 files."""
@@ -35,7 +29,7 @@ files."""
 
 def is_output_folder(path: Path) -> bool:
     """Return whether this program has written its record or its log into a folder."""
-    for name, mark in MARKS:
+    for name, mark in MARKS.items():
         with suppress(OSError), (path / name).open("rb") as file:
             if mark in file.read(BYTES_OF_MARK):
                 return True
@@ -129,14 +123,19 @@ def new_results(
     with ExitStack() as stack:
         folders = {}
         for parent in dict.fromkeys(target.parent for target in targets):
-            stack.enter_context(_folder_made(parent))
             folders[parent] = stack.enter_context(temporary_folder(parent))
         made = [folders[target.parent] / target.name for target in targets]
         yield made
         for temporary in folders.values():  # native writers say nothing of a full disk
             require_space(temporary / "rest", SPARE_BYTES)
         with uninterrupted():
-            _publish(list(zip(made, targets, strict=True)), replaces=replaces)
+            for target in () if replaces else targets:  # somebody may have made one meanwhile
+                _refuse_existing(target)
+            try:
+                for path, target in zip(made, targets, strict=True):
+                    path.replace(target)
+            except OSError as error:
+                raise cannot_write(target, error) from error
 
 
 def _refuse_existing(target: Path) -> None:
@@ -145,67 +144,17 @@ def _refuse_existing(target: Path) -> None:
 
 
 @contextmanager
-def _folder_made(folder: Path) -> Iterator[None]:
-    """Make a folder and those above it; those that are new go again if nothing comes into them."""
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    try:
-        yield
-    finally:
-        for path in new:
-            with suppress(OSError):
-                path.rmdir()
-
-
-def _publish(made: list[tuple[Path, Path]], *, replaces: bool) -> None:
-    """Give everything its name; on failure nothing new has it."""
-    done: list[tuple[Path, Path]] = []
-    try:
-        for path, target in made:
-            if replaces:
-                path.replace(target)
-            else:
-                _move(path, target)
-                done.append((path, target))
-    except (OSError, OptionError) as error:
-        for path, target in reversed(done):
-            target.rename(path)
-        if isinstance(error, OptionError):
-            raise
-        raise cannot_write(target, error) from error
-
-
-def _move(path: Path, target: Path) -> None:
-    """Rename a file or folder; what has come to be there meanwhile is not overwritten."""
-    _refuse_existing(target)
-    if path.is_file():
-        try:
-            os.link(path, target)
-        except FileExistsError:
-            _refuse_existing(target)
-        except OSError:  # no hard links on this file system
-            path.rename(target)
-        else:
-            path.unlink()
-    else:
-        path.rename(target)
-
-
-@contextmanager
 def temporary_folder(parent: Path) -> Iterator[Path]:
     """Yield a new folder in a folder, in which those that killed processes left are removed."""
-    parent.mkdir(parents=True, exist_ok=True)
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        name = mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent)
+    except OSError as error:
+        raise cannot_write(parent, error) from error
     for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
         if (left / LOCK).is_file() and not left.is_symlink():
             with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
                 shutil.rmtree(left)  # its process has ended
-    try:
-        name = mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent)
-    except OSError as error:
-        raise cannot_write(parent, error) from error
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, name, ignore_errors=True)
         with suppress(OSError):  # of file systems without locks leftovers are not tidied up
@@ -220,8 +169,7 @@ def database_files(path: Path) -> list[Path]:
 
 def remove_database(path: Path) -> None:
     """Remove a database and the files beside it, if they are there."""
-    for file in database_files(path):
-        file.unlink(missing_ok=True)
+    remove_own(database_files(path))
 
 
 def remove_own(paths: Iterable[Path]) -> None:

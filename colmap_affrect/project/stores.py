@@ -8,7 +8,6 @@ again by its geometry. Files are opened for one image or one batch of pairs and 
 is written in between appears as a whole (:mod:`colmap_affrect.project.atomic_files`).
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -29,9 +28,11 @@ from colmap_affrect.project.group_store import GroupStore, checked, complete_gro
 MAX_INT16 = 32767
 NOT_KNOWN = Content()
 STATIONARY = "stationary_cells"
+"""Note of matches: [size, cells] of the places that never move (stages/stationary)."""
 STEP = "step"
+"""Note of matches: level and pairs of the step of escalation that has begun and not ended."""
 FINISHED = "finished_list"
-
+"""Note of matches: digest of the list whose pairs have all been matched and looked at."""
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
@@ -257,21 +258,12 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            file.attrs.update({FINISHED: "", STEP: ""})
+            for note in (FINISHED, STEP):
+                file.attrs.pop(note, None)
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
                 if is_asked or group.attrs.get("tried_level"):
                     del file[key]
-
-    def stationary_cells(self) -> dict[tuple[int, int], Indices]:
-        """Return the (N, 2) cells that never move by size of photographs (stages/stationary)."""
-        with self._damage():
-            known = json.loads(self._text(STATIONARY) or "[]")
-            return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in known}
-
-    def record_stationary_cells(self, cells: Mapping[tuple[int, int], Indices]) -> None:
-        """Keep the cells that never move."""
-        self._record_text(STATIONARY, json.dumps([(s, c.tolist()) for s, c in cells.items()]))
 
     def has(self, pairs: Sequence[tuple[str, str]]) -> Bools:
         """Return, as (N,) bools, which of N pairs are there and complete."""
@@ -286,38 +278,12 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             return sum(len(group) for group in file.values())
 
-    def finished_list(self) -> str | None:
-        """Return the digest of the list whose pairs have all been matched and looked at.
-
-        Empty if a run has begun with another one since, None if nothing is known.
-        """
-        return self._text(FINISHED)
-
-    def record_finished_list(self, digest: str) -> None:
-        """Keep the digest of the list that is finished, empty while there is none."""
-        self._record_text(FINISHED, digest)
-
-    def step(self) -> tuple[int, list[tuple[str, str]]] | None:
-        """Return the level and the pairs of the step of escalation that has begun and not ended."""
-        with self._damage():
-            level, pairs = json.loads(self._text(STEP) or "[0, []]")
-            return (int(level), [(first, second) for first, second in pairs]) if level else None
-
-    def record_step(self, level: int = 0, pairs: Sequence[tuple[str, str]] = ()) -> None:
-        """Keep a step that begins; without one, that it has ended."""
-        self._record_text(STEP, json.dumps([level, list(pairs)]))
-
-    def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
-        """Return the level of escalation that the matches of each pair are from."""
-        return self._attribute("level", pairs)
-
-    def tried_levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
-        """Return the highest level of escalation that was tried for each pair."""
-        return self._attribute("tried_level", pairs)
-
-    def _attribute(self, name: str, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+    def levels(
+        self, pairs: Iterable[tuple[str, str]], attribute: str = "level"
+    ) -> dict[tuple[str, str], int]:
+        """Return the level that the matches of each pair are from, or its ``tried_level``."""
         with self._open("r") as file:
-            return {pair: int(file[pair_key(*pair)].attrs[name]) for pair in pairs}
+            return {pair: int(file[pair_key(*pair)].attrs[attribute]) for pair in pairs}
 
     def read(self, pairs: Sequence[tuple[str, str]]) -> Iterator[PairMatches]:
         """Yield the matches of each pair; StoreError at a pair without matches."""

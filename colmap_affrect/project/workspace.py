@@ -3,8 +3,8 @@
 import logging
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,7 +12,6 @@ from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
-from colmap_affrect.options import digest_of
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 from colmap_affrect.project.outputs import (
     LOCK,
@@ -44,8 +43,6 @@ OWN_STEMS = {
     "report", "run", "shared", "sparse",
 }  # fmt: skip
 """How names of files and folders begin that are written here."""
-
-NOT_IN_DIGESTS = ("image_path", "image_list_path", "from_database", "cameras")
 
 
 class Workspace:
@@ -146,8 +143,8 @@ class Workspace:
         Raises OptionError for a folder of somebody else, WorkspaceError when it cannot be used.
         """
         self.begin()
+        lock = FileLock(self.path / LOCK)
         try:
-            lock = FileLock(self.path / LOCK)
             lock.acquire(timeout=LOCK_WAIT_S)
         except Timeout as error:
             raise WorkspaceError(
@@ -161,17 +158,6 @@ class Workspace:
             yield self
         finally:
             lock.release()
-
-    @contextmanager
-    def locked_or_read_only(self) -> Iterator[Self]:
-        """Keep other runs out as :meth:`locked`; a folder that cannot be written needs no lock."""
-        with ExitStack() as stack:
-            try:
-                stack.enter_context(self.locked())
-            except (WorkspaceError, OptionError) as error:  # the latter where links are
-                if not self.config.exists() or isinstance(error.__cause__, Timeout):
-                    raise
-            yield self
 
     def recorded(self) -> Mapping[str, Any]:
         """Return the record, see :func:`~colmap_affrect.project.record.read_record`."""
@@ -198,7 +184,6 @@ class Workspace:
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
-        self.require("extract")
         return str(self.recorded().get("recipe", ""))
 
     def planned(self, stage: str) -> dict[str, Any] | None:
@@ -258,14 +243,15 @@ class Workspace:
         StaleStoreError when other options made the results that are there.
         """
         self._refuse_foreign_results(stage)
-        self._remove(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
+        remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
         record, begun = self.recorded(), self.begun
         if overwrite:
             self.refuse_foreign_models()
-            self._remove(self._results(stage))
+            remove_own(self._results(stage))
             begun = self._begun_before(stage)
             record = record if begun else {}
-        if stage in begun and (why := self._difference(stage, options, recipe)):
+        known = placeless(record.get(stage, {}), GIVEN)
+        if stage in begun and (why := first_difference(known, placeless(options, GIVEN))):
             raise StaleStoreError(
                 f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
             )
@@ -273,13 +259,6 @@ class Workspace:
         later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
         changed = {**record, **later, stage: dict(options), "begun": begun}
         self._write_record({**changed, "recipe": recipe or record.get("recipe", "")})
-
-    def _difference(self, stage: str, options: Mapping[str, Any], recipe: str) -> str:
-        """Return where options differ from those on record, empty if they do not."""
-        known, record = self.recorded().get("recipe"), self.recorded()[stage]
-        found = first_difference(placeless(record, GIVEN), placeless(options, GIVEN))
-        is_other = found and known and recipe and known != recipe
-        return f"{found} (recipe {known!r} there, {recipe!r} now)" if is_other else found
 
     def rewind(self, why: str = "what it was made from has changed") -> None:
         """Remove the database and what was made from it, for inputs that have changed.
@@ -289,33 +268,15 @@ class Workspace:
         """
         if self.users_database:
             raise StaleStoreError(f"{self.users_database}: {why}; {self._remedy}")
-        self.forget_models()
-        self._remove(path for path in self._results("verify") if path != self.sparse)
-        self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
-
-    def forget_models(self) -> None:
-        """Have the models made anew, which stay until others take their place."""
         self.record_made_from(map="")
+        remove_own(path for path in self._results("verify") if path != self.sparse)
+        self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
 
     @property
     def _remedy(self) -> str:
         if self.users_database:
             return "use a new database (from_database= takes over its images and cameras)"
         return "use --overwrite to redo it and the stages after it, or another --output-path"
-
-    def options_digest(self, *stages: str) -> str:
-        """Return a sha256 of the recorded options of stages, for what they leave.
-
-        The digest stays the same when files are moved or photographs get other cameras.
-        """
-        record = self.recorded()
-        chosen = {stage: placeless(record.get(stage, {}), GIVEN) for stage in stages}
-        return digest_of(
-            {
-                stage: {k: value for k, value in options.items() if k not in NOT_IN_DIGESTS}
-                for stage, options in chosen.items()
-            }
-        )
 
     def _refuse_foreign_results(self, stage: str) -> None:
         first = {"copy": "extract", "extract": "copy"}.get(stage)
@@ -324,8 +285,8 @@ class Workspace:
                 f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
                 "use another --output-path"
             )
-        for path in (self.database, self.sparse, self.features, self.matches, self.guided):
-            if path.exists() and path != self.users_database and not self.begun:
+        for path in () if self.begun else self._results("extract"):
+            if path.exists() and path != self.users_database:
                 raise StaleStoreError(
                     f"{path}: exists and was not made here; it is left as it is, use "
                     "another --output-path"
@@ -355,13 +316,6 @@ class Workspace:
         }
         later = STAGES[STAGES.index(stage) :]
         return [path for name, paths in made.items() if name in later for path in paths]
-
-    @staticmethod
-    def _remove(paths: Iterable[Path]) -> None:
-        for path in paths:
-            if path.exists():
-                logger.info("removing %s", path)
-            remove_own([path])
 
 
 def _may_be_ours(path: Path) -> bool:

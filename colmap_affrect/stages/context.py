@@ -123,18 +123,15 @@ class Context:
 
     @property
     def features(self) -> FeatureStore:
-        """The features; a file that was made with other options than those on record is refused."""
-        digest = self.workspace.options_digest("extract")
-        return FeatureStore(self.workspace.features.absolute(), digest)
+        """The features."""
+        return FeatureStore(self.workspace.features.absolute())
 
     @property
     def matches(self) -> MatchStore:
-        """The raw matches; refused like features."""
-        digest = self.workspace.options_digest("extract", "match")
-        return MatchStore(self.workspace.matches, digest)
+        """The raw matches."""
+        return MatchStore(self.workspace.matches)
 
     @property
     def guided(self) -> GuidedStore:
-        """The guided matches; refused like features."""
-        digest = self.workspace.options_digest("extract", "match", "verify", "guide")
-        return GuidedStore(self.workspace.guided, digest)
+        """The guided matches."""
+        return GuidedStore(self.workspace.guided)

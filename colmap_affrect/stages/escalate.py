@@ -36,7 +36,7 @@ from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import PairMatches
+from colmap_affrect.project.stores import STEP, PairMatches
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalation_graph import (
@@ -186,7 +186,7 @@ class Escalation:
             )
         insecure = insecure_images(num_inliers, self.options.strong_num_inliers, weakly_connected)
         failed = [pair for pair, count in num_inliers.items() if not count]
-        reached, tried = self.matches.levels(failed), self.matches.tried_levels(failed)
+        reached, tried = self.matches.levels(failed), self.matches.levels(failed, "tried_level")
         stalled = {pair for pair in failed if reached[pair] < tried[pair]}
         num_consistent, num_raw = self._num_matches(failed)
         return EscalationGraph(num_inliers, num_consistent, insecure, stalled, num_raw)
@@ -214,10 +214,10 @@ class Escalation:
         There are no pairs where a killed run has matched all of a step, and only the database lacks
         them.
         """
-        tried = self.matches.tried_levels(self.pairs)
-        if step := self.matches.step():
+        tried = self.matches.levels(self.pairs, "tried_level")
+        if step := self.matches.note(STEP):
             level, pairs = step
-            return level, [pair for pair in pairs if tried.get(pair, level) < level]
+            return level, [p for p in map(tuple, pairs) if tried.get(p, level) < level]
         graph, levels = self.graph(), self.matches.levels(self.pairs)
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
 
@@ -239,7 +239,7 @@ class Escalation:
         What is to be done is on record meanwhile: a killed run could not tell it else.
         """
         if pairs:
-            self.matches.record_step(level, pairs)
+            self.matches.keep_note(STEP, [level, list(pairs)])
         images = sorted({name for pair in pairs for name in pair})
         names = [name for name in images if len(self.features.level_ends(name)) <= level]
         title, total = f"escalate, level {level}", len(names) + len(pairs)
@@ -248,7 +248,7 @@ class Escalation:
             if pairs:
                 self._match_again(pairs, level, advance)
         self.write()
-        self.matches.record_step()
+        self.matches.keep_note(STEP, None)
 
     def write(self) -> None:
         """Bring the database up to what is stored."""
@@ -268,7 +268,7 @@ class Escalation:
         with self.context.progress.stage("match", len(higher), "pairs") as advance:
             match_pairs(self.context, higher, self.matching, advance)
         self.matches.write((), self.pairs, 0)
-        self.matches.record_step()
+        self.matches.keep_note(STEP, None)
         self.write()
 
     def _extend(self, names: Sequence[str], level: int, advance: Callable[[int], None]) -> None:

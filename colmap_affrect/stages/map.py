@@ -72,7 +72,7 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     refuse_edited(workspace.sparse)
-    workspace.forget_models()  # a run that is killed begins anew
+    workspace.record_made_from(map="")  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)

@@ -16,7 +16,7 @@ from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.contents import file_sha256
 from colmap_affrect.project.record import WEIGHTS
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import PairMatches
+from colmap_affrect.project.stores import FINISHED, PairMatches
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import write_images_and_keypoints
 from colmap_affrect.stages.one_pair import Matching, iterate_matches
@@ -51,21 +51,21 @@ def match(
     record = options.to_mapping() | ({WEIGHTS: digests(weights)} if weights else {})
     workspace.record_options("match", record, overwrite=overwrite)
     matches, digest = context.matches, file_sha256(workspace.pairs)
-    finished = matches.finished_list()
+    finished = matches.note(FINISHED)
     is_finished = finished == digest and matches.num_pairs() == len(pairs)
     missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
     if missing:
-        matches.record_finished_list("")
+        matches.keep_note(FINISHED, None)
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance)
     warnings = {}
-    if missing or finished == "":  # else those of an older version
+    if missing or finished is None:
         is_asked = options.filter_stationary_matches
         if is_asked and (line := StationaryFilter(context.features, matches).learn(pairs)):
             warnings["matches"] = line
             logger.warning("matches: %s", line)
     if finished != digest:
-        matches.record_finished_list(digest)
+        matches.keep_note(FINISHED, digest)
     write_matches(context, pairs)
     wall_s = time.perf_counter() - start
     return StageReport("match", wall_s, len(missing), len(pairs) - len(missing), warnings=warnings)

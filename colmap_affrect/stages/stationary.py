@@ -16,7 +16,7 @@ from colmap_affrect.data import Mask
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.images.masks import grown
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
+from colmap_affrect.project.stores import STATIONARY, FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
@@ -44,11 +44,16 @@ class StationaryFilter:
         """Name the files; what is known of places is read now."""
         self._features, self._matches = features, matches
         self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
-        self._places = {size: _mask(cells) for size, cells in matches.stationary_cells().items()}
+        self._places = {size: _mask(cells) for size, cells in self._known().items()}
 
     @cached_property
     def _sizes(self) -> dict[str, Size]:
         return self._features.image_sizes()
+
+    def _known(self) -> dict[Size, Indices]:
+        """Return the (N, 2) cells, column and row, on record by size."""
+        kept = self._matches.note(STATIONARY) or []
+        return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in kept}
 
     def filtered(self, found: PairMatches) -> PairMatches:
         """Return the matches of a pair without those of captions, frames and watermarks."""
@@ -75,14 +80,14 @@ class StationaryFilter:
 
         A call that was killed may have dropped some: what it found is on record and counts too.
         """
-        known = self._matches.stationary_cells()
+        known = self._known()
         found = {size: cells for size, cells in self._find(pairs).items() if len(cells)}
         if not (found or known):
             return ""
         for size, cells in found.items():
             known[size] = np.unique(np.concatenate([known.get(size, cells), cells]), axis=0)
             self._places[size] = _mask(known[size])
-        self._matches.record_stationary_cells(known)
+        self._matches.keep_note(STATIONARY, [(s, c.tolist()) for s, c in known.items()])
         num_pairs = num_matches = 0
         for pair in pairs:
             (before,) = self._matches.read([pair])

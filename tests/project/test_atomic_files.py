@@ -149,19 +149,16 @@ def test_commit_that_ends_at_any_write_leaves_all_changes_or_none(
 ) -> None:
     path = tmp_path / "file.h5"
     before, after = grown_hdf5(path)
-    old, seen, ended = {f"old {index}" for index in range(40)}, set(), False
+    old, seen = {f"old {index}" for index in range(40)}, set()
     for passing in range(1000):
         for left in tmp_path.glob("file.h5*"):
             left.unlink()
         path.write_bytes(before)
         with FileTransaction(path) as changes, monkeypatch.context() as patch:
             change_hdf5(changes)
-            FailingFiles(patch, passing, error)
+            failing = FailingFiles(patch, passing, error)
             with suppress(OSError, Killed):
                 changes.commit()
-                ended = True
-        if isinstance(error, OSError) and not journal_of(path).exists() and not ended:
-            assert path.read_bytes() == before
         apply_journal(path)
         with h5py.File(path, "r") as file:
             assert set(file) in (old, old ^ {"old 3", "new"})
@@ -169,7 +166,7 @@ def test_commit_that_ends_at_any_write_leaves_all_changes_or_none(
             if "new" in file:
                 assert_array_equal(file["new"], np.arange(3000))
             seen.add("new" in file)
-        if ended:
+        if failing.left >= 0:
             break
     assert path.read_bytes() == after
     assert seen == {True, False}
@@ -238,9 +235,8 @@ def test_content_is_on_the_disk_before_its_name_and_the_name_before_the_end(
         changes.write(b"T")
         changes.commit()
     file, journal, folder = (str(tmp_path / name) for name in ("a.txt", "a.txt.journal", ""))
-    assert steps[0] == steps[4] == file
-    assert steps[1].startswith(journal)
-    assert steps[2:4] == ["-> a.txt.journal", folder.rstrip("/")]
+    assert steps[0].startswith(journal)
+    assert steps[1:] == ["-> a.txt.journal", folder.rstrip("/"), file]
 
 
 def test_links_that_lie_in_the_way_are_not_followed(tmp_path: Path) -> None:

@@ -273,7 +273,6 @@ def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path
     assert branch.recorded() == {
         **finished.recorded(), "begun": ["extract", "pairs", "match"],
     }  # fmt: skip
-    assert branch.options_digest("extract", "match") == finished.options_digest("extract", "match")
     with pytest.raises(OptionError, match="the verify stage has not been run"):
         branch.require("verify")
     branch.record_options("verify", {"by": "another seed"})

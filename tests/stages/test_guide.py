@@ -18,6 +18,7 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.matchers.guided import GuidedOptions
+from colmap_affrect.project.stores import STATIONARY
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import guide as stage
@@ -133,7 +134,7 @@ def test_captions_are_not_found_again(context: Context) -> None:
     """Here they are said to be everywhere."""
     everywhere = np.indices((NUM_CELLS, NUM_CELLS)).reshape(2, -1).T
     sizes = set(context.features.image_sizes().values())
-    context.matches.record_stationary_cells(dict.fromkeys(sizes, everywhere))
+    context.matches.keep_note(STATIONARY, [(size, everywhere.tolist()) for size in sizes])
     assert guide(context, ALWAYS).num_done == 6
     assert guided_counts(context) == {}
 
