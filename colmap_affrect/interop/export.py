@@ -1,5 +1,7 @@
 """A COLMAP model for other programs: points, text, undistorted photographs, a table."""
 
+import csv
+import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +18,6 @@ from colmap_affrect.interop.align import Georeference
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
-from colmap_affrect.project.report import csv_text
 from colmap_affrect.project.workspace import Workspace
 
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
@@ -137,7 +138,7 @@ def _cameras(source: Source, folder: Path) -> Path:
         camera, center = source.model.cameras[image.camera_id], image.projection_center()
         qx, qy, qz, qw = image.cam_from_world().rotation.quat.tolist()
         rows.append({
-            "name": image.name, **dict(zip("xyz", center, strict=True)),
+            "name": _no_formula(image.name), **dict(zip("xyz", center, strict=True)),
             "qw": qw, "qx": qx, "qy": qy, "qz": qz,
             "num_points": image.num_points3D, "camera": image.camera_id,
             "camera_model": camera.model.name, "width": camera.width, "height": camera.height,
@@ -147,8 +148,17 @@ def _cameras(source: Source, folder: Path) -> Path:
         if place:
             on_earth = place.on_earth(center)
             rows[-1] |= zip(("latitude", "longitude", "altitude_m"), on_earth, strict=True)
-    replace_text(path, csv_text(rows))
+    table = io.StringIO()
+    writer = csv.DictWriter(table, rows[0] if rows else ["name"], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    replace_text(path, table.getvalue())
     return path
+
+
+def _no_formula(text: str) -> str:
+    """Put an apostrophe before a text that a spreadsheet would compute."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 FORMATS: dict[str, tuple[Callable[[Source, Path], Path], tuple[str, ...]]] = {

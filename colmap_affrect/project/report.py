@@ -1,18 +1,15 @@
 """What stages and runs report: frozen, printable, JSON out."""
 
-import csv
-import io
 import json
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from typing import Any
 
 from colmap_affrect.errors import such_as
 
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")  # how cells begin that spreadsheets compute
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {
@@ -25,12 +22,7 @@ OF_LARGEST = (
     "registered_names", "probabilities", "doubtful", "mean_track_length",
     "mean_reprojection_error_px", "moves",
 )  # fmt: skip
-OF_RUN = (
-    "unregistered", "advice", "extended", "added", "num_pairs", "num_verified_pairs", "pair_levels",
-    "contradicting_pairs", "guided", "cameras", "recipe", "preset", "differs_from_colmap",
-    "versions",
-)  # fmt: skip
-"""What ``report.json`` has of the largest model and of the run under its own name."""
+"""What ``report.json`` has of the largest model under its own name."""
 
 SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
 
@@ -75,33 +67,6 @@ def by_level(level: str, count: int) -> str:
     if level in ("identity", "none"):
         return f"{count} {'without warps' if level == 'identity' else 'not verified'}"
     return f"{count} with warps ({level})"
-
-
-def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a table with a header; a column for every key, in the order of first use.
-
-    Text that a spreadsheet would take for a formula gets an apostrophe in front of it.
-
-    >>> print(csv_text([{"a": 1}, {"a": 2, "b": "x"}]), end="")
-    a,b
-    1,
-    2,x
-    """
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: _no_formula(value) for key, value in row.items()} for row in rows)
-    return text.getvalue()
-
-
-def _no_formula(value: Any) -> Any:
-    """Return a cell that no spreadsheet computes.
-
-    >>> _no_formula("=1+1"), _no_formula(-1.5), _no_formula("-1.5"), _no_formula("a-b")
-    ("'=1+1", -1.5, "'-1.5", 'a-b')
-    """
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA_STARTS) else value
 
 
 @dataclass(frozen=True)
@@ -150,10 +115,6 @@ class Arrival:
     num_agreeing: int = 0
     num_ratios: int = 0
     scale_error_frac: float = 0.0
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return what ``report.json`` holds."""
-        return asdict(self) if self.by else {"how": self.how}
 
     def text(self) -> str:
         """Return a few words."""
@@ -308,29 +269,28 @@ class ReconstructionReport:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
-        mapping, verification = dict(self.mapping), dict(self.verification)
-        mapper, mapper_options = mapping.pop("name"), mapping.pop("mapper_options")
-        random_seed = mapping.pop("random_seed")
-        verification.pop("random_seed")
         largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
-        found: dict[str, Any] = {
+        found = asdict(self)
+        del found["presets"], found["verification"]["random_seed"]
+        options = found["mapping"]
+        return {
             "status": self.status,
-            "images_total": self.images_total,
             "images_registered": len(largest.registered_names),
             **{key: getattr(largest, key) for key in OF_LARGEST},
+            **found,
             "points3D": largest.num_points3D,
-            "arrivals": {name: item.to_mapping() for name, item in largest.arrivals.items()},
+            "arrivals": {
+                name: asdict(arrival) if arrival.by else {"how": arrival.how}
+                for name, arrival in largest.arrivals.items()
+            },
             "num_models": len(self.models),
-            "models": [list(model.registered_names) for model in self.models],
-            **{key: getattr(self, key) for key in OF_RUN},
-            "stages": [asdict(stage) for stage in self.stages],
-            "mapper": mapper,
-            "mapper_options": mapper_options,
-            "verification": verification,
-            "mapping": mapping,
-            "random_seed": random_seed,
+            "models": [model.registered_names for model in self.models],
+            "added": self.added,
+            "preset": self.preset,
+            "mapper": options.pop("name"),
+            "mapper_options": options.pop("mapper_options"),
+            "random_seed": options.pop("random_seed"),
         }
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items()}
 
     def to_json(self) -> str:
         """Return ``report.json`` as text."""
