@@ -59,7 +59,7 @@ def match(
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance)
     warnings = {}
-    if missing or finished is None:
+    if pairs and (missing or finished is None):
         is_asked = options.filter_stationary_matches
         if is_asked and (line := StationaryFilter(context.features, matches).learn(pairs)):
             warnings["matches"] = line
