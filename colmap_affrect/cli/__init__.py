@@ -6,21 +6,11 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import TextIO
 
-from colmap_affrect import __version__
+from colmap_affrect import __version__, errors
 from colmap_affrect.cli.parser import build_parser
-from colmap_affrect.errors import (
-    EXIT_INTERRUPTED,
-    INTERRUPTED,
-    MEMORY_HINT,
-    AffrectError,
-    lacks_memory,
-    one_line,
-    say,
-)
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.workspace import Workspace
 
@@ -32,10 +22,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = build_parser().parse_args(arguments)
         with _no_empty_folder(options.output_path), _logging(options):
-            commands = import_module("colmap_affrect.cli.commands")
-            command = getattr(commands, options.command.replace("-", "_"))
+            from colmap_affrect.cli import commands  # not for --help
+
+            command = getattr(commands, options.command.replace("-", "_"), commands.stage)
             return command(options) or 0
-    except AffrectError as error:
+    except errors.AffrectError as error:
         return _fail(str(error), error.exit_code)
     except BrokenPipeError:  # who reads what is printed has seen enough, as head has
         return 0
@@ -45,17 +36,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "run the same command again: what was done before is kept"
         )
     except Exception as error:
-        if not lacks_memory(error):
+        if not errors.lacks_memory(error):
             raise
-        return _fail(f"{MEMORY_HINT}: what was done before is kept")
+        return _fail(f"{errors.MEMORY_HINT}: what was done before is kept")
     except KeyboardInterrupt:
-        say(INTERRUPTED)
-        return EXIT_INTERRUPTED
+        errors.say(errors.INTERRUPTED)
+        return errors.EXIT_INTERRUPTED
 
 
 def _fail(message: str, code: int = 1) -> int:
     """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
-    say(f"error: {one_line(message)}")
+    errors.say(f"error: {errors.one_line(message)}")
     return code
 
 
@@ -65,7 +56,7 @@ def _no_empty_folder(path: Path | None) -> Iterator[None]:
     is_new = path is not None and not path.exists()
     try:
         yield
-    except AffrectError:
+    except errors.AffrectError:
         if path and is_new and {file.name for file in path.glob("*")} <= {".lock", "run.log"}:
             remove_own([path])
         raise
@@ -115,7 +106,7 @@ class _OneLine(logging.Formatter):
     """Shows a message in one line, whatever names are in it; a traceback keeps its lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        return one_line(super().formatMessage(record))
+        return errors.one_line(super().formatMessage(record))
 
 
 class _Log(logging.StreamHandler[TextIO]):

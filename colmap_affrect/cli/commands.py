@@ -57,44 +57,34 @@ def extract(options: argparse.Namespace) -> None:
     _refuse_failures(report.failures, options)
 
 
-def pairs(options: argparse.Namespace) -> None:
+def stage(options: argparse.Namespace) -> None:
+    """Run one stage, with the options on record and those that are given in their place."""
+    from colmap_affrect.stages.escalate import escalate
+    from colmap_affrect.stages.guide import guide
+    from colmap_affrect.stages.match import match as match_pairs
     from colmap_affrect.stages.pairs import choose_pairs
-
-    with given.context(options) as context:
-        chosen = given.over(context.pairing, options, "pairs")
-        show(choose_pairs(context, chosen, overwrite=options.overwrite).summary())
-
-
-def match(options: argparse.Namespace) -> None:
-    from colmap_affrect.stages.match import match
-
-    with given.context(options) as context:
-        chosen = given.changed(context.matching, options, "matching")
-        show(match(context, chosen, overwrite=options.overwrite).summary())
-
-
-def verify(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.verify import verify_matches
 
+    how = {"overwrite": options.overwrite}
     with given.context(options) as context:
-        chosen = given.verification(options, context.verification)
-        show(verify_matches(context, chosen, overwrite=options.overwrite).summary())
-
-
-def escalate(options: argparse.Namespace) -> None:
-    from colmap_affrect.stages.escalate import escalate
-
-    with given.context(options) as context:
-        chosen = given.changed(context.escalation, options, "escalate")
-        show(escalate(context, chosen, overwrite=options.overwrite).summary())
-
-
-def guide(options: argparse.Namespace) -> None:
-    from colmap_affrect.stages.guide import guide
-
-    with given.context(options) as context:
-        chosen = given.changed(context.guiding, options, "guided")
-        show(guide(context, chosen, overwrite=options.overwrite).summary())
+        match options.command:
+            case "pairs":
+                report = choose_pairs(context, given.over(context.pairing, options, "pairs"), **how)
+            case "match":
+                report = match_pairs(
+                    context, given.changed(context.matching, options, "matching"), **how
+                )
+            case "verify":
+                report = verify_matches(
+                    context, given.verification(options, context.verification), **how
+                )
+            case "escalate":
+                report = escalate(
+                    context, given.changed(context.escalation, options, "escalate"), **how
+                )
+            case _:
+                report = guide(context, given.changed(context.guiding, options, "guided"), **how)
+        show(report.summary())
 
 
 def map(options: argparse.Namespace) -> None:
@@ -353,14 +343,13 @@ def weights(options: argparse.Namespace) -> None:
             show(fetched)
         return
     folder = given.folder("--weights", options.weights)
-    found = {key: find(key, folder) for key in keys or WEIGHT_FILES}
-    for key, path in found.items():
-        file = WEIGHT_FILES[key]
-        where = f"not found: {install_hint([file])}colmap-affrect weights fetch {key}"
-        if path:
-            unlike = f"NOT the published file: unless it is your own, {remedy(path)}"
-            unknown = "not checked: the sha256 of the published file is not known"
-            states = {True: "verified", False: unlike, None: unknown}
-            where = f"{path}, {states[is_published(key, path)]}"
+    for key in keys or WEIGHT_FILES:
+        file, path = WEIGHT_FILES[key], find(key, folder)
+        if not path:
+            where = f"not found: {install_hint([file])}colmap-affrect weights fetch {key}"
+        elif is_published(key, path) is False:
+            where = f"{path}, NOT the published file: unless it is your own, {remedy(path)}"
+        else:
+            where = str(path)
         show(f"{key:32s} {file.used_for}, {file.file_name}\n    {where}")
         show(f"    sha256 {file.sha256 or 'not known'}; licence {file.licence or 'not stated'}")
