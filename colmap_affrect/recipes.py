@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureOptions, NetworkOptions
+from colmap_affrect.features.base import EXTRACTORS, FeatureOptions, NetworkOptions
 from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthFilesOptions, DepthOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.options import Options, Registry, suggestion, within
+from colmap_affrect.options import Options, suggestion, within
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
 from colmap_affrect.rectifiers.dense import DenseShapesOptions
 from colmap_affrect.rectifiers.whole_image import IdentityOptions
@@ -145,24 +145,6 @@ class EscalateOptions(Options):
     where light or age differ, gradients do."""
 
 
-def _mapper_options(
-    mapping: Mapping[str, Any], preset: str, name: str = "", **values: Any
-) -> MapperOptions:
-    own = dict(mapping)
-    usual = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))
-    if name and name != usual:
-        own = {}  # they are those of another mapper
-    options: MapperOptions = MAPPERS.part(name or usual).Options.preset(preset, **{**own, **values})
-    return options
-
-
-def _checked_mapping(mapping: dict[str, Any]) -> dict[str, Any]:
-    """Refuse wrong options of the mapper now, not when mapping begins."""
-    if mapping:
-        _mapper_options(mapping, "sparse")
-    return mapping
-
-
 class Recipe(ExtractionOptions):
     """All sections of a recipe."""
 
@@ -173,14 +155,15 @@ class Recipe(ExtractionOptions):
     matching: AnyMatcher = NearestOptions()
     escalate: EscalateOptions = EscalateOptions()
     guided: GuidedOptions = GuidedOptions()
-    mapping: Annotated[dict[str, Any], AfterValidator(_checked_mapping)] = Field(
-        default_factory=dict
-    )
+    mapping: dict[str, Any] = Field(default_factory=dict)
     """``name`` of the mapper and options that differ from the preset."""
 
     @model_validator(mode="after")
-    def _matchers_fit(self) -> Self:
+    def _fits(self) -> Self:
+        """Refuse now what would fail when matching or mapping begins."""
         self.require_matching(self.matching)
+        if self.mapping:
+            self.mapper_options("sparse")
         return self
 
     @property
@@ -209,7 +192,13 @@ class Recipe(ExtractionOptions):
 
         ``name`` is by default that of the recipe, or of the preset.
         """
-        return _mapper_options(self.mapping, preset, name, **values)
+        own = dict(self.mapping)
+        usual = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))
+        if name and name != usual:
+            own = {}  # they are those of another mapper
+        part = MAPPERS.part(name or usual)
+        options: MapperOptions = part.Options.preset(preset, **{**own, **values})
+        return options
 
 
 EXTRACTION = tuple(ExtractionOptions.model_fields)
@@ -231,6 +220,7 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
     """Load a recipe by its name or the path of a TOML file, and change single options.
 
     ``settings`` are ``section.option=value`` with a TOML value; strings may go without quotes.
+    ``section=name`` chooses another part, with its defaults.
     Raises OptionError for an unknown recipe or option, or a value out of range.
     """
     is_file = name.endswith(".toml")
@@ -267,20 +257,5 @@ def with_settings(values: Mapping[str, Any], settings: Sequence[str]) -> dict[st
                 raise OptionError(f"--set {setting}: {section} is not a section")
             target[section] = dict(inner)
             target = target[section]
-        if key.strip() in PART_SECTIONS and target.get("name") != value:
-            known = PART_SECTIONS[key.strip()].part(str(value)).Options.model_fields
-            for other in set(target) - set(known):  # options of the part that goes
-                del target[other]
         target[option] = value
     return changed
-
-
-PART_SECTIONS: dict[str, Registry[Any]] = {
-    "rectifier.name": RECTIFIERS,
-    "rectifier.shape_source.name": SHAPES,
-    "features.name": EXTRACTORS,
-    "matching.name": MATCHERS,
-    "mapping.name": MAPPERS,
-    "depth.name": DEPTH_SOURCES,
-}
-"""Options that choose the part of their section, which the other options there depend on."""

@@ -10,7 +10,6 @@ import tomli_w
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.second_moment import SecondMomentOptions
-from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe, recipe_names
 from colmap_affrect.rectifiers.base import CoverOptions
@@ -70,7 +69,7 @@ def test_levels_build_on_the_lowest_one_with_their_features() -> None:
 
 def test_matcher_must_be_trained_for_the_features() -> None:
     with pytest.raises(OptionError) as error:
-        load_recipe("default", ["matching.name=lightglue"])
+        load_recipe("default", ["matching=lightglue"])
     assert str(error.value).endswith(
         "'aliked' takes features of aliked, not of rootsift; use --recipe aliked-lightglue, or "
         "--set matching.trained_for=sift"
@@ -83,19 +82,12 @@ def test_matching_of_a_level_must_take_its_features() -> None:
         Recipe.from_mapping(values, "mine")
 
 
-def test_choosing_a_profile_drops_the_options_of_the_other_one() -> None:
-    recipe = load_recipe("asift-recommended", ["features.name=rootsift"])
-    assert recipe.extraction.features == SiftOptions(max_num_rectified_features=32768)
-    recipe = load_recipe("unrectified", ["features.descriptor=hardtfeat", "features.name=rootsift"])
-    assert recipe.extraction.features.contrast_threshold == 0.04
-
-
 def test_settings_change_single_options() -> None:
     settings = [
-        "rectifier.tilt_radius=1.8",
         "matching.max_ratio=0.7",
         "max_image_size_px=1000",
-        "rectifier.name=affnet-shapes",
+        "rectifier=affnet-shapes",
+        "rectifier.tilt_radius=1.8",
         "rectifier.shape_source.integration_sigmas_px=[4.0, 9.0]",
     ]
     extraction = load_recipe("default", settings).extraction
@@ -116,7 +108,7 @@ def test_settings_change_single_options() -> None:
         ("rectifier.tilt_radius=wide", "=.wide.: should be a valid number"),
         ("matching.max_ratio.deep=1", "is not a section"),
         ("escalate=3", "escalate=3: should be a valid dict"),
-        ("rectifier.name=dense", "unknown rectifier 'dense' .did you mean 'dense-shapes'"),
+        ("rectifier=dense", "unknown rectifier 'dense' .did you mean 'dense-shapes'"),
     ],
 )
 def test_wrong_setting_is_one_clear_line(setting: str, message: str) -> None:

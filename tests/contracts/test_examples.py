@@ -60,7 +60,7 @@ def test_new_extractor_and_matcher_are_chosen_by_name(tmp_path: Path) -> None:
     image = texture((240, 180), 1)
     write_image(photos / "a.png", image)
     write_image(photos / "b.png", image[:, 11:])
-    settings = ["features.name=orb", "features.max_num_features=500", "matching.name=mutual"]
+    settings = ["features=orb", "features.max_num_features=500", "matching=mutual"]
     recipe = load_recipe("default", settings)
     context = Context(Workspace(tmp_path / "out"))
     with context.workspace.locked():
@@ -88,6 +88,6 @@ def test_new_mapper_is_chosen_by_name(photos: Path, tmp_path: Path) -> None:
 
 def test_names_and_options_of_other_packages_are_checked_as_our_own() -> None:
     with pytest.raises(OptionError, match=r"unknown option 'num' .did you mean 'name'"):
-        load_recipe("default", ["matching.name=mutual", "matching.num=3"])
+        load_recipe("default", ["matching=mutual", "matching.num=3"])
     with pytest.raises(OptionError, match=r"unknown matcher 'mutal' .did you mean 'mutual'"):
-        load_recipe("default", ["matching.name=mutal"])
+        load_recipe("default", ["matching=mutal"])
