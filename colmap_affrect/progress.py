@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass
 from typing import Self, TextIO
 
 from tqdm import tqdm
@@ -87,7 +86,8 @@ class Progress:
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
         """Show one stage of ``total`` units for as long as the context lasts."""
-        forecast, done = self._forecast, 0
+        forecast, stream, title = self._forecast, self._stream, self._title + name
+        done = num_lines = 0
         if forecast:
             forecast.begin(name, total)
 
@@ -96,11 +96,21 @@ class Progress:
             done += count
             return forecast.text(done / total) if forecast else ""
 
-        title = self._title + name
-        if self._stream is None or total == 0:
+        def print_line(text: str) -> None:
+            more = f", {text}" if text else ""
+            show(f"{title}: {done}/{total} {unit}{more}", file=stream)
+
+        def advance_lines(count: int) -> None:
+            nonlocal num_lines
+            text = left(count)
+            if (wanted := done * self._num_plain_lines // total) > num_lines:
+                num_lines = wanted
+                print_line(text)
+
+        if stream is None or total == 0:
             yield lambda _: None
-        elif self._stream.isatty():
-            with tqdm(total=total, desc=title, unit=unit, file=self._stream) as bar:
+        elif stream.isatty():
+            with tqdm(total=total, desc=title, unit=unit, file=stream) as bar:
 
                 def advance(count: int) -> None:
                     bar.set_postfix_str(left(count), refresh=False)
@@ -108,10 +118,9 @@ class Progress:
 
                 yield advance
         else:
-            lines = _PlainLines(self._stream, title, total, unit, self._num_plain_lines)
-            yield lambda count: lines.advance(count, left(count))
-            if not lines.printed:
-                lines.print("")
+            yield advance_lines
+            if not num_lines:
+                print_line("")
 
 
 SILENT = Progress()
@@ -120,30 +129,6 @@ SILENT = Progress()
 def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
     """Print what people or programs read; see :mod:`colmap_affrect.errors`."""
     print(shown(str(text)), file=file, end=end)
-
-
-@dataclass
-class _PlainLines:
-    """A few lines, evenly over the whole stage."""
-
-    stream: TextIO
-    name: str
-    total: int
-    unit: str
-    num_lines: int
-    done: int = 0
-    printed: int = 0
-
-    def advance(self, count: int, left: str) -> None:
-        self.done += count
-        part = self.done * self.num_lines // self.total
-        if part > self.printed:
-            self.printed = part
-            self.print(left)
-
-    def print(self, left: str) -> None:
-        line = f"{self.name}: {self.done}/{self.total} {self.unit}"
-        show(f"{line}, {left}" if left else line, file=self.stream)
 
 
 class Stopwatch:
