@@ -243,7 +243,7 @@ def with_settings(values: Mapping[str, Any], settings: Sequence[str]) -> dict[st
     for setting in settings:
         key, separator, text = setting.partition("=")
         if not separator or not key.strip():
-            raise OptionError(f"--set {setting}: expected section.option=value")
+            raise OptionError(f"{setting}: expected OPTION=VALUE")
         try:
             value = tomllib.loads(f"value = {text}")["value"]
         except (ValueError, RecursionError):
@@ -254,7 +254,7 @@ def with_settings(values: Mapping[str, Any], settings: Sequence[str]) -> dict[st
             inner = target.get(section, {})
             inner = {"name": inner} if isinstance(inner, str) else inner  # a part by its name alone
             if not isinstance(inner, Mapping):
-                raise OptionError(f"--set {setting}: {section} is not a section")
+                raise OptionError(f"{setting}: {section} is not a section")
             target[section] = dict(inner)
             target = target[section]
         target[option] = value

@@ -101,8 +101,8 @@ def test_settings_change_single_options() -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("rectifier.tilt_radius", "expected section.option=value"),
-        ("=3", "expected section.option=value"),
+        ("rectifier.tilt_radius", "expected OPTION=VALUE"),
+        ("=3", "expected OPTION=VALUE"),
         ("rectifyer.tilt_radius=1.8", "did you mean 'rectifier'"),
         ("rectifier.tilt_radius=0.5", r"tilt_radius=0\.5: should be greater"),
         ("rectifier.tilt_radius=wide", "=.wide.: should be a valid number"),

@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     try:
         options = build_parser().parse_args(arguments)
-        with _no_empty_folder(options.output_path), _logging(options):
+        with _logging(options):
             from colmap_affrect.cli import commands  # not for --help
 
             command = getattr(commands, options.command.replace("-", "_"), commands.stage)
@@ -51,27 +51,17 @@ def _fail(message: str, code: int = 1) -> int:
 
 
 @contextmanager
-def _no_empty_folder(path: Path | None) -> Iterator[None]:
-    """Remove a new output folder when the command fails before it has more than its log."""
-    is_new = path is not None and not path.exists()
-    try:
-        yield
-    except errors.AffrectError:
-        if path and is_new and {file.name for file in path.glob("*")} <= {".lock", "run.log"}:
-            remove_own([path])
-        raise
-
-
-@contextmanager
 def _logging(options: argparse.Namespace) -> Iterator[None]:
     """Log to the terminal and, if there is an output folder, to ``run.log``.
 
     COLMAP and image decoders write to file descriptor 2: it leads to the log while the
-    command runs, and Python's ``sys.stderr`` to the terminal.
+    command runs, and Python's ``sys.stderr`` to the terminal. A new output folder goes when the
+    command fails before it has more than its log.
     """
-    log_path = Path(os.devnull)
+    log_path, new = Path(os.devnull), None
     if options.output_path:
         workspace = Workspace(options.output_path)
+        new = None if workspace.path.exists() else workspace.path
         workspace.require_own(options.image_path or options.dataset_path)
         log_path = workspace.log
     log_path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,8 +82,11 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
         sys.stderr = terminal
         try:
             yield
-        except Exception:
+        except Exception as error:
             logger.log(logging.DEBUG, "failed", exc_info=True)
+            left = {file.name for file in new.glob("*")} if new else set()
+            if new and isinstance(error, errors.AffrectError) and left <= {".lock", "run.log"}:
+                remove_own([new])
             raise
         finally:
             sys.stderr = python_stderr

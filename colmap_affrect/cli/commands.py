@@ -332,8 +332,13 @@ def weights(options: argparse.Namespace) -> None:
         is_published,
         remedy,
     )
+    from colmap_affrect.recipes import load_recipe, recipe_names
 
-    keys = given.weight_keys(options.keys)
+    keys: list[str] = []
+    for name in options.keys:  # of a recipe what it needs, of aliked all of that name
+        alike = [key for key in WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
+        keys += load_recipe(name).weights if name in recipe_names() else alike or [name]
+    keys = list(dict.fromkeys(keys))
     if options.keys and not keys:
         show(f"{', '.join(options.keys)}: no weights are needed")
         return
@@ -344,7 +349,7 @@ def weights(options: argparse.Namespace) -> None:
         return
     folder = given.folder("--weights", options.weights)
     for key in keys or WEIGHT_FILES:
-        file, path = WEIGHT_FILES[key], find(key, folder)
+        path, file = find(key, folder), WEIGHT_FILES[key]
         if not path:
             where = f"not found: {install_hint([file])}colmap-affrect weights fetch {key}"
         elif is_published(key, path) is False:

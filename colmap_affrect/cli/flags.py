@@ -3,7 +3,6 @@
 What :mod:`.given` makes an options class of has the field as destination, as ``cameras.mode``.
 """
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +14,16 @@ Settings = dict[str, Any]
 MANY: Settings = {"nargs": "+", "action": "extend", "default": []}
 
 
-def _value(metavar: str, text: str, field: str = "", **settings: Any) -> Settings:
-    destination = {"dest": field} if field else {}
-    return {"metavar": metavar, "help": text, **destination, **settings}
+def _value(metavar: str, text: str, **settings: Any) -> Settings:
+    return {"metavar": metavar, "help": text, **settings}
 
 
-def _path(metavar: str, text: str, field: str = "", **settings: Any) -> Settings:
-    return _value(metavar, text, field, **{"type": absolute if "." in field else Path, **settings})
+def _path(metavar: str, text: str, **settings: Any) -> Settings:
+    return {"metavar": metavar, "help": text, "type": Path, **settings}
 
 
-def _switch(text: str, field: str = "") -> Settings:
-    destination = {"dest": field} if field else {}
-    return {"action": "store_true", "help": text, **destination}
-
-
-def absolute(text: str) -> str:
-    return str(Path(text).resolve())
+def _switch(text: str, **settings: Any) -> Settings:
+    return {"action": "store_true", "help": text, **settings}
 
 
 def integers(text: str) -> tuple[int, ...]:
@@ -39,13 +32,6 @@ def integers(text: str) -> tuple[int, ...]:
 
 def words(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
-
-
-def setting(text: str) -> str:
-    key, separator, _ = text.partition("=")
-    if not separator or not key.strip():
-        raise argparse.ArgumentTypeError(f"{text}: expected KEY=VALUE")
-    return text
 
 
 def distance(text: str) -> tuple[str, str, float]:
@@ -78,47 +64,47 @@ FLAGS: dict[str, Settings] = {
     "--from-database": _path("FILE",
         "take images, cameras, rigs, frames and priors of this COLMAP database; it is copied"),
     "--mask-path": _path("FOLDER", "masks, black where features are not wanted: a/b.jpg has "
-        "a/b.jpg.png or a/b.png; photographs without one are used whole", "masks.path"),
-    "--camera-mask-path": _path("FILE", "one mask for all images", "masks.camera_path"),
+        "a/b.jpg.png or a/b.png; photographs without one are used whole", dest="masks.path"),
+    "--camera-mask-path": _path("FILE", "one mask for all images", dest="masks.camera_path"),
     "--camera-mode": _value("MODE", "which images share a camera: auto, single, per-folder or "
         "per-image (default: auto, as --cameras-path says, else those of one body, lens, focal "
         "length and size by EXIF; without EXIF one camera each, unless matches show that images "
-        "of one size share one)", "cameras.mode"),
+        "of one size share one)", dest="cameras.mode"),
     "--camera-model": _value("MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
-        "cameras.model"),
+        dest="cameras.model"),
     "--camera-params": _value("A,B,...",
-        "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5", "cameras.params"),
+        "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792,524.5", dest="cameras.params"),
     "--cameras-path": _path("FILE", "known cameras: folder of a COLMAP model of these images, or "
         "a CSV file with the columns name and any of focal_px, focal_mm with "
         "plate_width_mm (of what the whole image shows), model, params, cx, cy, camera (images "
-        "with one label share a camera)", "cameras.cameras_path"),
+        "with one label share a camera)", dest="cameras.cameras_path"),
     "--focal-length-px": _value("PX", "known focal length of images that --cameras-path does not "
-        "name; the rest is refined", "cameras.focal_length_px", type=float),
+        "name; the rest is refined", dest="cameras.focal_length_px", type=float),
     "--principal-point": _value("CX,CY", "where the optical axis meets the image, in px from its "
         "corner (default: its middle, wrong for prints and scans that were cropped off centre)",
-        "cameras.principal_point"),
+        dest="cameras.principal_point"),
     "--ignore-exif": _switch("take neither focal lengths nor who shares a camera from EXIF",
-        "cameras.ignore_exif"),
+        dest="cameras.ignore_exif"),
     # features, pairs and matches
     "--recipe": _value("NAME",
         "one that 'recipes' lists, or the path of a TOML file (default: default)"),
     "--set": _value("SECTION.OPTION=VALUE", "change one option of the recipe, e.g. --set "
-        "rectifier.tilt_radius=1.8; may be repeated", type=setting, action="append", default=[]),
+        "rectifier.tilt_radius=1.8; may be repeated", action="append", default=[]),
     "--depth-path": _path("FOLDER",
         "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
     "--database-descriptors": _switch(
         "descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers"),
     "--match-list-path": _path("FILE", "pairs to match, two names per line (default: all pairs)",
-        "pairs.match_list_path"),
+        dest="pairs.match_list_path"),
     "--pairs": _value("A,B,...", "which pairs to match, all of: exhaustive, retrieval "
         "(photographs that are alike), low-resolution (whose strongest features match), gps (near "
         "to each other), sequence (following by name); with those of --match-list-path, which "
-        "takes the place of exhaustive (default: exhaustive)", "pairs.methods", type=words),
+        "takes the place of exhaustive (default: exhaustive)", dest="pairs.methods", type=words),
     "--num-neighbors": _value("N", "retrieval, low-resolution: neighbours of a photograph on "
         "average; gps: at most; sequence: before and after it (default: 20)",
-        "pairs.num_neighbors", type=int),
+        dest="pairs.num_neighbors", type=int),
     "--max-distance-m": _value("METRES", "gps: largest distance of neighbours (default: 100)",
-        "pairs.max_distance_m", type=float),
+        dest="pairs.max_distance_m", type=float),
     # verification and mapping
     "--preset": _value("NAME", "options of two-view geometry and mapping: ours for few "
         "photographs, or COLMAP's defaults (default: sparse)", choices=PRESETS),
@@ -127,7 +113,7 @@ FLAGS: dict[str, Settings] = {
     "--mapper-options": _value("KEY=VALUE", "options of pycolmap's IncrementalPipelineOptions or "
         "GlobalPipelineOptions, e.g. ba_refine_principal_point=true "
         "mapper.abs_pose_min_num_inliers=10; they win over the preset. With num_threads other "
-        "than 1 results vary from run to run", type=setting, **MANY),
+        "than 1 results vary from run to run", **MANY),
     "--extend": _path("MODEL", "register new photographs into this COLMAP model, whose poses and "
         "cameras stay; it may be of another program, and its photographs must be among those "
         "given"),
@@ -155,9 +141,9 @@ FLAGS: dict[str, Settings] = {
     "--max-num-keypoints": _value("N", "equal budget: match only the strongest N features of each "
         "image, warps included", type=int),
     "--protocol-options": _value("KEY=VALUE", "settings of the protocol, e.g. threshold_px=1, "
-        "max_num_iterations=1000 (svp, imc: what the code of the paper did)", type=setting, **MANY),
+        "max_num_iterations=1000 (svp, imc: what the code of the paper did)", **MANY),
     # features and models from and for other programs
-    "--output-path@photographs": _path("PATH", "new folder for the photographs", "target_path"),
+    "--output-path@photographs": _path("PATH", "new folder for them", dest="target_path"),
     "--features-path": _path("FILE", "HDF5 file of features"),
     "--matches-path": _path("FILE", "HDF5 file of matches"),
     "--database-path": _path("FILE", "the database to make; must not exist"),
@@ -169,7 +155,7 @@ FLAGS: dict[str, Settings] = {
     "database_path": _path("OUT.db", "the database to make; must not exist"),
     "--model-path": _path("MODEL", "folder of a COLMAP model, such as out/sparse/0"),
     "--output-path@files": _path("FOLDER", "folder for the files; nothing in it is overwritten",
-        "target_path"),
+        dest="target_path"),
     "--format": _value("A,B,...", "ply (points), text (COLMAP's), undistorted (photographs and "
         "model, for dense reconstruction), nerfstudio (the same with transforms.json, for "
         "Gaussian splatting too), cameras (CSV) "
@@ -177,7 +163,7 @@ FLAGS: dict[str, Settings] = {
     "--image-path@export": _path("PATH",
         "folder of the photographs, to undistort them (default: that of the run)"),
     "--output-path@model": _path("MODEL", "folder for the new model, in metres; must not exist",
-        "target_path"),
+        dest="target_path"),
     "--gps": _path("DATABASE",
         "positions by GPS that a COLMAP database holds, such as out/database.db"),
     "--positions": _path("FILE", "CSV of where photographs were taken: name and x,y,z in metres, "

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.options import Options
+from colmap_affrect.options import Options, flat
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.workspace import Workspace
 
@@ -29,7 +29,7 @@ AnyOptions = TypeVar("AnyOptions", bound=Options)
 def over(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOptions:
     """Return options with what is given of a section, as ``cameras.mode`` of ``cameras``."""
     given = {
-        name.removeprefix(f"{section}."): value
+        name.removeprefix(f"{section}."): str(value.resolve()) if isinstance(value, Path) else value
         for name, value in vars(options).items()
         if name.startswith(f"{section}.") and value is not None
     }
@@ -101,11 +101,11 @@ def mapping(
     known: MapperOptions | None = None,
 ) -> MapperOptions:
     """Return the mapper that is given, or what is known."""
-    from colmap_affrect.recipes import Recipe
+    from colmap_affrect.recipes import Recipe, with_settings
 
     given: dict[str, Any] = _seed(options)
     if options.mapper_options:
-        given["mapper_options"] = dict(text.split("=", 1) for text in options.mapper_options)
+        given["mapper_options"] = flat(with_settings({}, options.mapper_options))
     if options.preset or options.mapper or not known:
         recipe = recipe or Recipe()
         known = recipe.mapper_options(options.preset or "sparse", options.mapper or "")
@@ -150,18 +150,6 @@ def context(options: argparse.Namespace) -> Iterator[Context]:
         discards = is_first and options.overwrite
         with watched(found, follows=not is_first, maps=maps, discards=discards):
             yield found
-
-
-def weight_keys(names: Sequence[str]) -> list[str]:
-    """Return keys of weights: of recipes what they need, of ``aliked`` all of that name."""
-    from colmap_affrect.features.weights import WEIGHT_FILES
-    from colmap_affrect.recipes import load_recipe, recipe_names
-
-    keys: list[str] = []
-    for name in names:
-        alike = [key for key in WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
-        keys += load_recipe(name).weights if name in recipe_names() else alike or [name]
-    return list(dict.fromkeys(keys))
 
 
 def progress(options: argparse.Namespace) -> Progress:

@@ -245,7 +245,7 @@ def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
         ("--refine-existing", "--refine-existing: only with --extend MODEL"),
         ("--camera-params 1,2", "SIMPLE_RADIAL needs 4 values"),
         ("--preset dense", "invalid choice: 'dense'"),
-        ("--mapper-options min_model_size", "min_model_size: expected KEY=VALUE"),
+        ("--mapper-options min_model_size", "min_model_size: expected OPTION=VALUE"),
         ("--mapper-options __import__('os')=1", "pycolmap has no such option"),
     ],
 )
