@@ -10,7 +10,6 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose
-from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.epipolar import (
     EpipolarModel,
@@ -107,28 +106,6 @@ def homography_matrix(geometry: pycolmap.TwoViewGeometry) -> Array | None:
     """Return the (3, 3) homography of a geometry, None where there is none."""
     has_one = geometry.H is not None and np.any(geometry.H)
     return np.asarray(geometry.H, np.float64) if has_one else None
-
-
-def homography_of(
-    geometry: pycolmap.TwoViewGeometry,
-    keypoints: tuple[Floats, Floats],
-    tolerance_px: float,
-    min_off_plane: int,
-) -> Array | None:
-    """Return the homography of a pair whose epipolar geometry is arbitrary or poorly determined.
-
-    That is one of :data:`PLANAR`, or whose homography explains all but fewer than
-    ``min_off_plane`` of its inliers, up to ``tolerance_px`` in image 2.
-    """
-    homography = homography_matrix(geometry)
-    if homography is None:
-        return None
-    first, second = np.asarray(geometry.inlier_matches, np.int64).T
-    places = project(homography, np.asarray(keypoints[0][first, :2], np.float64))
-    errors = np.linalg.norm(places - keypoints[1][second, :2], axis=1)
-    if geometry.config in PLANAR or (errors > tolerance_px).sum() < min_off_plane:
-        return homography
-    return None
 
 
 def significance(

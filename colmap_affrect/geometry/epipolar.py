@@ -5,8 +5,8 @@ A match of two frames must carry the direction of the epipolar line in image 1 t
 ``x2^T F x1 = 0``; shapes are the (N, 2, 2) linear parts of frames, in the same axes.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,12 @@ class EpipolarModel:
         points = self.points[0][rows1], self.points[1][rows2]
         return direction_cosines(self.fundamental, *points, shapes[0][rows1], shapes[1][rows2])
 
+    def scaled(self, first: float, second: float) -> Self:
+        """Return the same in px of images that are smaller by these factors."""
+        matrix = np.diag([second, second, 1.0]) @ self.fundamental @ np.diag([first, first, 1.0])
+        points = self.points[0] / first, self.points[1] / second
+        return replace(self, fundamental=matrix, points=points)
+
 
 @dataclass(frozen=True)
 class HomographyModel:
@@ -93,6 +99,13 @@ class HomographyModel:
         """Return (M,) cosines between what frames carry over and what the geometry does."""
         frames = np.concatenate([shapes[0][rows1], self.points[0][rows1, :, None]], axis=2)
         return turn_cosines(transform_frames(self.matrix, frames)[:, :, :2], shapes[1][rows2])
+
+    def scaled(self, first: float, second: float) -> Self:
+        """Return the same in px of images that are smaller by these factors."""
+        matrix = np.diag([1 / second, 1 / second, 1.0]) @ self.matrix @ np.diag([first, first, 1.0])
+        return replace(
+            self, matrix=matrix, points=(self.points[0] / first, self.points[1] / second)
+        )
 
 
 PairModel = EpipolarModel | HomographyModel

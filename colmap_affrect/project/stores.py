@@ -309,9 +309,7 @@ class GuidedPair:
 
     names: tuple[str, str]  # of the two images, in the order of the columns
     exact: Indices  # (M, 2) inliers before; what adjusts models most accurately
-    candidates: Indices  # (K, 2) the same and guided matches, to verify
-    # of the geometry that was estimated from the candidates and took the place of the one before; 0
-    # where that stayed
+    # of the geometry that took the place of the one before; 0 where that stayed
     num_inliers: int
 
 
@@ -324,7 +322,7 @@ class GuidedStore(GroupStore):
         """Write a batch of pairs, in the place of what is there of them."""
         with self._open("a") as file:
             for pair in pairs:
-                datasets = {"exact": pair.exact, "candidates": pair.candidates}
+                datasets = {"exact": pair.exact}
                 names = np.asarray(pair.names, dtype=h5py.string_dtype())
                 key = pair_key(*pair.names)
                 self._write(file, key, datasets, names=names, num_inliers=pair.num_inliers)
@@ -338,7 +336,6 @@ class GuidedStore(GroupStore):
                 GuidedPair(
                     (str(first), str(second)),
                     checked(group, "exact"),
-                    checked(group, "candidates"),
                     int(group.attrs["num_inliers"]),
                 )
                 for _, group in sorted(complete_groups(file), key=lambda item: item[0])

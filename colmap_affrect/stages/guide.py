@@ -8,24 +8,27 @@ to be told from it. The raw matches stay as they are, as with COLMAP's own guide
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.two_views import CALIBRATED, pair_model
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.geometry.arrays import Indices, rows_in
-from colmap_affrect.matchers.guided import GuidedOptions
+from colmap_affrect.geometry.epipolar import PairModel
+from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import GuidedPair
+from colmap_affrect.project.stores import FeatureStore, GuidedPair
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalation_graph import weakly_connected_images
 from colmap_affrect.stages.match import PAIRS_PER_WRITE
-from colmap_affrect.stages.one_guided_pair import GuidedMatcher, GuidedTask, guided_task
+from colmap_affrect.stages.one_pair import ImageCache
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (
     extracted_px,
@@ -33,8 +36,8 @@ from colmap_affrect.stages.verify import (
     verify_new,
 )
 
-Matches = Indices
 MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
+NOTHING: Indices = np.zeros((0, 2), np.int64)
 IMAGES_IN_MEMORY = 40  # of 13,000 features; pairs come in an order that reads these seldom
 
 
@@ -82,13 +85,13 @@ def restore_exact(context: Context) -> None:
     context.guided.write([replace(pair, num_inliers=0) for pair in guided])
 
 
-def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, Matches]:
+def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, Indices]:
     """Return the inliers of each verified pair without the matches of :func:`current` ones."""
     exact = {pair.names: pair.exact for pair in guided if pair.num_inliers}
     return {**verified_inliers(context), **exact}
 
 
-def guided_matches(context: Context) -> dict[tuple[int, int], Matches]:
+def inliers_by_guiding(context: Context) -> dict[tuple[int, int], Indices]:
     """Return the inliers, by image ids, that only guided matching has found."""
     guided = _gained(context)
     if not guided:
@@ -125,7 +128,7 @@ def _gained(context: Context) -> list[GuidedPair]:
     return [pair for pair in current(context) if pair.num_inliers]
 
 
-def weak_images(exact: Mapping[Pair, Matches], min_num_tracks: int) -> set[str]:
+def weak_images(exact: Mapping[Pair, Indices], min_num_tracks: int) -> set[str]:
     """Return the images with few features in tracks through three images, where there are three."""
     num_images = len({name for pair in exact for name in pair})
     return weakly_connected_images(exact, min_num_tracks) if num_images > 2 else set()
@@ -143,6 +146,37 @@ def guided_counts(context: Context) -> dict[str, int]:
     }
 
 
+@dataclass(frozen=True)
+class GuidedTask:
+    """A verified pair to match again; of its images the one with the lower id comes first."""
+
+    names: Pair  # of the two images
+    model: PairModel  # its geometry, and all keypoints
+    inliers: Indices  # (M, 2) of the geometry
+    is_calibrated: bool  # the focal lengths of its cameras agree with the geometry
+
+    def __str__(self) -> str:
+        return " and ".join(self.names)
+
+
+class GuidedMatcher:
+    """Matches pairs again, with the descriptors that it keeps of some images."""
+
+    def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
+        self._store, self._options = store, options
+        self._descriptors = ImageCache(
+            lambda name: store.read(name).descriptors, lambda found: found.nbytes
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return GuidedMatcher, (self._store, self._options)
+
+    def __call__(self, task: GuidedTask) -> Indices:
+        """Return the (K, 2) inliers of a pair and its guided matches."""
+        first, second = map(self._descriptors.get, task.names)
+        return guided_matches((first, second), task.model, task.inliers, self._options)
+
+
 class Guiding:
     """Guides the pairs of a workspace, with the options on record."""
 
@@ -152,6 +186,7 @@ class Guiding:
         self.ids = colmap_database.image_ids(self.path)
         max_size_px = context.extraction.max_image_size_px
         sizes = context.features.image_sizes()
+        # Bands are as wide as features are exact: in pixels of the images as they were extracted.
         self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
         self.verifier = PairVerifier(self.path, context.verification, extracted_px(context))
 
@@ -169,10 +204,7 @@ class Guiding:
         return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
 
     def guide(self, pairs: Sequence[Pair], advance: Callable[[int], None]) -> None:
-        """Match verified pairs again, batch by batch, and keep what has more inliers.
-
-        Of each pair the image with the lower id comes first.
-        """
+        """Match verified pairs again, batch by batch, and keep what has more inliers."""
         if not pairs:
             return
         features = self.context.features
@@ -181,73 +213,66 @@ class Guiding:
         stationary = StationaryFilter(features, self.context.matches)
         ordered = ordered_for_reuse(pairs, IMAGES_IN_MEMORY)
         for begin in range(0, len(ordered), PAIRS_PER_WRITE):
-            batch = ordered[begin : begin + PAIRS_PER_WRITE]
-            found = []
-            for pair in executor.map(matcher, self._tasks(batch), [features.path]):
-                left = stationary.left(pair.names, pair.candidates)
-                found.append(replace(pair, candidates=pair.candidates[left]))
+            batch, found = ordered[begin : begin + PAIRS_PER_WRITE], []
+            tasks = self._tasks(batch)
+            for task, both in zip(
+                tasks, executor.map(matcher, tasks, [features.path]), strict=True
+            ):
+                found.append((task, both[stationary.left(task.names, both)]))
                 advance(1)
+            untold = set(batch) - {task.names for task in tasks}
+            self.context.guided.write(GuidedPair(names, NOTHING, 0) for names in sorted(untold))
+            advance(len(untold))
             self._keep(found)
 
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
+        """Return what is to be done for the pairs whose geometry says where matches may be."""
         tasks = []
         with colmap_database.open_database(self.path) as database:
             cameras = colmap_database.cameras_of_images(database)
             for names in pairs:
                 first, second = (self.ids[name] for name in names)
-                task = guided_task(
-                    names,
-                    (cameras[first], cameras[second]),
-                    (database.read_keypoints(first), database.read_keypoints(second)),
-                    (self.scales[names[0]], self.scales[names[1]]),
-                    database.read_two_view_geometry(first, second),
-                    self.options.band_px,
-                )
-                tasks.append(task)
-        return [task for task in tasks if task]
+                keypoints = database.read_keypoints(first), database.read_keypoints(second)
+                geometry = database.read_two_view_geometry(first, second)
+                model = pair_model(geometry, (cameras[first], cameras[second]), keypoints)
+                if model:
+                    inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+                    scaled = model.scaled(self.scales[names[0]], self.scales[names[1]])
+                    tasks.append(GuidedTask(names, scaled, inliers, geometry.config == CALIBRATED))
+        return tasks
 
-    def _keep(self, found: Sequence[GuidedPair]) -> None:
+    def _keep(self, found: Sequence[tuple[GuidedTask, Indices]]) -> None:
         """Put better geometries into the database, and all pairs on record before that."""
-        geometries, configs = {}, self._configs([pair.names for pair in found])
-        for pair in found:
-            if len(pair.candidates) > len(pair.exact):
-                first, second = (self.context.features.read_frames(name) for name in pair.names)
-                geometry = self.verifier.geometry(pair.names, (first, second), pair.candidates)
-                if _is_better(geometry, pair, configs.get(pair.names)):
-                    geometries[pair.names] = geometry
+        geometries = {}
+        for task, matches in found:
+            if len(matches) > len(task.inliers):
+                frames1, frames2 = map(self.context.features.read_frames, task.names)
+                geometry = self.verifier.geometry(task.names, (frames1, frames2), matches)
+                if _is_better(geometry, task):
+                    geometries[task.names] = geometry
         counts = {names: len(geometry.inlier_matches) for names, geometry in geometries.items()}
         self.context.guided.write(
-            replace(pair, num_inliers=counts.get(pair.names, 0)) for pair in found
+            GuidedPair(task.names, task.inliers, counts.get(task.names, 0)) for task, _ in found
         )
-        self._write_geometries(geometries)
+        self._write(geometries)
 
-    def _configs(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
-        """Return what kind of geometry the database has of each pair."""
-        ids = {pair: (self.ids[pair[0]], self.ids[pair[1]]) for pair in pairs}
+    def _write(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
         with colmap_database.open_database(self.path) as database:
-            return {
-                pair: database.read_two_view_geometry(*ids[pair]).config
-                for pair in pairs
-                if database.exists_two_view_geometry(*ids[pair])
-            }
-
-    def _write_geometries(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
-        with colmap_database.open_database(self.path) as database:
-            for pair, geometry in geometries.items():
-                first, second = (self.ids[name] for name in pair)
+            for names, geometry in geometries.items():
+                first, second = (self.ids[name] for name in names)
                 database.update_two_view_geometry(first, second, geometry)
 
 
-def _is_better(geometry: pycolmap.TwoViewGeometry, pair: GuidedPair, before: int | None) -> bool:
+def _is_better(geometry: pycolmap.TwoViewGeometry, task: GuidedTask) -> bool:
     """Tell whether a geometry has more inliers, and is still that of the exact matches.
 
     Where structure repeats, guided matches may outvote them: exact inliers then fall out, or the
     cameras, whose focal lengths the geometry agreed with, do not fit any more.
     """
-    if len(geometry.inlier_matches) <= len(pair.exact):
+    if len(geometry.inlier_matches) <= len(task.inliers):
         return False
-    configs = pycolmap.TwoViewGeometryConfiguration
-    if before == configs.CALIBRATED and geometry.config == configs.UNCALIBRATED:
+    uncalibrated = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+    if task.is_calibrated and geometry.config == uncalibrated:
         return False
-    kept = rows_in(pair.exact, np.asarray(geometry.inlier_matches, np.int64))
-    return bool(kept.sum() >= MIN_SHARE_KEPT * len(pair.exact))
+    kept = rows_in(task.inliers, np.asarray(geometry.inlier_matches, np.int64))
+    return bool(kept.sum() >= MIN_SHARE_KEPT * len(task.inliers))

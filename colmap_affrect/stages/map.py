@@ -25,7 +25,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import measured_inliers
-from colmap_affrect.stages.guide import guided_matches
+from colmap_affrect.stages.guide import inliers_by_guiding
 from colmap_affrect.stages.pairs import listed_pairs
 
 logger = logging.getLogger(__name__)
@@ -97,7 +97,7 @@ def _task(context: Context, existing: ExistingModel | None, may_share: bool | No
         workspace.database,
         image_path_of(workspace),
         existing,
-        guided={} if copied else guided_matches(context),
+        guided={} if copied else inliers_by_guiding(context),
         measured={} if copied else measured_inliers(context),
         cameras=read_camera_records(workspace.cameras),
         may_share=_may_share(context) if may_share is None else may_share,

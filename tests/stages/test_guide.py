@@ -29,7 +29,7 @@ from colmap_affrect.stages.guide import (
     exact_inliers,
     guide,
     guided_counts,
-    guided_matches,
+    inliers_by_guiding,
     restore_exact,
 )
 from colmap_affrect.stages.inputs import Inputs
@@ -157,7 +157,7 @@ def test_killed_before_the_geometries_are_written_it_goes_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(stage, "PAIRS_PER_WRITE", 4)
-    monkeypatch.setattr(stage.Guiding, "_write_geometries", killed)
+    monkeypatch.setattr(stage.Guiding, "_write", killed)
     with pytest.raises(KeyboardInterrupt):
         guide(context, ALWAYS)
     monkeypatch.undo()
@@ -188,7 +188,7 @@ def test_overwrite_undoes_and_guides_again(guided: Context) -> None:
     assert guided_counts(guided) == {}
 
 
-def test_verification_over_again_forgets_guided_matches(
+def test_verification_over_again_forgets_inliers_by_guiding(
     before: Workspace, context: Context
 ) -> None:
     guide(context, ALWAYS)
@@ -215,10 +215,10 @@ def mapper() -> object:
 def test_guided_matches_are_the_inliers_that_came_by_guiding(
     context: Context, guided: Context
 ) -> None:
-    assert guided_matches(context) == {}
+    assert inliers_by_guiding(context) == {}
     ids = image_ids(guided.workspace.database)
     exact, verified = exact_inliers(guided, current(guided)), verified_inliers(guided)
-    found = guided_matches(guided)
+    found = inliers_by_guiding(guided)
     assert len(found) == guided_counts(guided)["pairs"]
     for pair, inliers in verified.items():
         new = {*map(tuple, inliers.tolist())} - {*map(tuple, exact[pair].tolist())}
