@@ -23,15 +23,6 @@ def run_cancellable(
     """
     return_freed_memory()
     known = token or pycolmap.CancellationToken()
-    return _run(lambda: call(known), known.cancel)
-
-
-def run_leavable(call: Callable[[], Result]) -> Result:
-    """Run ``call``, which cannot be cancelled, in a thread that Ctrl-C leaves."""
-    return _run(call, lambda: None)
-
-
-def _run(call: Callable[[], Result], cancel: Callable[[], object]) -> Result:
     outcome: Future[Result] = Future()
     # Not Thread.join: interrupted in Python 3.11, it takes the running thread for ended, and
     # the interpreter then ends under pycolmap's feet (bpo-45274).
@@ -39,7 +30,7 @@ def _run(call: Callable[[], Result], cancel: Callable[[], object]) -> Result:
 
     def work() -> None:
         try:
-            outcome.set_result(call())
+            outcome.set_result(call(known))
         except BaseException as error:  # noqa: BLE001  (raised again by the waiting thread)
             outcome.set_exception(error)
         finally:
@@ -50,7 +41,7 @@ def _run(call: Callable[[], Result], cancel: Callable[[], object]) -> Result:
         while not ended.wait(POLL_S):
             pass
     except KeyboardInterrupt:
-        cancel()
+        known.cancel()
         ended.wait(LEAVE_AFTER_S)
         raise
     return outcome.result()

@@ -42,19 +42,6 @@ def refuse_newer(path: Path) -> int:
     return version
 
 
-def copy_as_it_is(source: Path, target: Path) -> None:
-    """Copy a database as it is now, including its write-ahead log, with the schema that it has.
-
-    DatabaseError unless it is an intact one of a COLMAP that is not newer than pycolmap.
-    """
-    refuse_newer(source)
-    try:
-        with open_read_only(source) as original, closing(sqlite3.connect(target)) as copy:
-            original.backup(copy)
-    except DAMAGED as error:
-        raise DatabaseError(f"cannot copy {source} to {target}: {error}") from error
-
-
 Change = Callable[[pycolmap.Database], None]
 
 
@@ -64,9 +51,9 @@ def copy_database(
     """Copy a database as it is now, including its write-ahead log.
 
     The copy, which appears as a whole, has the schema of the installed pycolmap, and what
-    ``change`` does to it. COLMAP leaves positions of before 3.10 behind. Raises DatabaseError,
-    beside :func:`copy_as_it_is`, when the target exists, and for ``refused`` kinds of problems:
-    databases of anybody are checked before COLMAP sees the copy.
+    ``change`` does to it. COLMAP leaves positions of before 3.10 behind. DatabaseError when the
+    target exists, for what is no intact database or one of a newer COLMAP, and for ``refused``
+    kinds of problems: databases of anybody are checked before COLMAP sees the copy.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
@@ -75,7 +62,12 @@ def copy_database(
     new = target.with_name(target.name + ".new")
     remove_database(new)
     try:
-        copy_as_it_is(source, new)
+        refuse_newer(source)
+        try:
+            with open_read_only(source) as original, closing(sqlite3.connect(new)) as copy:
+                original.backup(copy)
+        except DAMAGED as error:
+            raise DatabaseError(f"cannot copy {source} to {target}: {error}") from error
         with open_database(new) as database:  # COLMAP migrates it
             if change:
                 change(database)

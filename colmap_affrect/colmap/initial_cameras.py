@@ -25,7 +25,7 @@ from colmap_affrect.colmap.cameras import (
     read_given_cameras,
     write_camera_records,
 )
-from colmap_affrect.colmap.cancellable import run_leavable
+from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import (
     camera_matrix,
     cameras_of_images,
@@ -45,7 +45,7 @@ from colmap_affrect.images.exif import (
 )
 from colmap_affrect.images.headers import is_too_large
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.project.outputs import remove_database
+from colmap_affrect.project.outputs import remove_database, temporary_folder
 
 MAX_LINES = 5  # that are logged; report.json says all
 
@@ -243,22 +243,22 @@ def import_images(
     whose size is not that of their camera.
     """
     initial = InitialCameras(image_path, options)
-    new = path if path.exists() else path.with_name(path.name + ".new")
-    read = path.with_name(path.name + ".read")
-    for file in {path, new, read} if new != path else {read}:
-        remove_database(file)
-    missing = sorted(set(names) - set(image_ids(new)))
-    missing = [name for name in missing if not is_too_large(initial.size(name))]
-    if missing:
-        require_database_space(new, 2 * len(missing))
-        image_ids(read)  # makes it
-        mode = pycolmap.CameraMode.PER_IMAGE
-        run_leavable(lambda: pycolmap.import_images(read, image_path, mode, missing))
-        with open_database(read) as found, open_database(new) as database:
-            _take_over(initial, found, database)
-        remove_database(read)
-    if new != path:
-        new.replace(path)
+    is_new = not path.exists()
+    if is_new:
+        remove_database(path)  # what is beside it, of one that was removed
+    with temporary_folder(path.parent) as folder:
+        new, read = folder / "new.db" if is_new else path, folder / "read.db"
+        missing = sorted(set(names) - set(image_ids(new)))
+        missing = [name for name in missing if not is_too_large(initial.size(name))]
+        if missing:
+            require_database_space(new, 2 * len(missing))
+            image_ids(read)  # makes it
+            mode = pycolmap.CameraMode.PER_IMAGE
+            run_cancellable(lambda _: pycolmap.import_images(read, image_path, mode, missing))
+            with open_database(read) as found, open_database(new) as database:
+                _take_over(initial, found, database)
+        if is_new:
+            new.replace(path)
     return sorted(set(names) - set(image_ids(path)))
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -28,7 +29,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 T = TypeVar("T", int, str)
 
-PAIRS_PER_WRITE = 200  # a killed run loses at most as many
+PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
 
@@ -210,30 +211,17 @@ def verify(
             size_px = of_pair(extracted_px, ids)
             return ids, estimate_geometry(sides, matches, options, size_px)
 
-        done: list[_Done] = []
         tasks = (
             ((one, two), (side(one), side(two)), database.read_matches(one, two))
             for one, two in map(tuple, todo)
         )
-        try:
-            for item in map_ordered(estimate, tasks, available_cores()):
-                done.append(item)
-                if len(done) == PAIRS_PER_WRITE:
-                    _write(database, done, advance)
-        finally:
-            _write(database, done, advance)
-
-
-def _write(
-    database: pycolmap.Database, done: list[_Done], advance: Callable[[int], None] | None
-) -> None:
-    with pycolmap.DatabaseTransaction(database):
-        for ids, geometry in done:
-            database.write_two_view_geometry(*ids, geometry)
-    count = len(done)
-    done.clear()  # before advance, which may raise
-    if advance:
-        advance(count)
+        found = map_ordered(estimate, tasks, available_cores())
+        while batch := list(islice(found, PAIRS_PER_WRITE)):
+            with pycolmap.DatabaseTransaction(database):
+                for ids, geometry in batch:
+                    database.write_two_view_geometry(*ids, geometry)
+            if advance:
+                advance(len(batch))
 
 
 class PairVerifier:

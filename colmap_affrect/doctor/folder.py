@@ -49,9 +49,9 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         )  # fmt: skip
     diagnosis.checked.append(f"{path}: {tables.summary()}")
     for kind in sorted(problems, key=list(CHECKS).index):
-        severity, what, usual = CHECKS[kind]
+        what, usual = CHECKS[kind]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
-        diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
+        diagnosis.add("error", path, f"{what}{items}", advice or usual.format(path=quoted))
     return True
 
 

@@ -192,6 +192,7 @@ def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
         last = database.read_keypoints(4)
     with monkeypatch.context() as patched:
         patched.setattr("colmap_affrect.colmap.verification.estimate_geometry", interrupted)
+        patched.setattr("colmap_affrect.colmap.verification.PAIRS_PER_WRITE", 1)
         with pytest.raises(KeyboardInterrupt):
             verify(path, options)
     assert unverified_pairs(path).tolist() == [[3, 4]]
