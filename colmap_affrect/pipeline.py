@@ -122,10 +122,8 @@ def run(
     mapper = MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    count, num_pairs = len(names), expected_num_pairs(options.pairs, len(names))
-    units = {"extract": count, "match": num_pairs, "verify": num_pairs}
-    units["map"] = count + count**2 // 50  # adjustments grow with the model
-    shown = progress.with_forecast(Forecast(units))
+    num_pairs = expected_num_pairs(options.pairs, len(names))
+    shown = progress.with_forecast(Forecast(len(names), num_pairs))
     context = Context(Workspace(output_path), options.resources, executor, shown)
     if options.extend:
         if overwrite:

@@ -2,7 +2,7 @@
 
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from typing import Self, TextIO
@@ -24,9 +24,11 @@ class Forecast:
     """What is left of a row of stages: the one that runs is measured, others guessed from it."""
 
     def __init__(
-        self, units: Mapping[str, int], clock: Callable[[], float] = time.monotonic
+        self, num_images: int, num_pairs: int, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Take the images or pairs of each stage in :data:`COSTS`."""
+        """Take what is ahead if all images are new."""
+        units = {"extract": num_images, "match": num_pairs, "verify": num_pairs}
+        units["map"] = num_images + num_images**2 // 50  # adjustments grow with the model
         self._costs = {name: COSTS[name] * count for name, count in units.items()}  # ahead
         self._cost = self._start_s = 0.0  # of the stage that runs
         self._clock = clock

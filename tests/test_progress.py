@@ -39,16 +39,17 @@ def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent
 
 def test_forecast_measures_what_has_begun_and_guesses_the_rest_from_it() -> None:
     now_s, lines = 0.0, io.StringIO()
-    forecast = Forecast({"extract": 20, "match": 190, "map": 20}, clock=lambda: now_s)
+    forecast = Forecast(20, 190, clock=lambda: now_s)
     with Progress(lines).with_forecast(forecast).stage("extract", 20, "images") as advance:
         for _ in range(20):
             now_s += 60.0
             advance(1)
-    minutes = 10 + 190 * COSTS["match"] + 20 * COSTS["map"]
+    minutes = 10 + 190 * (COSTS["match"] + COSTS["verify"]) + 28 * COSTS["map"]
     assert lines.getvalue().splitlines()[4] == (
-        f"extract: 10/20 images, whole run: about {minutes:.0f} min left"
+        f"extract: 10/20 images, whole run: about {minutes / 60:.1f} h left"
     )
     forecast.begin("match", 190)
+    forecast.begin("verify", 190)
     forecast.begin("map", 20)
     now_s += 600.0
     assert forecast.text(0.5) == ""

@@ -1,29 +1,49 @@
 """What each command does with its options: one library function and its result printed.
 
-Every command takes the parsed options; what is wrong it raises. Modules are imported when a command
-needs them.
+Every command takes the parsed options, and raises what is wrong. This is imported when a command
+runs: ``--help`` loads no heavy package.
 """
-
-from __future__ import annotations
 
 import argparse
 import shlex
 import sys
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
+from colmap_affrect import doctor as examination
+from colmap_affrect import pipeline
 from colmap_affrect.cli import given
+from colmap_affrect.colmap import old_databases
+from colmap_affrect.comparison import compare as comparing
+from colmap_affrect.comparison import tables
+from colmap_affrect.comparison.method_run import CompareOptions
+from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.errors import ComparisonError, ImageError, NoModelError, OptionError, such_as
+from colmap_affrect.evaluation import evaluate as evaluating
+from colmap_affrect.evaluation.truths import ScoreOptions
+from colmap_affrect.features import weights as files
+from colmap_affrect.images.conversion import convert_images
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs
+from colmap_affrect.interop import align as aligning
+from colmap_affrect.interop import export as exporting
+from colmap_affrect.interop import hdf5
+from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.options import described_toml
 from colmap_affrect.progress import SILENT, Progress, show
+from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
-
-if TYPE_CHECKING:
-    from colmap_affrect.project.report import ReconstructionReport
+from colmap_affrect.recipes import load_recipe, recipe_names, with_settings
+from colmap_affrect.report.inspection import inspect_image
+from colmap_affrect.stages.escalate import escalate as escalate_pairs
+from colmap_affrect.stages.extract import extract as extract_features
+from colmap_affrect.stages.extract import write_descriptors
+from colmap_affrect.stages.guide import guide as guide_pairs
+from colmap_affrect.stages.match import match as match_pairs
+from colmap_affrect.stages.one_image import prepare
+from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.verify import verify_matches
 
 
 def run(options: argparse.Namespace) -> None:
-    from colmap_affrect import pipeline
-
     recipe = given.recipe(options)
     run_options = pipeline.RunOptions(
         recipe=recipe,
@@ -45,56 +65,42 @@ def run(options: argparse.Namespace) -> None:
 
 
 def extract(options: argparse.Namespace) -> None:
-    from colmap_affrect.pipeline import InputOptions
-    from colmap_affrect.stages import extract as stage
-
-    inputs = InputOptions(**given.inputs(options)).inputs(options.image_path)
+    inputs = pipeline.InputOptions(**given.inputs(options)).inputs(options.image_path)
     with given.context(options) as context:
-        report = stage.extract(context, inputs, given.recipe(options), overwrite=options.overwrite)
+        report = extract_features(
+            context, inputs, given.recipe(options), overwrite=options.overwrite
+        )
         if options.database_descriptors:
-            stage.write_descriptors(context)
+            write_descriptors(context)
         show(report.summary())
     _refuse_failures(report.failures, options)
 
 
 def stage(options: argparse.Namespace) -> None:
     """Run one stage, with the options on record and those that are given in their place."""
-    from colmap_affrect.stages.escalate import escalate
-    from colmap_affrect.stages.guide import guide
-    from colmap_affrect.stages.match import match as match_pairs
-    from colmap_affrect.stages.pairs import choose_pairs
-    from colmap_affrect.stages.verify import verify_matches
-
     how = {"overwrite": options.overwrite}
-    with given.context(options) as context:
+    with given.context(options) as at:
         match options.command:
             case "pairs":
-                report = choose_pairs(context, given.over(context.pairing, options, "pairs"), **how)
+                report = choose_pairs(at, given.over(at.pairing, options, "pairs"), **how)
             case "match":
-                report = match_pairs(
-                    context, given.changed(context.matching, options, "matching"), **how
-                )
+                report = match_pairs(at, given.changed(at.matching, options, "matching"), **how)
             case "verify":
-                report = verify_matches(
-                    context, given.verification(options, context.verification), **how
-                )
+                report = verify_matches(at, given.verification(options, at.verification), **how)
             case "escalate":
-                report = escalate(
-                    context, given.changed(context.escalation, options, "escalate"), **how
+                report = escalate_pairs(
+                    at, given.changed(at.escalation, options, "escalate"), **how
                 )
             case _:
-                report = guide(context, given.changed(context.guiding, options, "guided"), **how)
+                report = guide_pairs(at, given.changed(at.guiding, options, "guided"), **how)
         show(report.summary())
 
 
 def map(options: argparse.Namespace) -> None:
-    from colmap_affrect.mappers.base import MAPPERS
-    from colmap_affrect.pipeline import map_and_report, map_from_database
-
     extend = given.extension(options)
     how = {"overwrite": options.overwrite, "page": options.page}
     if options.from_database:
-        report = map_from_database(
+        report = pipeline.map_from_database(
             options.from_database,
             options.output_path,
             image_path=options.image_path,
@@ -109,18 +115,13 @@ def map(options: argparse.Namespace) -> None:
     else:
         with given.context(options) as context:
             mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
-            report = map_and_report(context, mapper, extend, **how)
+            report = pipeline.map_and_report(context, mapper, extend, **how)
     _print_reconstruction(report, options)
 
 
 def compare(options: argparse.Namespace) -> None:
-    from colmap_affrect.comparison.compare import compare
-    from colmap_affrect.comparison.method_run import CompareOptions
-    from colmap_affrect.comparison.methods import parse_methods
-    from colmap_affrect.comparison.tables import summary, to_json
-
     methods = options.methods and parse_methods(options.methods, given.depth_settings(options))
-    comparison = compare(
+    comparison = comparing.compare(
         options.image_path,
         options.output_path,
         CompareOptions(
@@ -132,7 +133,7 @@ def compare(options: argparse.Namespace) -> None:
         overwrite=options.overwrite,
         progress=SILENT if options.quiet else Progress(sys.stderr, num_plain_lines=1),
     )
-    show(to_json(comparison) if options.json else summary(comparison))
+    show(tables.to_json(comparison) if options.json else tables.summary(comparison))
     if not options.json:
         show(f"\npictures: {options.output_path / 'report.html'}")
     failed = [method.name for method in comparison.methods if method.failed]
@@ -145,17 +146,12 @@ def compare(options: argparse.Namespace) -> None:
 
 
 def evaluate(options: argparse.Namespace) -> None:
-    from colmap_affrect.comparison.methods import parse_methods
-    from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
-    from colmap_affrect.evaluation.truths import ScoreOptions
-    from colmap_affrect.recipes import with_settings
-
     scores = with_settings({}, options.protocol_options)
-    evaluation = evaluate(
+    evaluation = evaluating.evaluate(
         options.protocol,
         options.dataset_path,
         options.output_path,
-        EvaluateOptions(
+        evaluating.EvaluateOptions(
             recipes=parse_methods(options.recipes, given.depth_settings(options)),
             max_num_keypoints=options.max_num_keypoints,
             random_seed=options.random_seed or 0,
@@ -172,10 +168,7 @@ def evaluate(options: argparse.Namespace) -> None:
 
 
 def import_h5(options: argparse.Namespace) -> None:
-    from colmap_affrect.images.photographs import CameraOptions
-    from colmap_affrect.interop.hdf5 import import_h5
-
-    report = import_h5(
+    report = hdf5.import_h5(
         options.image_path,
         options.features_path,
         options.matches_path,
@@ -189,9 +182,7 @@ def import_h5(options: argparse.Namespace) -> None:
 
 
 def export_h5(options: argparse.Namespace) -> None:
-    from colmap_affrect.interop.hdf5 import export_h5
-
-    report = export_h5(
+    report = hdf5.export_h5(
         options.database_path,
         options.features_path,
         options.matches_path,
@@ -201,22 +192,18 @@ def export_h5(options: argparse.Namespace) -> None:
 
 
 def export_database(options: argparse.Namespace) -> None:
-    from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
-
     path = Workspace(options.path).database if options.path.is_dir() else options.path
-    export_database(path, options.database_path)
+    old_databases.export_database(path, options.database_path)
     show(
         f"{options.database_path}: for COLMAP {options.colmap} to 3.13\n"
         "then, for few photographs (the folder of models must be there): colmap mapper "
         f"--database_path {options.database_path} --image_path PHOTOS --output_path MODELS "
-        f"{MAPPER_OPTIONS}"
+        f"{old_databases.MAPPER_OPTIONS}"
     )
 
 
 def export(options: argparse.Namespace) -> None:
-    from colmap_affrect.interop.export import export
-
-    written = export(
+    written = exporting.export(
         options.model_path, options.target_path, options.format, image_path=options.image_path
     )
     for name, path in written.items():
@@ -224,22 +211,18 @@ def export(options: argparse.Namespace) -> None:
 
 
 def align(options: argparse.Namespace) -> None:
-    from colmap_affrect.interop.align import Reference, align
-
-    reference = Reference(
+    reference = aligning.Reference(
         gps_database=options.gps,
         positions_path=options.positions,
         points_path=options.points,
         distances=tuple(options.distance),
     )
-    show(align(options.model_path, options.target_path, reference).summary())
+    show(aligning.align(options.model_path, options.target_path, reference).summary())
     show(f"model       {options.target_path}")
 
 
 def doctor(options: argparse.Namespace) -> int | None:
-    from colmap_affrect.doctor import diagnose
-
-    diagnosis = diagnose(options.path, weights_path=options.weights)
+    diagnosis = examination.diagnose(options.path, weights_path=options.weights)
     show(diagnosis.to_json() if options.json else diagnosis.summary())
     return 1 if diagnosis.num_errors else None
 
@@ -284,10 +267,6 @@ def _refuse_failures(failures: Iterable[str], options: argparse.Namespace) -> No
 
 
 def inspect(options: argparse.Namespace) -> None:
-    from colmap_affrect.images.photographs import MaskOptions, Photographs
-    from colmap_affrect.report.inspection import inspect_image
-    from colmap_affrect.stages.one_image import prepare
-
     recipe = given.recipe(options)
     if not options.image.is_file():
         raise OptionError(f"{options.image}: no such file; give a photograph")
@@ -299,8 +278,6 @@ def inspect(options: argparse.Namespace) -> None:
 
 
 def convert(options: argparse.Namespace) -> None:
-    from colmap_affrect.images.conversion import convert_images
-
     report = convert_images(options.image_path, options.target_path, given.progress(options))
     show(report.summary())
     if report.failures:
@@ -309,9 +286,6 @@ def convert(options: argparse.Namespace) -> None:
 
 
 def recipes(options: argparse.Namespace) -> None:
-    from colmap_affrect.options import described_toml
-    from colmap_affrect.recipes import load_recipe, recipe_names
-
     if options.name:
         show(described_toml(load_recipe(options.name)), end="")
         return
@@ -324,19 +298,9 @@ def recipes(options: argparse.Namespace) -> None:
 
 
 def weights(options: argparse.Namespace) -> None:
-    from colmap_affrect.features.weights import (
-        WEIGHT_FILES,
-        fetch,
-        find,
-        install_hint,
-        is_published,
-        remedy,
-    )
-    from colmap_affrect.recipes import load_recipe, recipe_names
-
     keys: list[str] = []
     for name in options.keys:  # of a recipe what it needs, of aliked all of that name
-        alike = [key for key in WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
+        alike = [key for key in files.WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
         keys += load_recipe(name).weights if name in recipe_names() else alike or [name]
     keys = list(dict.fromkeys(keys))
     if options.keys and not keys:
@@ -344,16 +308,16 @@ def weights(options: argparse.Namespace) -> None:
         return
     if options.action == "fetch":
         keys = keys or ["affnet", "orinet", "hardnet"]
-        for fetched in fetch(keys, options.weights, progress=given.progress(options)).values():
-            show(fetched)
+        fetched = files.fetch(keys, options.weights, progress=given.progress(options))
+        show("\n".join(str(path) for path in fetched.values()))
         return
     folder = given.folder("--weights", options.weights)
-    for key in keys or WEIGHT_FILES:
-        path, file = find(key, folder), WEIGHT_FILES[key]
+    for key in keys or files.WEIGHT_FILES:
+        path, file = files.find(key, folder), files.WEIGHT_FILES[key]
         if not path:
-            where = f"not found: {install_hint([file])}colmap-affrect weights fetch {key}"
-        elif is_published(key, path) is False:
-            where = f"{path}, NOT the published file: unless it is your own, {remedy(path)}"
+            where = f"not found: {files.install_hint([file])}colmap-affrect weights fetch {key}"
+        elif files.is_published(key, path) is False:
+            where = f"{path}, NOT the published file: unless it is your own, {files.remedy(path)}"
         else:
             where = str(path)
         show(f"{key:32s} {file.used_for}, {file.file_name}\n    {where}")

@@ -1,27 +1,26 @@
 """What the flags of a command mean to the library; stages take the rest from the record."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import OptionError
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.mappers.base import MapperOptions
+from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.options import Options, flat
+from colmap_affrect.pairs.base import PairOptions
+from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.workspace import Workspace
-
-if TYPE_CHECKING:
-    from colmap_affrect.colmap.verification import VerificationOptions
-    from colmap_affrect.mappers.base import MapperOptions
-    from colmap_affrect.mappers.existing import Extension
-    from colmap_affrect.parallel.executor import Executor
-    from colmap_affrect.recipes import Recipe
-    from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.recipes import Recipe, load_recipe, with_settings
+from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.stages.mend import watched
 
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 
@@ -38,9 +37,6 @@ def over(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOpt
 
 def inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[str, Any]:
     """Return the fields of InputOptions."""
-    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
-    from colmap_affrect.pairs.base import PairOptions
-
     return {
         "cameras": over(CameraOptions(), options, "cameras"),
         "masks": over(MaskOptions(), options, "masks"),
@@ -54,16 +50,12 @@ def inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[st
 
 
 def extension(options: argparse.Namespace) -> Extension | None:
-    from colmap_affrect.mappers.existing import Extension
-
     if options.refine_existing and not options.extend:
         raise OptionError("--refine-existing: only with --extend MODEL")
     return Extension(options.extend, bool(options.refine_existing)) if options.extend else None
 
 
 def recipe(options: argparse.Namespace) -> Recipe:
-    from colmap_affrect.recipes import load_recipe
-
     return load_recipe(options.recipe or "default", [*options.set, *depth_settings(options)])
 
 
@@ -75,8 +67,6 @@ def depth_settings(options: argparse.Namespace) -> list[str]:
 
 def changed(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOptions:
     """Return a section of the recipe with what --set changes of it."""
-    from colmap_affrect.recipes import Recipe, with_settings
-
     values = with_settings({section: known.to_mapping()}, options.set)
     if len(values) > 1:
         raise OptionError(f"--set: only options of {section} can be changed here")
@@ -88,8 +78,6 @@ def verification(
     options: argparse.Namespace, known: VerificationOptions | None = None
 ) -> VerificationOptions:
     """Return the preset that is given, or what is known."""
-    from colmap_affrect.colmap.verification import VerificationOptions
-
     if options.preset or not known:
         known = VerificationOptions.preset(options.preset or "sparse")
     return known.changed(**_seed(options))
@@ -101,8 +89,6 @@ def mapping(
     known: MapperOptions | None = None,
 ) -> MapperOptions:
     """Return the mapper that is given, or what is known."""
-    from colmap_affrect.recipes import Recipe, with_settings
-
     given: dict[str, Any] = _seed(options)
     if options.mapper_options:
         given["mapper_options"] = flat(with_settings({}, options.mapper_options))
@@ -117,8 +103,6 @@ def _seed(options: argparse.Namespace) -> dict[str, int]:
 
 
 def resources(options: argparse.Namespace) -> Resources:
-    from colmap_affrect.stages.context import Resources
-
     return Resources(folder("--weights", options.weights), options.device or "auto")
 
 
@@ -141,9 +125,6 @@ def executor(options: argparse.Namespace) -> AbstractContextManager[Executor | N
 @contextmanager
 def context(options: argparse.Namespace) -> Iterator[Context]:
     """Lock the output folder and return what the stages work with."""
-    from colmap_affrect.stages.context import Context
-    from colmap_affrect.stages.mend import watched
-
     with Workspace(options.output_path).locked() as workspace, executor(options) as where:
         found = Context(workspace, resources(options), where, progress(options))
         is_first, maps = options.command == "extract", options.command == "map"
