@@ -3,12 +3,9 @@
 Everything is checked before it is written: an index out of range would later end the process.
 """
 
-import errno
 import hashlib
-import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +34,9 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         # A Ctrl-C while pycolmap converts a Path would become a TypeError.
         database = pycolmap.Database.open(str(path))
     except RuntimeError as error:
-        with suppress(OSError):
-            if shutil.disk_usage(path.parent).free < BYTES_OF_EMPTY_DATABASE:
-                full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                raise cannot_write(path, full) from error
         raise DatabaseError(
-            f"{path}: not a usable COLMAP database, or in use by another program ({error})"
+            f"{path}: not a usable COLMAP database, in use by another program, or the disk is full "
+            f"({error})"
         ) from error
     try:
         with closing(database):

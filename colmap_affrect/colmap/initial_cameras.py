@@ -270,16 +270,15 @@ def _take_over(
     read = cameras_of_images(found)
     sizes = {i.name: (read[i.image_id].width, read[i.image_id].height) for i in images}
     priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
-    cameras, new = _known_cameras(initial, database), {}
-    for group, names in initial.groups(list(sizes)).items():
-        if group not in cameras:
-            size = sizes[names[0]]
-            new[group], _ = initial.camera([n for n in names if sizes[n] == size], size)
+    cameras = _known_cameras(initial, database)
     rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
     with pycolmap.DatabaseTransaction(database):
-        for camera in new.values():
-            camera.camera_id = database.write_camera(camera)
-        cameras |= new
+        for group, names in initial.groups(list(sizes)).items():
+            if group not in cameras:
+                size = sizes[names[0]]
+                camera, _ = initial.camera([n for n in names if sizes[n] == size], size)
+                camera.camera_id = database.write_camera(camera)
+                cameras[group] = camera
         for image in images:
             camera = cameras[initial.group(image.name)]
             if sizes[image.name] == (camera.width, camera.height):

@@ -1,27 +1,25 @@
 """Give a COLMAP model its scale and place: by positions, control points, or known distances."""
 
+import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
-from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.model_files import read_given_model, write_model
-from colmap_affrect.errors import DatabaseError, OptionError, damage
+from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.tables import read_table
 from colmap_affrect.project.workspace import Workspace
 
-GEOREFERENCE = "georeference.json"  # beside a model
+GEOREFERENCE = "georeference.json"  # beside a model: what COLMAP's files have no place for
 MIN_WIDTH = 0.01  # of known places across the line that fits them best, in units of its length
 METRIC, ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "altitude")
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
@@ -30,51 +28,14 @@ SHOWN = 12  # residuals in the summary, the largest first
 Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
 
 
-@dataclass(frozen=True)
-class Georeference:
-    """Origin (WGS 84) of a model in metres whose x, y, z point east, north and up."""
-
-    latitude: float  # degrees
-    longitude: float  # degrees
-    altitude: float  # metres above the ellipsoid, or as GPS has it
-
-    @classmethod
-    def read(cls, model_path: Path) -> Self | None:
-        """Return that of a model, None if it has none."""
-        path = model_path / GEOREFERENCE
-        if not path.exists():
-            return None
-        with damage(path, "align the model again"):
-            return TypeAdapter(cls).validate_json(path.read_bytes())
-
-    def write(self, model_path: Path) -> None:
-        """Write it beside a model: COLMAP's files have no place for it."""
-        text = TypeAdapter(Georeference).dump_json(self, indent=1).decode()
-        replace_text(model_path / GEOREFERENCE, text + "\n")
-
-    def in_metres(self, positions: ArrayLike) -> Array:
-        """Return metres east, north and up of the origin for latitudes, longitudes, altitudes."""
-        return np.asarray(WGS84.ellipsoid_to_enu(positions, *astuple(self)))
-
-    def on_earth(self, point: ArrayLike) -> tuple[float, float, float]:
-        """Return latitude, longitude and altitude of a point of the model."""
-        places = WGS84.enu_to_ellipsoid(np.asarray(point, float)[None], *astuple(self))
-        latitude, longitude, altitude = places[0].tolist()
-        return latitude, longitude, altitude
-
-
 @dataclass(frozen=True, kw_only=True)
 class Reference:
     """What a model is aligned to; exactly one of the first three, or distances."""
 
     gps_database: Path | None = None  # COLMAP database with positions of the photographs
-    # CSV of where photographs were taken: name and x, y, z in metres, or latitude, longitude,
-    # altitude
-    positions_path: Path | None = None
-    # CSV of points marked in photographs: point, image, px, py; of control points also x, y, z
-    points_path: Path | None = None
-    # two names, of photographs or marked points, and their distance in metres
-    distances: tuple[tuple[str, str, float], ...] = ()
+    positions_path: Path | None = None  # CSV: name and x, y, z or latitude, longitude, altitude
+    points_path: Path | None = None  # CSV of marks: point, image, px, py; perhaps x, y, z
+    distances: tuple[tuple[str, str, float], ...] = ()  # two photographs or marks, and metres
 
 
 @dataclass(frozen=True)
@@ -83,19 +44,20 @@ class Alignment:
 
     scale: float  # metres for a unit of the model as it was
     residuals: Mapping[str, float]  # how far each position, point or distance is off, metres
-    georeference: Georeference | None = None  # where the model is on earth, if that is known
+    origin: tuple[
+        float, ...
+    ] = ()  # latitude, longitude, altitude (WGS 84) of x, y, z east, north, up
 
     def summary(self) -> str:
         """Return a few lines."""
-        largest = sorted(self.residuals.items(), key=lambda item: -item[1])
         lines = [f"scale       {self.scale:.6g} metres for a unit of the old model"]
-        if len(largest) == 1:  # a single distance is met exactly
-            return lines[0]
-        lines += [
-            f"off         {median(self.residuals.values()):.3g} m in the median of "
-            f"{len(largest)}, {largest[0][1]:.3g} m at most",
-            *(f"            {name} {value:.3g}" for name, value in largest[:SHOWN]),
-        ]
+        if len(self.residuals) > 1:  # a single distance is met exactly
+            largest = sorted(self.residuals.items(), key=lambda item: -item[1])
+            lines.append(
+                f"off         {median(self.residuals.values()):.3g} m in the median of "
+                f"{len(largest)}, {largest[0][1]:.3g} m at most"
+            )
+            lines += [f"            {name} {value:.3g}" for name, value in largest[:SHOWN]]
         return "\n".join(lines)
 
 
@@ -107,7 +69,7 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
     """
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
-    model, origin = read_given_model(model_path), None
+    model, origin = read_given_model(model_path), tuple[float, ...]()
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     old = {name: image.projection_center() for name, image in images.items()}
     true, is_on_earth, marked = Places(), False, Places()
@@ -130,13 +92,14 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
     with new_results(output_path, photographs=photographs, names=images) as (folder,):
         write_model(model, folder)
         if origin:
-            origin.write(folder)
+            content = dict(zip(ON_EARTH, origin, strict=True))
+            replace_text(folder / GEOREFERENCE, json.dumps(content, indent=1) + "\n")
     return Alignment(float(new_from_old.scale), residuals, origin)
 
 
 def _similarity(
     old: Places, true: Places, *, is_on_earth: bool
-) -> tuple[pycolmap.Sim3d, dict[str, float], Georeference | None]:
+) -> tuple[pycolmap.Sim3d, dict[str, float], tuple[float, ...]]:
     """Return the similarity of least squares, its residuals, and the origin if on earth."""
     names = sorted(old.keys() & true.keys())
     if len(names) < 3:
@@ -145,9 +108,9 @@ def _similarity(
             f"3 are needed; known are those of {', '.join(sorted(true)[:3]) or 'none'}"
         )
     before, after = (np.array([places[name] for name in names]) for places in (old, true))
-    origin = Georeference(*after.mean(axis=0).tolist()) if is_on_earth else None
+    origin = tuple(after.mean(axis=0).tolist()) if is_on_earth else ()
     if origin:
-        after = origin.in_metres(after)
+        after = np.asarray(WGS84.ellipsoid_to_enu(after, *origin))
     for points in (before, after):
         along, across, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if across <= MIN_WIDTH * along:

@@ -14,7 +14,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import ImageError, OptionError
-from colmap_affrect.interop.align import Georeference
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
@@ -132,7 +131,7 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
 
 def _cameras(source: Source, folder: Path) -> Path:
     """Write a table: a row for each photograph, with its camera, where it stands and looks."""
-    path, place = folder / "cameras.csv", Georeference.read(source.path)
+    path = folder / "cameras.csv"
     rows: list[dict[str, Any]] = []
     for image in source.images():
         camera, center = source.model.cameras[image.camera_id], image.projection_center()
@@ -145,9 +144,6 @@ def _cameras(source: Source, folder: Path) -> Path:
             "focal_px": camera.mean_focal_length(),
             "params": " ".join(f"{value:.9g}" for value in camera.params),
         })  # fmt: skip
-        if place:
-            on_earth = place.on_earth(center)
-            rows[-1] |= zip(("latitude", "longitude", "altitude_m"), on_earth, strict=True)
     table = io.StringIO()
     writer = csv.DictWriter(table, rows[0] if rows else ["name"], lineterminator="\n")
     writer.writeheader()

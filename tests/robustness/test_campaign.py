@@ -28,7 +28,6 @@ from posed_photographs import write_extreme_views
 from results import database_content, differences, results, tree
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.interop.align import Georeference
 from colmap_affrect.interop.export import FORMATS
 
 pytestmark = pytest.mark.long
@@ -59,8 +58,8 @@ def run_words(scene: Path, out: Path) -> Words:
 def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the small scene in ``out``, and what commands need beside it.
 
-    These are ``photos``; the model as it is and with a lens that distorts, both with a place on
-    earth; files of hloc; a dataset.
+    These are ``photos``; the model as it is and with a lens that distorts;
+    files of hloc; a dataset.
     """
     folder = tmp_path_factory.mktemp("scene")
     shutil.copytree(photos, folder / "photos")
@@ -79,7 +78,6 @@ def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             camera.params = [300.0, 160.0, 120.0, 0.05]
         (folder / name).mkdir()
         model.write(folder / name)
-        Georeference(50.0, 14.0, 200.0).write(folder / name)
     write_extreme_views(folder / "pairs", ["cafe"])
     return folder
 
