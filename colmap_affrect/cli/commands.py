@@ -120,12 +120,11 @@ def map(options: argparse.Namespace) -> None:
 
 
 def compare(options: argparse.Namespace) -> None:
-    methods = options.methods and parse_methods(options.methods, given.depth_settings(options))
     comparison = comparing.compare(
         options.image_path,
         options.output_path,
         CompareOptions(
-            methods=methods,
+            methods=parse_methods(options.methods, given.depth_settings(options)),
             seeds=options.seeds,
             ground_truth_path=options.ground_truth_path,
             **given.inputs(options),

@@ -6,7 +6,7 @@ What :mod:`.given` makes an options class of has the field as destination, as ``
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS
+from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.options import PRESETS
 
 Settings = dict[str, Any]
@@ -125,9 +125,8 @@ FLAGS: dict[str, Settings] = {
     # comparison and evaluation
     "--methods": _value("A,B,...", "sift-colmap (all as COLMAP does it by default), sift, "
         "sift-affine-dsp (with our preset), recipes by name or path; "
-        "NAME=RECIPE:section.option=value changes options (default: "
-        f"{','.join(DEFAULT_METHODS)}, and {', '.join(LEARNED_METHODS)} where their weights are)",
-        nargs="+"),
+        "NAME=RECIPE:section.option=value changes options "
+        f"(default: {','.join(DEFAULT_METHODS)})", nargs="+", default=DEFAULT_METHODS),
     "--seeds": _value("N,...", "seeds of verification and mapping, which run once for each "
         "(default: 0,1,2)", type=integers, default=(0, 1, 2)),
     "--ground-truth-path": _path("MODEL",

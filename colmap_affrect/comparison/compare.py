@@ -7,23 +7,23 @@ masks, pairs, verification, mapping and seeds are the same for all.
 import pickle
 import signal
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap.poses import Poses, read_poses
-from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
+from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
-from colmap_affrect.comparison.methods import Method, parse_methods, without_weights
+from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.pose_scores import pose_scores
 from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.tables import to_json
 from colmap_affrect.errors import ComparisonError, OptionError
-from colmap_affrect.features.weights import install_hint, resolve
+from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.options import Options, digest_of
+from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.parallel.subprocesses import child
 from colmap_affrect.progress import SILENT, Progress
@@ -52,7 +52,7 @@ def compare(
     """
     options = options or CompareOptions()
     Workspace(output_path).require_own(image_path)
-    methods, not_compared = _methods(options)
+    methods = parse_methods(options.methods)
     inputs, names = _checked(image_path, options)
     pairs = list(options.pairs_of(names))
     truth = _ground_truth(options.ground_truth_path, names)
@@ -78,24 +78,12 @@ def compare(
             methods=tuple(results),
             seeds=tuple(options.seeds),
             num_pairs=len(pairs),
-            settings=_settings(options) | {"not_compared": not_compared},
+            settings=_settings(same, options),
             versions=installed_versions(),
         )
         replace_text(output_path / "comparison.json", to_json(comparison))
         write_page(comparison, output_path, progress)
     return comparison
-
-
-def _methods(options: CompareOptions) -> tuple[tuple[Method, ...], str]:
-    """Return the methods, and which learned ones are left out without weights, and the remedy."""
-    if options.methods:
-        return parse_methods(options.methods), ""
-    lacking = without_weights(options.resources.weights_path)
-    learned = [name for name in LEARNED_METHODS if name not in lacking]
-    files = {file.file_name: file for group in lacking.values() for file in group}
-    hint = install_hint(files.values()).removesuffix(", or ")
-    absent = f"{', '.join(lacking)}: {hint}" if lacking else ""
-    return parse_methods([*DEFAULT_METHODS, *learned]), absent
 
 
 def _checked(image_path: Path, options: CompareOptions) -> tuple[Inputs, list[str]]:
@@ -125,30 +113,23 @@ def _same_for_all(
     """Return what all methods begin with, for the record; digests stand for the files."""
     files = {name: inputs.photographs.files(name) for name in names}
     files[""] = inputs.camera_files
-    masks = options.masks.to_mapping()
+    sections = {"verification": options.verification, "mapping": options.mapping}
     return {
         "photographs": {k: content_of(paths).digest[:NUM_DIGITS] for k, paths in files.items()},
         "pairs": {"number": len(pairs), "sha256": digest_of(pairs)},
-        "masks": {key: bool(path) for key, path in masks.items()},
-        **_sections(options),
-    }
-
-
-def _sections(options: CompareOptions) -> dict[str, Any]:
-    def without_seed(section: Options) -> dict[str, Any]:
-        return {k: value for k, value in section.to_mapping().items() if k != "random_seed"}
-
-    return {
         "camera": options.cameras.to_mapping(),
-        "verification": without_seed(options.verification),
-        "mapping": without_seed(options.mapping),
+        "masks": {key: bool(path) for key, path in options.masks.to_mapping().items()},
+        **{
+            name: {k: value for k, value in section.to_mapping().items() if k != "random_seed"}
+            for name, section in sections.items()
+        },
     }
 
 
-def _settings(options: CompareOptions) -> dict[str, Any]:
+def _settings(same: Mapping[str, Any], options: CompareOptions) -> dict[str, Any]:
     places = ("image_list_path", "from_database", "ground_truth_path")
     return {
-        **_sections(options),
+        **{key: same[key] for key in ("camera", "verification", "mapping")},
         **{key: str(getattr(options, key) or "") for key in places},
         "masks": options.masks.to_mapping(),
         "match_list_path": options.pairs.match_list_path,

@@ -17,9 +17,9 @@ from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
-from colmap_affrect.colmap.database_copy import copy_database, copy_without_features
-from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
+from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP, SIFT_COLMAP, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.comparison.sift import extract_sift, match_sift
@@ -39,7 +39,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate
-from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.extract import add_images, extract
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
@@ -57,13 +57,12 @@ class CompareOptions(InputOptions):
     The other attributes are those of :class:`~colmap_affrect.pipeline.InputOptions`.
 
     Attributes:
-        methods: names of methods as the command line takes them, or methods; None for those that
-            need no weights, and learned ones whose weights are there.
+        methods: names of methods as the command line takes them, or methods.
         seeds: of verification and mapping, which run once for each.
         ground_truth_path: folder of a COLMAP model with true poses, in any frame; None for none.
     """
 
-    methods: Sequence[str | Method] | None = None
+    methods: Sequence[str | Method] = DEFAULT_METHODS
     seeds: Sequence[int] = (0, 1, 2)
     ground_truth_path: Path | None = None
 
@@ -159,24 +158,14 @@ class MethodRun:
 
     def _extract_sift(self) -> None:
         inputs = self.options.inputs(self.image_path)
-        names, source = inputs.names(), self.options.from_database
+        names, affine = inputs.names(), self.method.label == SIFT_AFFINE_DSP
         with self.progress.stage("extract", len(names), "images") as advance:
-            if source and not self.database.exists():
-                copy_without_features(source, self.database)
-            mode = self.options.cameras.mode
-            rejected = import_images(self.database, self.image_path, names, self.options.cameras)
-            initial = None if source else inputs.initial_cameras
-            known = read_camera_records(source.with_name("cameras.json")) if source else None
-            record_cameras(self.database, self.workspace.cameras, initial, known)
-            taken = [name for name in names if name not in set(rejected)]
+            failures = add_images(self.workspace, inputs, names)
+            taken = [name for name in names if name not in failures]
             if not taken:
                 raise ComparisonError(f"COLMAP cannot use any of the {len(names)} images")
-            affine = self.method.label == SIFT_AFFINE_DSP
-            failures = extract_sift(
-                self.database, self.image_path, taken, self.options.masks, affine=affine
-            )
-            reason = f"COLMAP cannot read it, or does not take it (camera mode {mode})"
-            self._keep(failures=dict.fromkeys(rejected, reason) | failures)
+            images = self.image_path, taken, self.options.masks
+            self._keep(failures=failures | extract_sift(self.database, *images, affine=affine))
             advance(len(names))
 
     def _match_sift(self) -> None:

@@ -5,12 +5,10 @@ import re
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Any
 
-from colmap_affrect.comparison import LEARNED_METHODS
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features.weights import WeightFile, missing
 from colmap_affrect.recipes import Recipe, load_recipe, recipe_names
 
 SIFT_COLMAP, SIFT, SIFT_AFFINE_DSP = "sift-colmap", "sift", "sift-affine-dsp"
@@ -52,13 +50,6 @@ class Method:
         if plain == self.label:
             return plain
         return f"{plain}-{zlib.crc32(self.label.encode()):08x}"
-
-
-def without_weights(weights_path: Path | None = None) -> dict[str, list[WeightFile]]:
-    """Return the files that learned methods lack here, by method; none of those that lack none."""
-    recipes = {name: load_recipe(name) for name in LEARNED_METHODS}
-    lacking = {name: missing(recipe.weights, weights_path) for name, recipe in recipes.items()}
-    return {name: files for name, files in lacking.items() if files}
 
 
 def parse_methods(

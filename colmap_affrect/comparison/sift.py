@@ -4,15 +4,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids, open_database, require_database_space
+from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import temporary_folder
 
-ROWS_PER_IMAGE = 400  # of 4 KiB, for 8192 features of 128 bytes and their positions
-ROWS_PER_PAIR = 8
 TEMPORARY_NAME = "id:{}"  # name of an image by its id while COLMAP matches
 
 
@@ -33,7 +31,6 @@ def extract_sift(
     photographs = Photographs(image_path, masks)
     impossible = {name: why for name in image_names if (why := photographs.why_impossible(name))}
     usable = [name for name in image_names if name not in impossible]
-    require_database_space(database_path, len(image_names) * ROWS_PER_IMAGE)
     options, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
     options.sift.estimate_affine_shape = options.sift.domain_size_pooling = affine
     if masks.path:
@@ -62,7 +59,6 @@ def match_sift(database_path: Path, pairs: Sequence[Pair]) -> None:
     ids = image_ids(database_path)
     names = {image_id: name for name, image_id in ids.items()}
     lines = [f"{TEMPORARY_NAME.format(ids[a])} {TEMPORARY_NAME.format(ids[b])}\n" for a, b in pairs]
-    require_database_space(database_path, len(pairs) * ROWS_PER_PAIR)
     with temporary_folder(database_path.parent) as folder:
         list_path, copy = folder / "pairs.txt", folder / database_path.name
         replace_text(list_path, "".join(lines))

@@ -74,7 +74,7 @@ def headline(comparison: Comparison) -> str:
     what = "correct" if comparison.has_ground_truth else "sure"
     texts = [
         f"{kind}{'' if best.name == SIFT_COLMAP else f' ({best.name})'} "
-        f"{span_text(best.registered)} ({span_text(best.right)} {what})"
+        f"{span_text(best.registered)}, {span_text(best.right)} of them {what}"
         for kind, methods in kinds.items()
         for best in methods[:1]
     ]
@@ -97,8 +97,6 @@ def notes(comparison: Comparison) -> list[str]:
         for method in finished:
             doubts = by_story(method.usually_doubted)
             texts += [f"Doubtful in {method.name}: {line}." for line in doubts]
-    if absent := comparison.settings.get("not_compared"):
-        texts.append(f"Not compared for want of weights: {absent}")
     return texts
 
 

@@ -82,7 +82,7 @@ def extract(
         overwrite=overwrite,
     )
     warnings = _forget_changed(context, inputs, contents, are_all=not image_names)
-    _start_database(workspace)
+    _start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
@@ -200,11 +200,25 @@ def _image_tasks(
         yield ImageTask(inputs.photographs, name, level, intrinsics, size)
 
 
-def _start_database(workspace: Workspace) -> None:
-    """Make the database from the one that the extract stage was given, unless it is there."""
-    original = workspace.require("extract")["from_database"]
-    if original and not workspace.database.exists():
-        copy_without_features(Path(original), workspace.database)
+def _start_database(workspace: Workspace, inputs: Inputs) -> None:
+    """Make the database from the one that is given, unless it is there."""
+    if inputs.from_database and not workspace.database.exists():
+        copy_without_features(Path(inputs.from_database), workspace.database)
+
+
+def add_images(workspace: Workspace, inputs: Inputs, names: Sequence[str]) -> dict[str, str]:
+    """Add images that the database lacks; return those that COLMAP does not take, with reasons."""
+    _start_database(workspace, inputs)
+    original = Path(inputs.from_database) if inputs.from_database else None
+    rejected = import_images(workspace.database, Path(inputs.image_path), names, inputs.cameras)
+    record_cameras(
+        workspace.database,
+        workspace.cameras,
+        None if original else inputs.initial_cameras,
+        read_camera_records(original.with_name(workspace.cameras.name)) if original else None,
+    )
+    reason = f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})"
+    return dict.fromkeys(rejected, reason)
 
 
 def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None:
@@ -224,19 +238,8 @@ def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None
 def write_images_and_keypoints(context: Context) -> dict[str, str]:
     """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
     workspace, store = context.workspace, context.features
-    _start_database(workspace)
-    inputs = context.inputs
     counts = store.num_keypoints()
-    rejected = import_images(
-        workspace.database, Path(inputs.image_path), list(counts), inputs.cameras
-    )
-    original = Path(inputs.from_database) if inputs.from_database else None
-    record_cameras(
-        workspace.database,
-        workspace.cameras,
-        None if original else inputs.initial_cameras,
-        read_camera_records(original.with_name(workspace.cameras.name)) if original else None,
-    )
+    rejected = add_images(workspace, context.inputs, list(counts))
     ids = colmap_database.image_ids(workspace.database)
     with colmap_database.open_database(workspace.database) as database:
         for name, count in counts.items():
@@ -244,8 +247,7 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
                 colmap_database.write_keypoints(
                     database, ids[name], store.read_frames(name), store.level_ends(name)
                 )
-    reason = f"COLMAP does not take it (camera mode {inputs.cameras.mode})"
-    return dict.fromkeys(rejected, reason)
+    return rejected
 
 
 def write_descriptors(context: Context) -> None:

