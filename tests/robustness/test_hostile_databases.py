@@ -17,8 +17,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
 from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
-from colmap_affrect.doctor.findings import Diagnosis
-from colmap_affrect.doctor.folder import examine_database
+from colmap_affrect.doctor import Diagnosis, examine_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.interop.pycolmap_api import extract_features

@@ -1,0 +1,259 @@
+"""What is wrong with an output folder, a COLMAP database or the installation, and what helps.
+
+Nothing is changed: databases are examined in a copy. No run can begin in a folder meanwhile.
+Files are read as runs read them, and what their readers say is what is found.
+"""
+
+import dataclasses
+import json
+import shlex
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.checks import CHECKS, check_database
+from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
+from colmap_affrect.colmap.model_files import SUMMARY, registered_names
+from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
+from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
+from colmap_affrect.mappers.summaries import model_folders, read_summary
+from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.project.record import STAGES
+from colmap_affrect.project.report import installed_versions
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Context
+
+Read = TypeVar("Read")
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+
+MAX_ITEMS_SHOWN = 5
+SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was found.
+
+    Attributes:
+        severity: ``error`` (a program will fail, or results are wrong), ``warning`` (something
+            is missing from the results), or ``note`` (worth knowing).
+        where: file, folder or part of the installation.
+    """
+
+    severity: Severity
+    where: str
+    what: str
+    advice: str
+
+
+@dataclass
+class Diagnosis:
+    """The result of an examination: what was found, and what was looked at."""
+
+    checked: list[str] = field(default_factory=list)
+    _found: list[Finding] = field(default_factory=list, init=False)
+
+    def add(self, severity: Severity, where: Path | str, what: str, advice: str) -> None:
+        """Add what is wrong with a file, folder or part of the installation, and what helps."""
+        self._found.append(Finding(severity, str(where), what, advice))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What was found, the worst first."""
+        return tuple(sorted(self._found, key=lambda found: SEVERITIES.index(found.severity)))
+
+    @property
+    def num_errors(self) -> int:
+        """Number of findings that are errors."""
+        return self._counts["error"]
+
+    @property
+    def _counts(self) -> Counter[str]:
+        return Counter(finding.severity for finding in self._found)
+
+    def summary(self) -> str:
+        """Return text for people."""
+        lines = [f"checked  {line}" for line in self.checked]
+        for finding in self.findings:
+            lines.append(f"{finding.severity:8s} {finding.where}: {finding.what}")
+            lines.append(f"         -> {finding.advice}")
+        counts = {severity: self._counts[severity] for severity in SEVERITIES[:2]}
+        found = [f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items() if count]
+        return "\n".join([*lines, ", ".join(found) or "no problems found"])
+
+    def to_json(self) -> str:
+        """Return the same for programs."""
+        content = {
+            "num_errors": self.num_errors,
+            "num_warnings": self._counts["warning"],
+            "findings": [dataclasses.asdict(finding) for finding in self.findings],
+            "checked": self.checked,
+        }
+        return json.dumps(content, indent=2, ensure_ascii=False)
+
+
+def diagnose(path: Path | None = None, *, weights_path: Path | None = None) -> Diagnosis:
+    """Examine the installation and, if a path is given, an output folder or a COLMAP database.
+
+    OptionError when something that is given is not there.
+    """
+    if path is not None and not path.exists():
+        raise OptionError(
+            f"{path}: no such file or folder; give a COLMAP database or output folder"
+        )
+    if weights_path is not None and not weights_path.is_dir():
+        raise OptionError(f"--weights {weights_path}: no such folder")
+    diagnosis = Diagnosis()
+    if path is not None:
+        examine = _examine_folder if path.is_dir() else examine_database
+        examine(diagnosis, path)
+    _examine_installation(diagnosis, weights_path)
+    return diagnosis
+
+
+def _examine_installation(diagnosis: Diagnosis, weights_path: Path | None) -> None:
+    versions = ", ".join(f"{name} {number}" for name, number in installed_versions().items())
+    diagnosis.checked.append(f"installation: {versions}")
+    try:
+        from colmap_affrect.features.networks import resolve_device
+    except (ImportError, OSError) as error:
+        diagnosis.add(
+            "error", "installation", f"torch or kornia cannot be loaded ({error})",
+            "install them again; recipes with RootSIFT work without",
+        )  # fmt: skip
+        return
+    diagnosis.checked.append(f"networks: run on {resolve_device('auto')}")
+    found = {key: path for key in WEIGHT_FILES if (path := find(key, weights_path))}
+    files = ", ".join(sorted(map(str, found.values())))
+    diagnosis.checked.append(f"weights: {files or 'none found'}")
+    for key, path in found.items():
+        if is_published(key, path) is False:
+            what, advice = f"not the published file of {key}", remedy(path)
+            diagnosis.add("warning", path, what, f"unless it is your own, {advice}")
+
+
+def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool:
+    """Examine a COLMAP database; return whether it is usable.
+
+    ``advice`` is what to do about problems, where it is not what ``CHECKS`` says.
+    """
+    try:
+        version, newest = refuse_newer(path), newest_schema_version()
+        tables, problems = check_database(path)
+    except DatabaseError as error:
+        recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
+        diagnosis.add("error", path, _without_path(path, error), advice or recover)
+        return False
+    quoted = shlex.quote(str(path))
+    if version < newest:
+        diagnosis.add(
+            "note", path,
+            f"has the tables of an older COLMAP (schema {version}, now {newest}); COLMAP 4 and "
+            "pycolmap change them as soon as they open it, and an older COLMAP cannot read it "
+            "any more",
+            f"keep a copy: cp {quoted} {shlex.quote(str(path.with_suffix('.old.db')))}",
+        )  # fmt: skip
+    diagnosis.checked.append(f"{path}: {tables.summary()}")
+    for kind in sorted(problems, key=list(CHECKS).index):
+        what, usual = CHECKS[kind]
+        items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
+        diagnosis.add("error", path, f"{what}{items}", advice or usual.format(path=quoted))
+    return True
+
+
+def _examine_folder(diagnosis: Diagnosis, path: Path) -> None:
+    """Examine an output folder, unless somebody is working in it."""
+    workspace = Workspace(path)
+    if path.suffix == ".affrect" and not workspace.database.exists():
+        workspace = Workspace(path, path.with_suffix(".db"))
+    if not workspace.config.exists() and not workspace.database.exists():
+        what = "neither an output folder of colmap-affrect nor one with a database.db"
+        advice = "give the --output-path of a run, or a COLMAP database"
+        diagnosis.add("error", path, what, advice)
+    elif not workspace.config.exists():
+        what = "is no output folder of colmap-affrect (it has no config.toml)"
+        advice = "use another --output-path for colmap-affrect"
+        diagnosis.add("note", path, f"{what}; only its database is checked", advice)
+        examine_database(diagnosis, workspace.database)
+    else:
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(workspace.locked())
+            except (WorkspaceError, OptionError) as error:
+                in_use = isinstance(error.__cause__, TimeoutError)
+                writable = "make it writable before running anything in it"
+                advice = "run doctor again when it is done" if in_use else writable
+                diagnosis.add("warning", path, _without_path(path, error), advice)
+                if in_use:
+                    return
+            _examine_files(diagnosis, workspace)
+
+
+def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
+    """Read every file of an output folder, that of one stage after the other."""
+    context, quoted = Context(workspace), shlex.quote(str(workspace.path))
+
+    def read(path: Path, reader: Callable[..., Read], *given: Any, advice: str = "") -> Read | None:
+        try:
+            return reader(*given)
+        except AffrectError as error:
+            what, _, usual = _without_path(path, error).partition("; ")
+            restore = f"restore it, or use another --output-path than {quoted}"
+            diagnosis.add("error", path, what, advice or usual or restore)
+            return None
+
+    def is_there(path: Path) -> bool:
+        if not path.exists():
+            diagnosis.add("error", path, "is missing", f"{SAME_RUN} to make it anew")
+        return path.exists()
+
+    def num_images(model: Path) -> int:
+        if not read_summary(model):
+            what = "is missing or damaged: how the model came about is not known any more"
+            again = f"run 'colmap-affrect map --output-path {quoted} --overwrite'"
+            diagnosis.add("error", model / SUMMARY, what, again)
+        return len(registered_names(model))
+
+    done = read(workspace.config, _stages, diagnosis, context) or []
+    read(workspace.cameras, read_camera_records, workspace.cameras)
+    for store in (context.features, context.matches, context.guided) if done else ():
+        read(store.path, store.check_all)
+        diagnosis.checked.append(f"{store.path}: all values")
+    if "extract" in done:
+        is_there(workspace.features)
+        names = read(workspace.path, lambda: list(context.inputs.names()))
+        if names and "match" in done:
+            again = f"run 'colmap-affrect pairs --output-path {quoted} --overwrite'"
+            read(workspace.pairs, read_pairs, workspace.pairs, names, advice=again)
+    if not (is_there(workspace.database) if done else workspace.database.exists()):
+        return
+    remake = f"remove it and {SAME_RUN}: it is made anew"
+    advice = remake if done and not workspace.users_database else ""
+    if examine_database(diagnosis, workspace.database, advice) and "map" in done:
+        sizes = [read(f, num_images, f) for f in model_folders(workspace.sparse)]
+        listed = ", ".join(str(size) for size in sizes if size) or "no"
+        diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
+
+
+def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:
+    """Return the stages that have begun, after all options on record have been read."""
+    record = context.workspace.recorded()
+    if "extract" in context.workspace.begun:
+        _ = context.inputs, context.extraction
+    _ = context.pairing, context.matching, context.verification, context.escalation
+    _ = context.guiding, context.mapping
+    done = [stage for stage in STAGES if stage in record.get("begun", [])]
+    stages, recipe = ", ".join(done) or "none", record.get("recipe", "")
+    diagnosis.checked.append(
+        f"{context.workspace.path}: stages on record: {stages}; recipe {recipe}"
+    )
+    return done
+
+
+def _without_path(path: Path, error: Exception) -> str:
+    return str(error).removeprefix(f"{path}: ").removeprefix(f"{path}/") or type(error).__name__
