@@ -9,9 +9,9 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.report import (
-    Arrival,
     ModelSummary,
     ReconstructionReport,
+    Registration,
     StageReport,
 )
 from colmap_affrect.project.workspace import Workspace
@@ -30,11 +30,11 @@ def small_report(folder: Path) -> ReconstructionReport:
         0.25,
         doubtful={NAMES[3]: "hangs on few <points>"},
         probabilities=dict(zip(NAMES, (0.99, 0.95, 0.7, 0.4), strict=False)),
-        arrivals={
-            NAMES[0]: Arrival("tracks"),
-            NAMES[1]: Arrival("guided"),
-            NAMES[2]: Arrival("bridged", NAMES[0], 12, 15, 0.031),
-            NAMES[3]: Arrival("tracks"),
+        registrations={
+            NAMES[0]: Registration("tracks"),
+            NAMES[1]: Registration("guided"),
+            NAMES[2]: Registration("bridged", NAMES[0], 12, 15, 0.031),
+            NAMES[3]: Registration("tracks"),
         },
     )
     camera = {

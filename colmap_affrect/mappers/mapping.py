@@ -5,22 +5,32 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
-from colmap_affrect.colmap.model_files import SUMMARY, read_given_model, write_model
-from colmap_affrect.mappers.arrivals import arrivals
+from colmap_affrect.colmap.model_files import (
+    SUMMARY,
+    num_long_tracks,
+    read_given_model,
+    seen_points,
+    write_model,
+)
+from colmap_affrect.colmap.verification import inlier_matches, num_in_tracks
+from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.reliability import Judgement, judge
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.summaries import model_folders, read_summary, write_summary
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.report import DOUBTFUL, ModelSummary
+from colmap_affrect.project.report import DOUBTFUL, ModelSummary, Registration
 
 logger = logging.getLogger(__name__)
 
 Judgements = Mapping[str, Judgement]
 """By the names of the images."""
 
+MIN_THREE_VIEW_POINTS = 12
+"""So many points tie an image to two others, as the sparse preset asks for."""
 WRONG = 0.1  # probability below which an image leaves its model: nine of ten are wrong
 
 
@@ -130,8 +140,44 @@ def _summary(mapped: MappedModel, found: Judgements, task: MappingTask) -> Model
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
         probabilities={name: round(one.probability, 3) for name, one in found.items()},
         doubtful={name: one.reason for name, one in found.items() if one.probability < DOUBTFUL},
-        arrivals=arrivals(mapped, task),
+        registrations=registrations(mapped, task),
         taken_out=dict(mapped.taken_out),
         focals_px=focals,
         moves=mapped.moves,
     )
+
+
+def registrations(model: MappedModel, task: MappingTask) -> dict[str, Registration]:
+    """Tell by what each registered image was registered."""
+    reconstruction = model.reconstruction
+    bridged = {
+        name: Registration(
+            "bridged",
+            bridge.pair[0],
+            bridge.num_agreeing,
+            bridge.num_ratios,
+            bridge.scale_error_frac,
+        )
+        for bridge in model.bridges
+        for name in bridge.names
+    }
+    guided = _tied_by_guided_matches(reconstruction, task) if task.guided else set()
+    names = {i: reconstruction.images[i].name for i in reconstruction.reg_image_ids()}
+    return {
+        name: bridged.get(name, Registration("guided" if image_id in guided else "tracks"))
+        for image_id, name in sorted(names.items(), key=lambda item: item[1])
+    }
+
+
+def _tied_by_guided_matches(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:
+    """Return the images that too few three-view tracks would tie without guided matches."""
+    points = {i: seen_points(model.images[i]) for i in model.reg_image_ids()}
+    exact = {}
+    for ids, matches in inlier_matches(task.database_path, 1).items():
+        if points.keys() >= set(ids):
+            first, second = (points[i][matches[:, side]] for side, i in enumerate(ids))
+            seen_by_both = matches[(first == second) & (first >= 0)]
+            guided = task.guided.get(ids, seen_by_both[:0])
+            exact[ids] = seen_by_both[~rows_in(seen_by_both, guided)]
+    seen, tied = num_long_tracks(model), num_in_tracks(exact)
+    return {i for i in points if tied.get(i, 0) < MIN_THREE_VIEW_POINTS <= seen[i]}

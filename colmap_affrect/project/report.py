@@ -98,8 +98,8 @@ class StageReport:
 
 
 @dataclass(frozen=True)
-class Arrival:
-    """How an image came into a model.
+class Registration:
+    """How an image was registered.
 
     Attributes:
         how: by ``tracks`` through three images, by tracks that ``guided`` matching made, or
@@ -131,7 +131,7 @@ class ModelSummary:
     Attributes:
         probabilities: how probable it is that an image stands right, within 5 degrees.
         doubtful: images that are rather wrong than right, with the reason.
-        arrivals: how each image came in.
+        registrations: by what each image was registered.
         taken_out: images that were surely wrong, with the reason.
         focals_px: focal length of each image's camera.
         moves: what made the model, by the sparse mapper.
@@ -143,7 +143,7 @@ class ModelSummary:
     mean_reprojection_error_px: float
     probabilities: dict[str, float] = field(default_factory=dict)
     doubtful: dict[str, str] = field(default_factory=dict)
-    arrivals: dict[str, Arrival] = field(default_factory=dict)
+    registrations: dict[str, Registration] = field(default_factory=dict)
     taken_out: dict[str, str] = field(default_factory=dict)
     focals_px: dict[str, float] = field(default_factory=dict)
     moves: tuple[str, ...] = ()
@@ -161,8 +161,8 @@ class ModelSummary:
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
         lines = _some(
-            f"came in     {name} {item.text()}"
-            for name, item in self.arrivals.items()
+            f"joined      {name} {item.text()}"
+            for name, item in self.registrations.items()
             if item.how != "tracks"
         )
         lines += _some(f"doubtful    {line}" for line in by_story(self.doubtful))
@@ -279,9 +279,9 @@ class ReconstructionReport:
             **{key: getattr(largest, key) for key in OF_LARGEST},
             **found,
             "points3D": largest.num_points3D,
-            "arrivals": {
-                name: asdict(arrival) if arrival.by else {"how": arrival.how}
-                for name, arrival in largest.arrivals.items()
+            "registrations": {
+                name: asdict(registration) if registration.by else {"how": registration.how}
+                for name, registration in largest.registrations.items()
             },
             "num_models": len(self.models),
             "models": [model.registered_names for model in self.models],

@@ -112,9 +112,9 @@ def _card(number: int, name: str, report: ReconstructionReport, model: ModelSumm
         text = report.unregistered.get(name, "not registered")
         text += f": {report.failures[name]}" if name in report.failures else ""
         return Card(number, name, "missing", text, ("all", "missing"))
-    arrival = model.arrivals.get(name)
-    kind = arrival.how if arrival else "tracks"
-    text = "registered" if not arrival or kind == "tracks" else arrival.text()
+    registration = model.registrations.get(name)
+    kind = registration.how if registration else "tracks"
+    text = "registered" if not registration or kind == "tracks" else registration.text()
     if name in report.extended:
         kind, text = "existing", KINDS["existing"]
     groups = ["all", kind, *(["added"] if name in report.added else [])]

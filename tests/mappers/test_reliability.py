@@ -13,10 +13,10 @@ from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.geometry.parallax import mirrored_share
-from colmap_affrect.mappers.arrivals import arrivals
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+from colmap_affrect.mappers.mapping import registrations
 from colmap_affrect.mappers.reliability import TERMS, judge, judged, measure
-from colmap_affrect.project.report import DOUBTFUL, SURE, Arrival
+from colmap_affrect.project.report import DOUBTFUL, SURE, Registration
 
 
 def scene(tmp_path: Path, num_images: int = 5) -> tuple[MappedModel, MappingTask]:
@@ -218,10 +218,9 @@ def test_how_images_came_in(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     name = last(mapped).name
     bridge = Bridge(("a.jpg", name), (name,), 32, 36, 0.031)
-    found = arrivals(MappedModel(mapped.reconstruction, (bridge,)), task)
-    assert found.pop(name) == Arrival("bridged", "a.jpg", 32, 36, 0.031)
-    assert set(found.values()) == {Arrival("tracks")}
-    assert Arrival("tracks").to_mapping() == {"how": "tracks"}
+    found = registrations(MappedModel(mapped.reconstruction, (bridge,)), task)
+    assert found.pop(name) == Registration("bridged", "a.jpg", 32, 36, 0.031)
+    assert set(found.values()) == {Registration("tracks")}
 
 
 def test_image_tied_by_guided_matches_only(tmp_path: Path) -> None:
@@ -229,7 +228,7 @@ def test_image_tied_by_guided_matches_only(tmp_path: Path) -> None:
     image = last(mapped)
     pairs = inlier_matches(task.database_path, 1)
     guided = {ids: matches for ids, matches in pairs.items() if image.image_id in ids}
-    found = arrivals(mapped, replace(task, guided=guided))
+    found = registrations(mapped, replace(task, guided=guided))
     assert [name for name, item in found.items() if item.how == "guided"] == [image.name]
     few = {ids: matches[:5] for ids, matches in guided.items()}
-    assert {i.how for i in arrivals(mapped, replace(task, guided=few)).values()} == {"tracks"}
+    assert {i.how for i in registrations(mapped, replace(task, guided=few)).values()} == {"tracks"}

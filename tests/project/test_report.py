@@ -7,14 +7,22 @@ from dataclasses import replace
 
 import pytest
 
-from colmap_affrect.project.report import Arrival, ModelSummary, ReconstructionReport, StageReport
+from colmap_affrect.project.report import (
+    ModelSummary,
+    ReconstructionReport,
+    Registration,
+    StageReport,
+)
 
 LARGE = ModelSummary(
     ("a.png", "č d.png"),
     120,
     2.25,
     0.512,
-    arrivals={"a.png": Arrival("tracks"), "č d.png": Arrival("bridged", "a.png", 32, 36, 0.031)},
+    registrations={
+        "a.png": Registration("tracks"),
+        "č d.png": Registration("bridged", "a.png", 32, 36, 0.031),
+    },
 )
 SMALL = ModelSummary(("e.png", "f.png"), 50, 2.0, 0.25)
 
@@ -56,7 +64,7 @@ EMPTY = replace(REPORT, models=(), unregistered={"a.png": "no verified pair"}, i
 def test_report_has_the_promised_keys_and_reads_back() -> None:
     read = json.loads(REPORT.to_json())
     stages = read.pop("stages")
-    assert read.pop("arrivals") == {
+    assert read.pop("registrations") == {
         "a.png": {"how": "tracks"},
         "č d.png": {
             "how": "bridged", "by": "a.png", "num_agreeing": 32, "num_ratios": 36,
@@ -110,7 +118,7 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         "not e.png: not registered",
         "try         (with another --output-path)\n            --recipe on-demand",
         "2 without warps, 1 with warps (asift)\n",
-        "came in     č d.png bridged by a.png, 32 of 36 depths agree, scale +-3.1%",
+        "joined      č d.png bridged by a.png, 32 of 36 depths agree, scale +-3.1%",
         "3 of 10 verified",
         "cameras     focal lengths: 2 from EXIF, 1 not known beforehand",
         "points      120, each in 2.25 images",
