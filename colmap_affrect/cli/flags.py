@@ -97,11 +97,12 @@ FLAGS: dict[str, Settings] = {
     "--match-list-path": _path("FILE", "pairs to match, two names per line (default: all pairs)",
         dest="pairs.match_list_path"),
     "--pairs": _value("A,B,...", "which pairs to match, all of: exhaustive, retrieval "
-        "(photographs that are alike), low-resolution (whose strongest features match), gps (near "
-        "to each other), sequence (following by name); with those of --match-list-path, which "
-        "takes the place of exhaustive (default: exhaustive)", dest="pairs.methods", type=words),
-    "--num-neighbors": _value("N", "retrieval, low-resolution: neighbours of a photograph on "
-        "average; gps: at most; sequence: before and after it (default: 20)",
+        "(photographs that are alike), gps (near to each other), sequence (following by name); "
+        "with those of --match-list-path, which takes the place of exhaustive (default: "
+        "exhaustive)",
+        dest="pairs.methods", type=words),
+    "--num-neighbors": _value("N", "retrieval: neighbours of a photograph on average; gps: at "
+        "most; sequence: before and after it (default: 20)",
         dest="pairs.num_neighbors", type=int),
     "--max-distance-m": _value("METRES", "gps: largest distance of neighbours (default: 100)",
         dest="pairs.max_distance_m", type=float),

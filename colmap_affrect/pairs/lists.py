@@ -3,7 +3,6 @@
 import difflib
 import itertools
 import re
-from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -85,34 +84,11 @@ def _candidates(
 def ordered_for_reuse(pairs: Iterable[Pair], num_images: int) -> PairList:
     """Order pairs so that those of the same images come close together.
 
-    Images are numbered breadth first; then come blocks of ``num_images`` with as many others.
+    They come in blocks of ``num_images``, in the order of their names, with as many others.
     """
     listed = PairList.of(pairs)
-    low, high = np.sort(_breadth_first(listed)[listed.numbers], axis=1).T
+    low, high = np.sort(listed.numbers, axis=1).T
     return listed.at(np.lexsort((high, low, high // num_images, low // num_images)))
-
-
-def _breadth_first(pairs: PairList) -> NDArray[np.int32]:
-    """Number the images of pairs; those that share pairs get near numbers."""
-    count = len(pairs.names)
-    first, second = pairs.numbers.T.astype(np.int64)
-    both = np.concatenate([first * count + second, second * count + first])
-    both.sort()
-    starts = np.searchsorted(both, np.arange(count + 1) * count)
-    numbers, order = np.full(count, -1, np.int32), list[int]()
-    for start in range(count):
-        if numbers[start] >= 0:
-            continue
-        numbers[start], reached = 0, deque([start])
-        while reached:
-            image = reached.popleft()
-            order.append(image)
-            others = both[starts[image] : starts[image + 1]] % count
-            new = others[numbers[others] < 0]
-            numbers[new] = 0
-            reached.extend(new.tolist())
-    numbers[order] = np.arange(len(order))
-    return numbers
 
 
 def read_pairs(path: Path, names: Sequence[str]) -> PairList:
@@ -128,7 +104,7 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
 
     def codes(lines: Iterable[str]) -> Iterator[int]:
         for count, line in enumerate(lines, start=1):
-            pair = _split_fast(line.rstrip("\n"), number) or _split(line.strip(), number)
+            pair = _split(line.rstrip("\n"), number) or _split(line.strip(), number)
             if pair:
                 low, high = sorted((number[pair[0]], number[pair[1]]))
                 if low < high:
@@ -169,15 +145,8 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
     replace_lines(path, (f"{first}{separator}{second}\n" for first, second in pairs))
 
 
-def _split_fast(line: str, known: Collection[str]) -> Pair | None:
-    """Split a line as :func:`write_pairs` makes them, else as others do."""
-    first, _, second = line.partition("\t" if "\t" in line else " ")
-    if first in known and second in known and "," not in line:
-        return first, second
-    return _split(line, known)
-
-
 def _split(line: str, known: Collection[str]) -> Pair | None:
+    """Return the two names of a line, either of which may hold separators."""
     for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
         for match in re.finditer(separator, line):
             first, second = line[: match.start()], line[match.end() :]

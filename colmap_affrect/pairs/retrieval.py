@@ -1,4 +1,4 @@
-"""Which images show the same: by one vector per image (VLAD), or by their strongest features.
+"""Which images show the same, by one vector per image (VLAD).
 
 The vocabulary is of descriptors of the images themselves. An image is the sums of differences of
 its descriptors to their nearest words (Jegou et al. 2010), each of unit length and damped by square
@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.arrays import Indices, Singles
-from colmap_affrect.pairs.base import Pair, PairList
-from colmap_affrect.pairs.lists import most_similar_pairs, ordered_for_reuse
-from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import most_similar_pairs
 from colmap_affrect.progress import Progress
 
 NUM_WORDS = 256
@@ -109,26 +108,3 @@ def _original_descriptors(features: LocalFeatures) -> Singles:
     """Return the (N, D) descriptors of the image itself; with those of warps recall is lower."""
     descriptors = features.descriptors[features.rectification_ids == 0]
     return np.asarray(descriptors, dtype=np.float32)
-
-
-NUM_STRONGEST = 1000  # features of each image that low-resolution matching looks at
-IMAGES_AT_ONCE = 256  # pairs are matched in blocks of that many images with that many others
-
-
-def low_resolution_pairs(
-    names: Sequence[str], count: Callable[[Pair], int], num_neighbors: int, progress: Progress
-) -> list[Pair]:
-    """Return the pairs of images of which the strongest features have the most matches.
-
-    ``count`` matches a pair; it should keep ``2 * IMAGES_AT_ONCE`` images. ``num_neighbors`` of an
-    image is an average.
-    """
-    counts = np.zeros((len(names), len(names)), np.uint16)
-    every = PairList(names, np.stack(np.triu_indices(len(names), 1), axis=1))
-    pairs = ordered_for_reuse(every, IMAGES_AT_ONCE)
-    with progress.stage("low resolution", len(pairs), "pairs") as advance:
-        found = map_ordered(count, pairs, available_cores())
-        for (i, j), num_matches in zip(pairs.numbers, found, strict=True):
-            counts[i, j] = counts[j, i] = num_matches
-            advance(1)
-    return most_similar_pairs(names, counts, num_neighbors)

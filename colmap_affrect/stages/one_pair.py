@@ -37,7 +37,6 @@ class Matching:
     base: int = 0  # level that has the features of the images themselves
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
-    max_num_features: int | None = None  # of each image, by response; None for all
     num_similarities: float = 0  # about how many pairs of features there will be to compare
 
 
@@ -128,10 +127,6 @@ class CachedMatcher:
         matching, store = self._matching, self._matching.store
         indices = store.level_indices(name, matching.level, matching.base)
         features = store.read(name).select(indices)
-        if matching.max_num_features is not None:
-            order = np.argsort(-features.responses, kind="stable")
-            strongest = np.sort(order[: matching.max_num_features])
-            indices, features = indices[strongest], features.select(strongest)
         image = ImageFeatures(features, store.image_size(name), matching.extractor)
         return PreparedImage(self._matcher.prepare(image), features.lafs, indices)
 

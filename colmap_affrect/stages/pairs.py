@@ -9,15 +9,13 @@ from pathlib import Path
 
 from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import PairListError
-from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.pairs.lists import read_pairs, sequence_pairs, write_pairs
-from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
+from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import write_images_and_keypoints
-from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)
 
@@ -113,18 +111,9 @@ def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pai
     names = [name for name, count in features.num_keypoints().items() if count]
     if len(names) < 2 or {name for pair in there for name in pair}.issuperset(names):
         return set()
-    pairs: list[Pair] = []
-    if "retrieval" in options.methods:
-        pairs += retrieved_pairs(names, features.read, options.num_neighbors, progress)
-    if "low-resolution" in options.methods:
-        matching = Matching(features, NearestOptions(), max_num_features=NUM_STRONGEST)
-        strongest = CachedMatcher(matching)
-
-        def count_matches(pair: Pair) -> int:
-            return len(strongest.match(*map(strongest.prepared, pair)).indices)
-
-        pairs += low_resolution_pairs(names, count_matches, options.num_neighbors, progress)
-    return set(pairs)
+    if "retrieval" not in options.methods:
+        return set()
+    return set(retrieved_pairs(names, features.read, options.num_neighbors, progress))
 
 
 def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:

@@ -176,7 +176,7 @@ def jobs() -> dict[str, Job]:
     court, images = sorted(path.name for path in COURTYARD.glob("images/*")), COURTYARD / "images"
     depth = ["--depth-path", str(COURTYARD / "depth")]
     preset = ["--mapper", "incremental", "--database-descriptors", "--preset", "colmap"]
-    few = ["--pairs", "retrieval,low-resolution,sequence", "--num-neighbors", "2"]
+    few = ["--pairs", "retrieval,sequence", "--num-neighbors", "2"]
     demand, with_depth = ["--recipe", "on-demand"], "depth-affnet-recommended"
     found: dict[str, Job] = {
         "courtyard default": (images, court, []),
@@ -185,7 +185,7 @@ def jobs() -> dict[str, Job]:
         "courtyard depth-planes, incremental mapper, descriptors": (
             images, court, ["--recipe", "depth-planes-recommended", *depth, *preset]
         ),
-        "courtyard retrieval, low resolution": (images, court, few),
+        "courtyard retrieval, sequence": (images, court, few),
     }  # fmt: skip
     if SHARED.is_dir():
         fountain = ["0000.jpg", "0005.jpg", "0010.jpg"]

@@ -20,15 +20,13 @@ from machine import parser_of, table
 
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.verification import verified_pairs
-from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import sequence_pairs
-from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
+from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 HEADER = ("chosen by", "chosen", "recall", "possible", "inliers", "s")
 
@@ -36,14 +34,8 @@ HEADER = ("chosen by", "chosen", "recall", "possible", "inliers", "s")
 def ways_to_choose(features: FeatureStore) -> dict[str, Callable[[int], Sequence[Pair]]]:
     """Return the ways to choose pairs such that images have so many neighbours on average."""
     names = sorted(features.names())
-    matcher = CachedMatcher(Matching(features, NearestOptions(), max_num_features=NUM_STRONGEST))
-
-    def count(pair: Pair) -> int:
-        return len(matcher.match(*map(matcher.prepared, pair)).indices)
-
     return {
         "retrieval": lambda num: retrieved_pairs(names, features.read, num, SILENT),
-        "low-resolution": lambda num: low_resolution_pairs(names, count, num, SILENT),
         "sequence": lambda num: sequence_pairs(names, -(-num // 2)),
     }
 

@@ -62,11 +62,8 @@ def choose(call: Call, workspace: Workspace, *arguments: object) -> list[str]:
     return workspace.pairs.read_text().splitlines()
 
 
-@pytest.mark.parametrize("method", ["retrieval", "low-resolution"])
-def test_photographs_of_one_room_are_chosen_by_their_features(
-    method: str, rooms: Workspace, call: Call
-) -> None:
-    arguments = ["--pairs", method, "--num-neighbors", 1]
+def test_photographs_of_one_room_are_chosen_by_their_features(rooms: Workspace, call: Call) -> None:
+    arguments = ["--pairs", "retrieval", "--num-neighbors", 1]
     assert choose(call, rooms, *arguments) == ["1.png 3.png", "2.png 4.png"]
 
 
