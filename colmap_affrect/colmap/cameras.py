@@ -25,7 +25,7 @@ from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_agai
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import Options
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.checked_json import with_checksum, without_checksum
+from colmap_affrect.project.contents import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.tables import read_table
 

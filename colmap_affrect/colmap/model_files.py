@@ -30,7 +30,7 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.project.atomic_files import cannot_write
-from colmap_affrect.project.checked_json import without_checksum
+from colmap_affrect.project.contents import without_checksum
 
 SUMMARY = "summary.json"  # beside a model of ours; has the digests of its files as ``model``
 

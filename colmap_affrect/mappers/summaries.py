@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact
 from colmap_affrect.errors import DAMAGE, StoreError, made_again
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.checked_json import with_checksum, without_checksum
+from colmap_affrect.project.contents import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
 
 

@@ -32,14 +32,7 @@ SHA256_BYTES = 32
 
 def replace_text(path: Path, text: str) -> None:
     """Write a text file as :func:`replace_bytes`."""
-    try:
-        content = text.encode("utf-8")
-    except UnicodeEncodeError as error:
-        raise WorkspaceError(
-            f"{path}: cannot hold {text[error.start - 40 : error.end + 40]!r}, which is not UTF-8; "
-            "rename that file or folder"
-        ) from error
-    replace_bytes(path, content)
+    replace_lines(path, [text])
 
 
 def replace_lines(path: Path, lines: Iterable[str]) -> None:
@@ -52,6 +45,11 @@ def replace_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write or replace a file; WorkspaceError when that fails, and an old one stays as it is."""
     try:
         _replace(path, [content] if isinstance(content, bytes) else content)
+    except UnicodeEncodeError as error:
+        name = error.object[max(0, error.start - 40) : error.end + 40]
+        raise WorkspaceError(
+            f"{path}: cannot hold {name!r}, which is not UTF-8; rename that file or folder"
+        ) from error
     except OSError as error:
         raise cannot_write(path, error) from error
 

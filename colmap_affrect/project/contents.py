@@ -1,19 +1,23 @@
-"""What given files hold: SHA-256 digests, kept with size and times so that an idle run reads none.
+"""What files hold: SHA-256 digests, kept with size and times so that an idle run reads none; checksums.
 
 A store keeps with the features of an image what they were extracted from.
 """
 
 import hashlib
+import re
+import zlib
 from collections.abc import Callable, Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
+CHECKSUM = re.compile(rb',\s*"crc32": "([0-9a-f]{8})"\s*}\s*$')
+
 
 class Content(NamedTuple):
     """What files hold."""
 
-    digest: str = ""  # sha256: of the file, or of the digests of several; empty if not known
+    digest: str = ""  # sha256 of the digests of the files; empty if not known
     stamp: str = ""  # their sizes and times: while these stay, nobody has to read the files
 
 
@@ -47,11 +51,8 @@ def content_of(paths: Iterable[Path], known: Content | None = None) -> Content:
     stamp = stamp_of(files)
     if known and known.stamp == stamp:
         return known
-    digests = [_or_empty(file_sha256, path) for path in files]
-    if len(digests) == 1:
-        return Content(digests[0], stamp)
-    joined = hashlib.sha256("\n".join(digests).encode()).hexdigest() if digests else ""
-    return Content(joined, stamp)
+    digests = "\n".join(_or_empty(file_sha256, path) for path in files)
+    return Content(hashlib.sha256(digests.encode()).hexdigest() if files else "", stamp)
 
 
 def _or_empty(read: Callable[[Path], str], path: Path) -> str:
@@ -59,3 +60,21 @@ def _or_empty(read: Callable[[Path], str], path: Path) -> str:
         return read(path)
     except OSError:
         return ""
+
+
+def with_checksum(text: str) -> str:
+    """Return the text of a JSON object with a checksum."""
+    body = text.rstrip().removesuffix("}").rstrip()
+    if body == "{":
+        return text
+    return f'{body},\n "crc32": "{zlib.crc32(body.encode()):08x}"\n}}\n'
+
+
+def without_checksum(content: bytes) -> bytes:
+    """Return a JSON object without its checksum; ValueError if it has one that does not fit."""
+    if not (found := CHECKSUM.search(content)):
+        return content
+    body = content[: found.start()]
+    if zlib.crc32(body) != int(found[1], 16):
+        raise ValueError("it is not as it was written")
+    return body + b"}"

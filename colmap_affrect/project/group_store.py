@@ -25,12 +25,6 @@ from colmap_affrect.project.atomic_files import (
 FORMAT_VERSION = 2
 CHECKSUM = "crc32"  # of the values of a dataset, its attribute
 
-DATASETS = {
-    "descriptors", "image_size", "keypoints", "lafs", "level_ends", "matches0",
-    "matching_scores0", "rectification_ids", "scores", "exact", "candidates",
-}  # fmt: skip
-"""What complete groups hold; groups too, where a file has become a folder."""
-
 
 class GroupStore:
     """A HDF5 file of complete groups."""
@@ -149,10 +143,10 @@ def complete_groups(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5
 
     Their datasets are not opened, which takes long, and links are not followed.
     """
-    is_complete = group.attrs.get("complete", False)
-    if is_complete:
+    if group.attrs.get("complete", False):
         yield path, group
-    for key in group.keys() - (DATASETS if is_complete else set()):
+        return
+    for key in group:
         is_link = not isinstance(group.get(key, getlink=True), h5py.HardLink)
         inner = None if is_link else group[key]
         if isinstance(inner, h5py.Group):

@@ -11,6 +11,7 @@ is written in between appears as a whole (:mod:`colmap_affrect.project.atomic_fi
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.project.contents import Content
+from colmap_affrect.project.contents import Content, stamp_of
 from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
 
 MAX_INT16 = 32767
@@ -37,9 +38,6 @@ FINISHED = "finished_list"
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
 
-_known: dict[Path, tuple[tuple[int, ...], Entries]] = {}
-"""What files held when they were last gone through, which takes long, by size and times."""
-
 
 @dataclass(frozen=True)
 class PairMatches:
@@ -52,12 +50,15 @@ class PairMatches:
     level: int = 0  # of escalation, whose features were looked at together with those of level 0
 
 
-def _entries_of(file: h5py.File) -> Entries:
+@lru_cache(maxsize=8)
+def _entries_of(path: Path, _: str) -> Entries:
+    """Go through a file, which takes long, unless that was done when its stamp was the same."""
     found: Entries = {}
-    for name, group in complete_groups(file):
-        width, height = checked(group, "image_size").tolist()
-        found[name] = _content(group), len(group["keypoints"]), (width, height)
-    return found
+    with FeatureStore(path)._open("r") as file:
+        for name, group in complete_groups(file):
+            width, height = checked(group, "image_size").tolist()
+            found[name] = _content(group), len(group["keypoints"]), (width, height)
+    return dict(sorted(found.items()))
 
 
 def _content(group: h5py.Group) -> Content:
@@ -80,19 +81,12 @@ class FeatureStore(GroupStore):
     kind, stage = "features", "extract"
 
     def _entries(self) -> Entries:
-        if not self.path.exists():
-            return {}
-        with self._open("r") as file:  # refuses what is not ours
-            there = self.path.stat()
-            stamp = there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns
-            if self.path not in _known or _known[self.path][0] != stamp:
-                _known[self.path] = stamp, dict(sorted(_entries_of(file).items()))
-            return _known[self.path][1]
+        return _entries_of(self.path, stamp_of([self.path])) if self.path.exists() else {}
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
         if mode != "r":
-            _known.pop(self.path, None)  # it may change again within one tick of the clock
+            _entries_of.cache_clear()  # it may change again within one tick of the clock
         with super()._open(mode) as file:
             yield file
 

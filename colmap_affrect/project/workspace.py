@@ -219,13 +219,6 @@ class Workspace:
         if any(self.made_from(what) != digest for what, digest in digests.items()):
             self._write_record({**record, MADE_FROM: known})
 
-    def models_made_from(self) -> str:
-        """Return the digests of what the models were made from, empty where there are none.
-
-        Of verified pairs and, after a space, of the model that was extended, if any.
-        """
-        return self.made_from("map") if self.sparse.exists() else ""
-
     def record_options(
         self,
         stage: str,

@@ -60,7 +60,7 @@ def map_images(
         existing = read_existing(extend, workspace.database)  # it may be discarded now
     inputs = _inputs(workspace, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    known = workspace.models_made_from()
+    known = workspace.made_from("map") if workspace.sparse.exists() else ""
     if known != inputs and " " in known and not extend:
         raise StaleStoreError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "

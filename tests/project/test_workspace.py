@@ -191,16 +191,6 @@ def test_models_that_somebody_put_beside_ours_are_not_removed(
     assert foreign.exists()
 
 
-def test_what_models_were_made_from_is_on_record_while_they_are_there(workspace: Workspace) -> None:
-    workspace.record_options("extract", OPTIONS)
-    workspace.record_made_from(map="ab")
-    assert workspace.models_made_from() == ""
-    workspace.sparse.mkdir()
-    assert Workspace(workspace.path).models_made_from() == "ab"
-    workspace.rewind()
-    assert workspace.models_made_from() == ""
-
-
 LOCK_AND_WAIT = """
 import sys
 from pathlib import Path
