@@ -1,6 +1,7 @@
-"""What files hold: SHA-256 digests, kept with size and times so that an idle run reads none; checksums.
+"""What files hold: SHA-256 digests, kept with sizes and times so that an idle run reads none.
 
-A store keeps with the features of an image what they were extracted from.
+A store keeps with the features of an image what they were extracted from. JSON objects have a
+checksum as last entry.
 """
 
 import hashlib

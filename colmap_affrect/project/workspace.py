@@ -22,12 +22,10 @@ from colmap_affrect.project.outputs import (
     remove_own,
 )
 from colmap_affrect.project.record import (
-    GIVEN,
     MADE_FROM,
     STAGES,
     WEIGHTS,
     first_difference,
-    placeless,
     read_record,
     record_text,
 )
@@ -162,7 +160,7 @@ class Workspace:
     def recorded(self) -> Mapping[str, Any]:
         """Return the record, see :func:`~colmap_affrect.project.record.read_record`."""
         if self._record is None:
-            self._record = read_record(self.config, self.path)
+            self._record = read_record(self.config)
         return self._record
 
     def _write_record(self, record: Mapping[str, Any]) -> None:
@@ -203,9 +201,9 @@ class Workspace:
     def photographs(self) -> Path | None:
         """Return the folder of the photographs on record, None where none is known."""
         with suppress(WorkspaceError):
-            for stage in ("extract", "copy"):
-                if path := self.recorded().get(stage, {}).get("image_path"):
-                    return Path(path)
+            record = self.recorded()
+            path = {**record.get("copy", {}), **record.get("extract", {})}.get("image_path")
+            return Path(path) if path else None
         return None
 
     def made_from(self, what: str) -> str:
@@ -243,8 +241,7 @@ class Workspace:
             remove_own(self._results(stage))
             begun = self._begun_before(stage)
             record = record if begun else {}
-        known = placeless(record.get(stage, {}), GIVEN)
-        if stage in begun and (why := first_difference(known, placeless(options, GIVEN))):
+        if stage in begun and (why := first_difference(record[stage], options)):
             raise StaleStoreError(
                 f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
             )
