@@ -73,8 +73,8 @@ class Tables:
     frame_images: set[int]  # ids of the images that are in a frame
     num_frames: int  # number of frames
     keypoints: dict[int, tuple[int, int]]  # rows and columns by image id
-    matches: dict[int, int]  # number of raw matches by pair id
-    geometries: dict[int, tuple[int, int]]  # number of inliers and configuration by pair id
+    num_matched: int  # pairs with raw matches
+    num_verified: int  # pairs with inliers
 
     def pair_names(self, pair_id: int) -> tuple[str, str]:
         """Return the names of a pair, the image with the smaller id first."""
@@ -84,12 +84,11 @@ class Tables:
     def summary(self) -> str:
         """Return the numbers of what there is."""
         features = sum(rows for rows, _ in self.keypoints.values())
-        raw = sum(count > 0 for count in self.matches.values())
-        verified = sum(count > 0 for count, _ in self.geometries.values())
         images, cameras = len(self.names), len(self.cameras)
         return (
             f"{images} image{'s' * (images != 1)}, {cameras} camera{'s' * (cameras != 1)}, "
-            f"{features} keypoints, {raw} matched and {verified} verified pairs"
+            f"{features} keypoints, {self.num_matched} matched and {self.num_verified} verified "
+            "pairs"
         )
 
 
@@ -116,9 +115,12 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
             if kind == SENSOR_CAMERA
         },
         num_frames=sum(1 for _ in rows("frame_id", "frames")),
-        keypoints=_numbers(rows("image_id rows cols", "keypoints")),
-        matches={int(key): int(count) for key, count in rows("pair_id rows", "matches")},
-        geometries=_numbers(rows("pair_id rows config", "two_view_geometries")),
+        keypoints={
+            int(key): (int(count), int(columns))
+            for key, count, columns in rows("image_id rows cols", "keypoints")
+        },
+        num_matched=sum(int(count) > 0 for (count,) in rows("rows", "matches")),
+        num_verified=sum(int(count) > 0 for (count,) in rows("rows", "two_view_geometries")),
     )
 
 
@@ -154,7 +156,3 @@ def rows_digest(path: Path) -> str:
 def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:
     """Return the columns of a table, none if there is no such table."""
     return {str(row[1]) for row in connection.execute(f"PRAGMA table_info({table})")}
-
-
-def _numbers(rows: Iterable[Any]) -> dict[int, tuple[int, int]]:
-    return {int(key): (int(first), int(second)) for key, first, second in rows}
