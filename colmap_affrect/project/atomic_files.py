@@ -99,21 +99,12 @@ def require_space(path: Path, num_bytes: int) -> None:
     For files that are written by libraries which do not survive a full disk: else WorkspaceError.
     """
     try:
-        with _new_beside(path) as (file, _):
-            _allocate(file, num_bytes)
+        if shutil.disk_usage(path.parent).free < num_bytes:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        with _new_beside(path) as (file, _), suppress(AttributeError):  # not on all systems
+            os.posix_fallocate(file.fileno(), 0, num_bytes)  # which a quota may not allow
     except OSError as error:
         raise cannot_write(path, error) from error
-
-
-def _allocate(file: BinaryIO, num_bytes: int) -> None:
-    """Allocate blocks of the disk for a file, or at least see whether there are enough."""
-    try:
-        os.posix_fallocate(file.fileno(), 0, num_bytes)
-    except (AttributeError, OSError) as error:
-        if getattr(error, "errno", None) not in (None, errno.EINVAL, errno.EOPNOTSUPP):
-            raise
-        if shutil.disk_usage(Path(file.name).parent).free < num_bytes:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
 
 
 def cannot_write(path: Path, error: Exception) -> WorkspaceError:
