@@ -147,8 +147,7 @@ class Registry(Generic[Part]):
         try:
             if not isinstance(values, Mapping):
                 raise OptionError(f"expected options, got {given!r}")
-            named = {str(key): value for key, value in values.items()}
-            return self.part(str(named.get("name", self.default))).Options(**named)
+            return self.part(str(values.get("name", self.default))).Options(**values)
         except OptionError as error:
             raise OptionError(f"{where}: {error}" if where else str(error)) from error
 

@@ -30,10 +30,7 @@ from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate, pair_levels
 from colmap_affrect.stages.extract import extract, write_descriptors
-from colmap_affrect.stages.guide import (
-    guide,
-    guided_counts,
-)
+from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.map import (
     advice,

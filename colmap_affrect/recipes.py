@@ -98,14 +98,15 @@ class ExtractionOptions(Options):
         if needing and not self.depth.is_given:
             raise OptionError(f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER")
 
-    def require_matching(self, matching: MatcherOptions) -> None:
-        """Refuse a matcher, of all levels without one of their own, for features of others."""
-        for level, matcher in zip(self.levels, self.matchers(matching), strict=True):
-            matcher.require_extractor(level.features.kind)
-
     def matchers(self, matching: MatcherOptions) -> tuple[MatcherOptions, ...]:
-        """Return the matcher of each level, ``matching`` where it has none of its own."""
-        return tuple(level.matching or matching for level in self.levels)
+        """Return the matcher of each level, ``matching`` where it has none of its own.
+
+        OptionError for one that was not made for the features of its level.
+        """
+        found = tuple(level.matching or matching for level in self.levels)
+        for level, matcher in zip(self.levels, found, strict=True):
+            matcher.require_extractor(level.features.kind)
+        return found
 
     @property
     def _network_parts(self) -> tuple[NetworkOptions, ...]:
@@ -161,7 +162,7 @@ class Recipe(ExtractionOptions):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         """Refuse now what would fail when matching or mapping begins."""
-        self.require_matching(self.matching)
+        self.matchers(self.matching)
         if self.mapping:
             self.mapper_options("sparse")
         return self
@@ -169,7 +170,8 @@ class Recipe(ExtractionOptions):
     @property
     def extraction(self) -> ExtractionOptions:
         """The options that decide the features of an image."""
-        return ExtractionOptions(**{key: getattr(self, key) for key in EXTRACTION})
+        fields = ExtractionOptions.model_fields
+        return ExtractionOptions(**{key: getattr(self, key) for key in fields})
 
     @property
     def weights(self) -> tuple[str, ...]:
@@ -201,7 +203,6 @@ class Recipe(ExtractionOptions):
         return options
 
 
-EXTRACTION = tuple(ExtractionOptions.model_fields)
 DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}  # by preset
 
 

@@ -43,11 +43,11 @@ def match(
     options = options or context.matching
     workspace, extraction = context.workspace, context.extraction
     try:
-        extraction.require_matching(options)
+        matchers = extraction.matchers(options)
     except OptionError as error:
         other = "other features than those here take 'run' with another --output-path"
         raise OptionError(f"{error}; {other}") from error
-    weights = load_matchers(context, extraction.matchers(options))
+    weights = load_matchers(context, matchers)
     record = options.to_mapping() | ({WEIGHTS: digests(weights)} if weights else {})
     workspace.record_options("match", record, overwrite=overwrite)
     matches, digest = context.matches, file_sha256(workspace.pairs)
