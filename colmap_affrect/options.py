@@ -18,10 +18,11 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, such_as
 
 PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
 MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
+MAX_KNOWN = 40  # names in a message
 MAX_COMMENT = 96  # width of comments in printed options
 CUSTOM = "custom"  # name of options that are no preset
 
@@ -194,5 +195,6 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Return what a message adds to an unknown name: the one that was meant, or those there are."""
-    close = difflib.get_close_matches(name, known := list(known), n=1, cutoff=0.5)
-    return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(known)})"
+    known = list(dict.fromkeys(known))
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f" (did you mean '{close[0]}'?)" if close else f" (known: {such_as(known, MAX_KNOWN)})"

@@ -238,13 +238,15 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
     return Recipe.from_mapping({**changed, "name": name}, f"recipe {name}")
 
 
-def with_settings(values: Mapping[str, Any], settings: Sequence[str]) -> dict[str, Any]:
+def with_settings(
+    values: Mapping[str, Any], settings: Sequence[str], flag: str = "--set"
+) -> dict[str, Any]:
     """Return the sections of a recipe with single options changed; see :func:`load_recipe`."""
     changed = dict(values)
     for setting in settings:
         key, separator, text = setting.partition("=")
         if not separator or not key.strip():
-            raise OptionError(f"{setting}: expected OPTION=VALUE")
+            raise OptionError(f"{flag} {setting}: expected OPTION=VALUE")
         try:
             value = tomllib.loads(f"value = {text}")["value"]
         except (ValueError, RecursionError):
@@ -255,7 +257,7 @@ def with_settings(values: Mapping[str, Any], settings: Sequence[str]) -> dict[st
             inner = target.get(section, {})
             inner = {"name": inner} if isinstance(inner, str) else inner  # a part by its name alone
             if not isinstance(inner, Mapping):
-                raise OptionError(f"{setting}: {section} is not a section")
+                raise OptionError(f"{flag} {setting}: {section} is not a section")
             target[section] = dict(inner)
             target = target[section]
         target[option] = value

@@ -145,7 +145,7 @@ def compare(options: argparse.Namespace) -> None:
 
 
 def evaluate(options: argparse.Namespace) -> None:
-    scores = with_settings({}, options.protocol_options)
+    scores = with_settings({}, options.protocol_options, "--protocol-options")
     evaluation = evaluating.evaluate(
         options.protocol,
         options.dataset_path,

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
+from colmap_affrect.cli.flags import FLAGS
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
@@ -27,12 +28,14 @@ AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 def over(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOptions:
     """Return options with what is given of a section, as ``cameras.mode`` of ``cameras``."""
-    given = {
-        name.removeprefix(f"{section}."): str(value.resolve()) if isinstance(value, Path) else value
-        for name, value in vars(options).items()
-        if name.startswith(f"{section}.") and value is not None
-    }
-    return known.from_mapping({**known.to_mapping(), **given}, section)
+    given, flags = known.to_mapping(), []
+    for flag, settings in FLAGS.items():
+        place, _, field = settings.get("dest", "").rpartition(".")
+        value = getattr(options, f"{place}.{field}", None)
+        if place == section and value is not None:
+            given[field] = str(value.resolve()) if isinstance(value, Path) else value
+            flags.append(flag)
+    return known.from_mapping(given, ", ".join(flags))
 
 
 def inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[str, Any]:
@@ -91,7 +94,8 @@ def mapping(
     """Return the mapper that is given, or what is known."""
     given: dict[str, Any] = _seed(options)
     if options.mapper_options:
-        given["mapper_options"] = flat(with_settings({}, options.mapper_options))
+        native = with_settings({}, options.mapper_options, "--mapper-options")
+        given["mapper_options"] = flat(native)
     if options.preset or options.mapper or not known:
         recipe = recipe or Recipe()
         known = recipe.mapper_options(options.preset or "sparse", options.mapper or "")

@@ -241,7 +241,7 @@ def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
         ("--device gpu", "--device gpu: not one of auto, cpu, cuda"),
         ("--recipe depth-planes", "give --depth-path FOLDER"),
         ("--recipe defalt", "did you mean 'default'"),
-        ("--pairs vocab", "pairs: methods='vocab': should be"),
+        ("--pairs vocab", "--pairs: methods='vocab': should be"),
         ("--refine-existing", "--refine-existing: only with --extend MODEL"),
         ("--camera-params 1,2", "SIMPLE_RADIAL needs 4 values"),
         ("--preset dense", "invalid choice: 'dense'"),
