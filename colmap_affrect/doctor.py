@@ -162,7 +162,8 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
     for kind in sorted(problems, key=list(CHECKS).index):
         what, usual = CHECKS[kind]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
-        diagnosis.add("error", path, f"{what}{items}", advice or usual.format(path=quoted))
+        severity: Severity = "warning" if kind == "camera-panorama" else "error"  # of use to COLMAP
+        diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
     return True
 
 

@@ -156,15 +156,13 @@ def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
 
 
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
-    query = "SELECT data FROM keypoints WHERE image_id = ?"
-    for image_id, name in tables.names.items():
-        if image_id not in tables.keypoints:
+    rows = rows_of(connection, "image_id rows cols data", "keypoints")
+    for image_id, count, width, blob in rows:
+        if not (name := tables.names.get(image_id)):
             continue
-        count, width = tables.keypoints[image_id]
         if count and width not in KEYPOINT_COLUMNS:
             found["keypoint-data"].append(f"{name} has {width}")
             continue
-        (blob,) = connection.execute(query, [image_id]).fetchone()
         keypoints = _array(blob, count, width, np.dtype("<f4"))
         if keypoints is None:
             found["keypoint-data"].append(name)

@@ -12,7 +12,7 @@ from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusabl
 from colmap_affrect.colmap.database import open_database, write_frame
 from colmap_affrect.colmap.tables import DAMAGED, open_read_only
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.project.outputs import remove_database
+from colmap_affrect.project.outputs import temporary_folder
 
 
 def schema_version(path: Path) -> int:
@@ -57,12 +57,11 @@ def copy_database(
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
+    refuse_newer(source)
     if refused:
         refuse_unusable(source, refused)
-    new = target.with_name(target.name + ".new")
-    remove_database(new)
-    try:
-        refuse_newer(source)
+    with temporary_folder(target.parent) as folder:
+        new = folder / target.name
         try:
             with open_read_only(source) as original, closing(sqlite3.connect(new)) as copy:
                 original.backup(copy)
@@ -72,8 +71,6 @@ def copy_database(
             if change:
                 change(database)
         new.replace(target)
-    finally:
-        remove_database(new)
 
 
 def copy_without_features(source: Path, target: Path) -> None:

@@ -1,4 +1,4 @@
-"""Files of COLMAP models: walked through, compared with their digests, read and written.
+"""COLMAP models: files walked through, compared with their digests, read, written; their poses.
 
 pycolmap's reader never ends, takes all memory or ends the process where a count in a file is wrong.
 So every record is followed to the end of its file first. Models of ours have a digest of their
@@ -21,6 +21,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import (
     DAMAGE,
     AffrectError,
+    ComparisonError,
     OptionError,
     StoreError,
     damage,
@@ -28,9 +29,12 @@ from colmap_affrect.errors import (
     made_again,
     reason,
 )
-from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.contents import without_checksum
+
+Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
+Poses = dict[str, Pose]  # poses by image name
 
 SUMMARY = "summary.json"  # beside a model of ours; has the digests of its files as ``model``
 
@@ -231,3 +235,37 @@ def seen_points(image: pycolmap.Image) -> Indices:
     for index in image.get_observation_point2D_idxs():
         seen[index] = image.points2D[index].point3D_id
     return seen
+
+
+def read_poses(model_path: Path) -> Poses:
+    """Read the poses of a COLMAP model, text or binary; ComparisonError when it has none."""
+    poses = model_poses(read_given_model(model_path, error_class=ComparisonError))
+    if not poses:
+        raise ComparisonError(f"{model_path}: the model has no images with poses")
+    return poses
+
+
+def model_poses(model: pycolmap.Reconstruction) -> Poses:
+    """Return the poses of the registered images of a model."""
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    matrices = {image.name: image.cam_from_world().matrix() for image in images}
+    return {name: (matrix[:, :3], matrix[:, 3]) for name, matrix in matrices.items()}
+
+
+def relative_pose(pose1: Pose, pose2: Pose) -> Pose:
+    """Compute cam2_from_cam1 from two cam_from_world poses."""
+    rotation = pose2[0] @ pose1[0].T
+    return rotation, pose2[1] - rotation @ pose1[1]
+
+
+def pose_errors(estimated: Pose, truth: Pose) -> tuple[float, float]:
+    """Return the angles between two relative poses, degrees: rotation, translation direction."""
+    rotation, translation = estimated
+    true_rotation, true_translation = truth
+    difference = rotation @ true_rotation.T
+    skew = difference - difference.T
+    sine = np.linalg.norm([skew[2, 1], skew[0, 2], skew[1, 0]])
+    rotation_error = np.degrees(np.arctan2(sine, np.trace(difference) - 1.0))
+    cross = np.linalg.norm(np.cross(translation, true_translation))
+    direction_error = np.degrees(np.arctan2(cross, translation @ true_translation))
+    return float(rotation_error), float(direction_error)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import Pose
+from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.epipolar import (
     EpipolarModel,

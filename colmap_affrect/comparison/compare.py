@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.colmap.poses import Poses, read_poses
+from colmap_affrect.colmap.model_files import Poses, read_poses
 from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import parse_methods

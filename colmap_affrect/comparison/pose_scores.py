@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from colmap_affrect.colmap.poses import Poses, pose_errors, relative_pose
+from colmap_affrect.colmap.model_files import Poses, pose_errors, relative_pose
 from colmap_affrect.pairs.base import Pair
 
 PairErrors = Mapping[Pair, tuple[float, float]]

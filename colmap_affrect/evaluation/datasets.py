@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import Pose, relative_pose
+from colmap_affrect.colmap.model_files import Pose, relative_pose
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError, damage, such_as
 from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
 from colmap_affrect.geometry.arrays import Array

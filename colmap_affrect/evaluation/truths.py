@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BeforeValidator
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import Pose, pose_errors
+from colmap_affrect.colmap.model_files import Pose, pose_errors
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats

@@ -56,7 +56,7 @@ def export(
     photographs = image_path or Workspace.of_model(model_path).photographs()
     source = Source(model_path, read_given_model(model_path), photographs)
     chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
-    names = dict.fromkeys(name for _, made in chosen.values() for name in made)
+    names = dict.fromkeys(made for _, made in chosen.values())
     targets = [output_path / name for name in names]
     images = [image.name for image in source.images()]
     with new_results(*targets, photographs=photographs, names=images) as made:
@@ -157,12 +157,12 @@ def _no_formula(text: str) -> str:
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
-FORMATS: dict[str, tuple[Callable[[Source, Path], Path], tuple[str, ...]]] = {
-    "ply": (_points, ("points3D.ply",)),
-    "text": (_text, ("text",)),
-    "undistorted": (_undistorted, (DENSE,)),
-    "nerfstudio": (_nerfstudio, (DENSE,)),
-    "cameras": (_cameras, ("cameras.csv",)),
+FORMATS: dict[str, tuple[Callable[[Source, Path], Path], str]] = {
+    "ply": (_points, "points3D.ply"),
+    "text": (_text, "text"),
+    "undistorted": (_undistorted, DENSE),
+    "nerfstudio": (_nerfstudio, DENSE),
+    "cameras": (_cameras, "cameras.csv"),
 }
 """What writes each format into a folder, and what it leaves there; ``undistorted`` comes before
 ``nerfstudio``, which uses its folder."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import Pose
+from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.two_views import (
     ScaleEstimate,
     scale_between,

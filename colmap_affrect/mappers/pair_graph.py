@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.poses import Pose, relative_pose
+from colmap_affrect.colmap.model_files import Pose, relative_pose
 from colmap_affrect.colmap.two_views import decomposed_homography, homography_matrix
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.geometry.epipolar import sampson_errors

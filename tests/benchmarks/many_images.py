@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from machine import describe_machine, parser_of, table
 
-from colmap_affrect.colmap.poses import read_poses
+from colmap_affrect.colmap.model_files import read_poses
 from colmap_affrect.comparison.pose_scores import pose_scores
 from colmap_affrect.parallel.executor import available_cores
 

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.poses import model_poses, pose_errors, read_poses, relative_pose
+from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
 from colmap_affrect.comparison import pose_scores
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MappingTask
 from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS, measure

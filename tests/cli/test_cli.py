@@ -14,7 +14,7 @@ from small_scene import write_photographs
 
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
-from colmap_affrect.colmap.poses import model_poses
+from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.reliability import Judgement

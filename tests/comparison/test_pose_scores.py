@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_affrect.colmap.poses import Poses, read_poses
+from colmap_affrect.colmap.model_files import Poses, read_poses
 from colmap_affrect.comparison.pose_scores import (
     PoseScores,
     correct_images,

@@ -15,7 +15,7 @@ import pytest
 from posed_photographs import SIZE, TRUTH, pose, write_extreme_views, write_pair
 from small_scene import FOCAL_PX
 
-from colmap_affrect.colmap.poses import relative_pose
+from colmap_affrect.colmap.model_files import relative_pose
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.datasets import Dataset, load_evd, load_imc, load_pairs, load_svp
 

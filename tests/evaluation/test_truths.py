@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import Pose, relative_pose
+from colmap_affrect.colmap.model_files import Pose, relative_pose
 from colmap_affrect.evaluation.truths import (
     Correspondences,
     PairResult,

@@ -10,7 +10,7 @@ from mapping_tasks import task_with_given_cameras
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.poses import model_poses
+from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions

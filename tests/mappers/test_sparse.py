@@ -12,7 +12,7 @@ from mapping_tasks import task_with_given_cameras
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import Poses, model_poses, pose_errors, relative_pose
+from colmap_affrect.colmap.model_files import Poses, model_poses, pose_errors, relative_pose
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.loops import contradicting_pairs, dispensable
