@@ -212,11 +212,6 @@ class RectificationPlan:
     replaces_original: bool = False
 
     @property
-    def num_regions(self) -> int:
-        """Number of different segments of the image that are warped; a whole image is one."""
-        return len({item.segment_id for item in self.items})
-
-    @property
     def rectified_area_px(self) -> int:
         """Pixels of all warps together."""
         return sum(item.canvas_area_px for item in self.items)

@@ -36,17 +36,12 @@ def resolve_device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not re.fullmatch(r"cpu|cuda(:\d+)?|mps", name):
         raise OptionError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
-    device = torch.device(name)
-    counts = {"cpu": lambda: 1, "cuda": torch.cuda.device_count}
-    count = counts.get(device.type, torch.backends.mps.is_available)()
-    if not count:
-        kind = device.type.upper()
-        raise DeviceError(
-            f"--device {name}: torch finds no {kind} device; use --device cpu or auto"
-        )
-    if (device.index or 0) >= count:
-        raise DeviceError(f"--device {name}: the last one is cuda:{count - 1}; use that")
-    return device
+    try:
+        torch.empty(0, device=name)
+    except (AssertionError, RuntimeError) as error:
+        why = str(error).splitlines()[0]
+        raise DeviceError(f"--device {name}: {why}; use --device cpu or auto") from error
+    return torch.device(name)
 
 
 def load_affnet(path: Path, device: str) -> nn.Sequential:
@@ -55,7 +50,9 @@ def load_affnet(path: Path, device: str) -> nn.Sequential:
     Standardized patches (B, 1, 32, 32) give (B, 3, 1, 1); an image of H x W px gives (ceil(H / 4) -
     7) x (ceil(W / 4) - 7) cells, where cell (i, j) has the patch whose first pixel is (4 j, 4 i).
     """
-    network = _loaded(feature.LAFAffNetShapeEstimator(pretrained=False), path, "AffNet")
+    network = _with_state(
+        feature.LAFAffNetShapeEstimator(pretrained=False), load_state_dict(path), path, "AffNet"
+    )
     kept = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU, nn.Tanh)
     layers = nn.Sequential(*(layer for layer in network.features if isinstance(layer, kept)))
     return _ready(folded(layers), device)
@@ -76,18 +73,19 @@ def load_orinet(path: Path, device: str) -> feature.OriNet:
     kornia's convention: an orientation a is a frame turned by [[cos a, sin a], [-sin a, cos a]],
     which is R(-a) here.
     """
-    network = _loaded(feature.OriNet(pretrained=False), path, "OriNet")
+    network = _with_state(feature.OriNet(pretrained=False), load_state_dict(path), path, "OriNet")
     network.features = folded(network.features)
     return _ready(network, device)
 
 
 def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
     """Build a network from (B, 1, 32, 32) patches in [0, 1] to (B, 128) rows of any length."""
+    state = load_state_dict(path)
     if name == "hardtfeat":
         # The file also holds a SIFT that helped in its training.
-        state = {k: v for k, v in load_state_dict(path).items() if not k.startswith("SIFT.")}
+        state = {key: value for key, value in state.items() if not key.startswith("SIFT.")}
         return _ready(_with_state(hardtfeat(), state, path, name), device)
-    network = _loaded(feature.HardNet(pretrained=False), path, name)
+    network = _with_state(feature.HardNet(pretrained=False), state, path, name)
     network.features = folded(network.features)
     return _ready(network, device)
 
@@ -139,35 +137,14 @@ def folded(layers: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*kept)
 
 
-def _loaded(network: Network, path: Path, name: str) -> Network:
-    """Give a network the parameters in a file; WeightsError when they are not exactly its own."""
-    return _with_state(network, load_state_dict(path), path, name)
-
-
-COUNTER = "num_batches_tracked"  # of batch normalisations; older files have none
-
-
 def _with_state(network: Network, state: Mapping[str, Any], path: Path, name: str) -> Network:
-    given, wanted = (
-        {key: _kind(value) for key, value in values.items() if not key.endswith(COUNTER)}
-        for values in (state, network.state_dict())
-    )
-    problems = [f"no {key}" for key in wanted if key not in given]
-    problems += [f"unknown {key}" for key in given if key not in wanted]
-    problems += [
-        f"{key} is {given[key]} instead of {kind}"
-        for key, kind in wanted.items()
-        if given.get(key, kind) != kind
-    ]
-    if problems:
-        more = f" and {len(problems) - 1} more" * (len(problems) > 1)
-        raise unusable(path, f"not the weights of {name} ({problems[0]}{more})")
-    network.load_state_dict(state, strict=False)
+    """Give a network the parameters of a file; WeightsError when they are not exactly its own."""
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as error:
+        _, first, *_ = [*str(error).splitlines(), ""]
+        raise unusable(path, f"not the weights of {name} ({first.strip()[:80]})") from error
     return network
-
-
-def _kind(value: Any) -> str:
-    return str(tuple(value.shape)) if isinstance(value, Tensor) else type(value).__name__
 
 
 def _ready(network: Network, device: str) -> Network:

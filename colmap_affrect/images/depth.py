@@ -21,18 +21,14 @@ from colmap_affrect.errors import DepthError, OptionError
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.headers import header_size
+from colmap_affrect.images.reading import decode
 from colmap_affrect.options import PartOptions, Registry
 
 SUFFIXES = (".npy", ".png", ".tif", ".tiff")  # in the order in which they are looked for
-MAX_NUM_VALUES_PER_PX = 4  # of a map, for each pixel of its photograph; more is taken for damage
-MIN_LARGEST_MAP = 1 << 22  # a map of so many values is read whatever the size of the photograph
+MAX_NUM_VALUES = 1 << 27  # of a map; more is taken for damage
 PNG_STEP = 0.001  # depth of one step of 16 bits; only the ratio of depths matters
 MAX_ASPECT_RATIO = 1.05  # of aspects of map and photograph: networks round sizes to 32 px
 MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
-
-
-class _UnusableMap(Exception):
-    """Reason why a map cannot be used; the caller adds the file and the photograph."""
 
 
 class DepthSource(Protocol):
@@ -142,59 +138,53 @@ class DepthFiles:
             raise DepthError(
                 f"{self._path}: no depth map of {photograph.name}; {self._places(photograph.name)}"
             )
+        what = f"{path}: depth map of {photograph.name}"
         try:
-            stored = photograph.path and header_size(photograph.path)
-            values = _read_map(path, prod(stored or photograph.size))
-            if path.suffix == ".png":
-                values = values * PNG_STEP
-            _require_same_aspect(values, photograph)
-            return _z_depth(values, self._options.kind, photograph)
-        except _UnusableMap as error:
-            raise DepthError(f"{path}: depth map of {photograph.name}: {error}") from error
+            values = _read_map(path)
+        except Exception as error:  # damaged files make readers fail in any way
+            raise DepthError(
+                f"{what}: cannot be read; damaged, too large, or not what its suffix says"
+            ) from error
+        if values.ndim != 2 or not values.size or values.dtype.kind not in "fiu":
+            raise DepthError(
+                f"{what}: expected numbers of shape (height, width), found {values.dtype} of shape "
+                f"{values.shape}"
+            )
+        if values.dtype == np.uint8:
+            raise DepthError(
+                f"{what}: 8 bits are a preview, too coarse for depth; give 16 bits, or .npy"
+            )
+        (height, width), size = values.shape, photograph.size
+        if abs(log(width / height) - log(size[0] / size[1])) > log(MAX_ASPECT_RATIO):
+            raise DepthError(
+                f"{what}: is {width} x {height} px, the photograph {size[0]} x {size[1]} (width x "
+                "height): not of this photograph, or turned; map and photograph must have the same "
+                "aspect as stored, EXIF orientation is not applied"
+            )
+        step = PNG_STEP if path.suffix == ".png" else 1.0
+        depth = _z_depth(step * values.astype(np.float64), self._options.kind, photograph)
+        known_frac = np.isfinite(depth).mean()
+        if known_frac < MIN_VALID_FRAC:
+            raise DepthError(
+                f"{what}: {100 * known_frac:.2g} % of the values are depths (finite and positive), "
+                f"at least {100 * MIN_VALID_FRAC:g} % are needed; make the map again"
+            )
+        return depth
 
     def _places(self, name: str) -> str:
         suffixes = ", ".join(SUFFIXES)
         return f"looked for {name}.* and {splitext(name)[0]}.* with * one of {suffixes}"
 
 
-def _read_map(path: Path, num_px: int) -> Array:
-    """Read the (h, w) values of a photograph's map; _UnusableMap if there are none, or too many."""
-    max_num = max(MIN_LARGEST_MAP, MAX_NUM_VALUES_PER_PX * num_px)
-    try:
-        values = _array(path, max_num) if path.suffix == ".npy" else _picture(path, max_num)
-    except _UnusableMap:
-        raise
-    except Exception as error:  # damaged files make readers fail in any way
-        raise _UnusableMap("cannot be read; damaged, or not what its suffix says") from error
-    if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "fiu":
-        raise _UnusableMap(
-            f"expected numbers of shape (height, width), found {values.dtype} of shape "
-            f"{values.shape}"
-        )
-    return values.astype(np.float64)
-
-
-def _require_sensible(shape: tuple[int, ...], max_num: int) -> None:
-    if prod(shape) > max_num:
-        raise _UnusableMap(f"is of shape {shape}, too large for a depth map of it")
-
-
-def _array(path: Path, max_num: int) -> NDArray[Any]:
+def _read_map(path: Path) -> NDArray[Any]:
+    """Read the values of a map; anything is raised for a damaged file, and for too many values."""
+    if path.suffix != ".npy":
+        if prod(header_size(path) or (0,)) > MAX_NUM_VALUES:
+            raise ValueError
+        return decode(path, cv2.IMREAD_UNCHANGED)
     values = np.load(path, mmap_mode="r", allow_pickle=False)  # which takes no memory yet
-    _require_sensible(values.shape, max_num)
-    return np.asarray(values)
-
-
-def _picture(path: Path, max_num: int) -> NDArray[Any]:
-    size = header_size(path)
-    if size is None:
+    if values.size > MAX_NUM_VALUES:
         raise ValueError
-    _require_sensible(size[::-1], max_num)
-    values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if values is None:
-        raise ValueError
-    if values.dtype == np.uint8:
-        raise _UnusableMap("8 bits are a preview, too coarse for depth; give 16 bits, or .npy")
     return np.asarray(values)
 
 
@@ -206,13 +196,7 @@ def _z_depth(values: Floats, kind: str, photograph: Photograph) -> Singles:
         elif kind == "ray":
             values = values / _ray_lengths((values.shape[1], values.shape[0]), photograph)
         depth = values.astype(np.float32)
-    known = np.isfinite(depth) & (depth > 0.0)
-    if known.mean() < MIN_VALID_FRAC:
-        raise _UnusableMap(
-            f"{100 * known.mean():.2g} % of the values are depths (finite and positive), at least "
-            f"{100 * MIN_VALID_FRAC:g} % are needed; make the map again"
-        )
-    return np.where(known, depth, np.float32(np.nan))
+    return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(np.nan))
 
 
 def _ray_lengths(size: tuple[int, int], photograph: Photograph) -> Array:
@@ -221,14 +205,3 @@ def _ray_lengths(size: tuple[int, int], photograph: Photograph) -> Array:
     pixels = np.stack([*np.meshgrid(np.arange(size[0]), np.arange(size[1])), np.ones(size[::-1])])
     rays = np.tensordot(np.linalg.inv(camera), pixels, axes=1)
     return np.asarray(np.linalg.norm(rays, axis=0))
-
-
-def _require_same_aspect(values: Floats, photograph: Photograph) -> None:
-    height, width = values.shape
-    image_width, image_height = photograph.size
-    if abs(log(width / height) - log(image_width / image_height)) > log(MAX_ASPECT_RATIO):
-        raise _UnusableMap(
-            f"is {width} x {height} px, the photograph {image_width} x {image_height} (width x "
-            "height): not of this photograph, or turned; map and photograph must have the same "
-            "aspect as stored, EXIF orientation is not applied"
-        )

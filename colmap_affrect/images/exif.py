@@ -40,7 +40,6 @@ class CameraTags:
     px_per_mm: tuple[float, float | None] | None = None  # focal-plane resolution, x and perhaps y
     original_size: tuple[int, int] | None = None  # (width, height) when EXIF was written
     zoom: float = 1.0  # of the part of the sensor that was enlarged; 1 without
-    absurd: tuple[str, ...] = ()  # names of tags whose values cannot be true
 
     @property
     def identity(self) -> tuple[object, ...] | None:
@@ -85,21 +84,15 @@ def _tags_of_file(file: BinaryIO) -> CameraTags:
         exif = image.getexif()
         tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
     except Exception:  # noqa: BLE001 - damaged tags raise nearly anything in Pillow
-        return CameraTags(size, absurd=("EXIF",))
+        return CameraTags(size)
     return _camera_tags(size, tags)
 
 
 def _camera_tags(size: tuple[int, int], tags: Mapping[int, Any]) -> CameraTags:
     tag = ExifTags.Base
-    absurd: list[str] = []
 
     def number(key: ExifTags.Base) -> float | None:
-        if key not in tags or tags[key] in (0, 0.0):  # how many programs say 'not known'
-            return None
-        value = _positive(tags[key])
-        if value is None:
-            absurd.append(key.name)
-        return value
+        return _positive(tags.get(key))
 
     def text(key: ExifTags.Base) -> str:
         value = tags.get(key)
@@ -117,7 +110,6 @@ def _camera_tags(size: tuple[int, int], tags: Mapping[int, Any]) -> CameraTags:
         (across / unit, down / unit if down else None) if across and unit else None,
         (int(width), int(height)) if width and height and min(width, height) >= 1 else None,
         max(1.0, number(tag.DigitalZoomRatio) or 1.0),
-        tuple(absurd),
     )
 
 
@@ -149,11 +141,6 @@ def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFo
         return ExifFocal(None, why=f"cropped or padded: {_sizes(tags)}")
     if tags.original_size and tags.scale < 1.0 and max(tags.size) <= MAX_THUMBNAIL_PX:
         return ExifFocal(None, why=f"a thumbnail: {_sizes(tags)}")
-    if tags.absurd:
-        problem = f"EXIF has an absurd {' and '.join(tags.absurd)}"
-    else:
-        speaks = tags.focal_mm or tags.equivalent_mm
-        problem = "EXIF has no focal length that can be converted to px" if speaks else ""
     stated = _statements(tags, sensor_width_mm)
     longer = max(tags.size)
     low, high = PLAUSIBLE_FOCALS
@@ -161,7 +148,7 @@ def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFo
     if not plausible:
         key, focal = next(iter(stated.items()), ("", 0.0))
         wrong = f"EXIF's {key} would be a focal length of {focal / longer:.2g} longer sides"
-        return ExifFocal(None, why=wrong if stated else problem or "no EXIF focal length")
+        return ExifFocal(None, why=wrong if stated else "no EXIF focal length in px")
     return _reconciled(tags, stated, plausible)
 
 
@@ -189,22 +176,16 @@ def _reconciled(
 ) -> ExifFocal:
     """Choose among plausible focal lengths, of which some may contradict each other.
 
-    Against a resolution of more pixels, which alone counts for pixels and not for the whole frame,
-    the others are right if the photograph was shrunk, wrong if it was cropped.
+    Against a resolution, which alone counts for pixels and not for the whole frame, the others are
+    right if the photograph was shrunk, wrong if it was cropped.
     """
-    colmaps, pixels = next(iter(stated)), plausible.get(RESOLUTION)
+    colmaps = next(iter(stated))
     key, focal = next(iter(plausible.items()))
     if not all(_agree(other, focal) for other in plausible.values()):
-        agreeing = [k for k, f in plausible.items() if pixels and _agree(f, pixels)]
-        framed = {k: f for k, f in plausible.items() if k != RESOLUTION}
-        whole = any(_similar(_aspect(tags.size), aspect) for aspect in SENSOR_ASPECTS)
-        if len(agreeing) > 1:
-            key = agreeing[0]
-        elif pixels and whole and pixels > max(framed.values()):
-            key = next(iter(framed))
-        else:
+        if not any(_similar(_aspect(tags.size), aspect) for aspect in SENSOR_ASPECTS):
             values = " and ".join(f"{f:.0f} px by its {k}" for k, f in plausible.items())
             return ExifFocal(None, why=f"EXIF contradicts itself: {values}")
+        key = next(each for each in plausible if each != RESOLUTION)
     if key == RESOLUTION and tags.scale != 1.0:
         return ExifFocal(plausible[key], True, f"shrunk: {_sizes(tags)}")
     wrong = [k for k, f in stated.items() if not _agree(f, plausible[key])]

@@ -21,7 +21,7 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
-from colmap_affrect.geometry.arrays import Array, Indices
+from colmap_affrect.geometry.arrays import Array, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.geometry.shapes import of_unit_area
@@ -91,12 +91,9 @@ class LightGlueOptions(MatcherOptions):
         """Refuse features that the weights were not trained for."""
         training = TRAININGS[self.trained_for]
         if extractor not in ("", training.kind):
-            advice = [f"--recipe {training.recipe}"]
-            advice += [f"--set matching.trained_for={name}" for name, other in TRAININGS.items()
-                       if other.kind == extractor]  # fmt: skip
             raise OptionError(
                 f"matching: trained_for={self.trained_for!r} takes features of {training.kind}, "
-                f"not of {extractor}; use {', or '.join(advice)}"
+                f"not of {extractor}; use --recipe {training.recipe}"
             )
 
 
@@ -273,24 +270,26 @@ def promising(
     first: Sequence[PreparedView], second: Sequence[PreparedView], count: int
 ) -> list[tuple[PreparedView, PreparedView]]:
     """Return the pairs of views with most mutual nearest neighbours among all features."""
-    descriptors, numbers = [], []
-    for views in (first, second):
-        descriptors.append(np.concatenate([v.inputs["descriptors"][0].numpy() for v in views]))
-        numbers.append(np.repeat(np.arange(len(views)), [len(view.rows) for view in views]))
-    views1, views2 = numbers
-    nearest1 = np.empty(len(views1), np.int64)
-    nearest2, closest = np.zeros(len(views2), np.int64), np.full(len(views2), -np.inf)
-    for start in range(0, len(views1), CHUNK_ROWS):
-        similarities = descriptors[0][start : start + CHUNK_ROWS] @ descriptors[1].T
-        nearest1[start : start + CHUNK_ROWS] = similarities.argmax(axis=1)
-        best = similarities.max(axis=0)
-        nearest2 = np.where(best > closest, start + similarities.argmax(axis=0), nearest2)
-        closest = np.maximum(best, closest)
-    mutual = nearest2[nearest1] == np.arange(len(views1))
+    descriptors1, descriptors2 = (
+        np.concatenate([view.inputs["descriptors"][0].numpy() for view in views])
+        for views in (first, second)
+    )
+    views1, views2 = (
+        np.repeat(np.arange(len(views)), [len(view.rows) for view in views])
+        for views in (first, second)
+    )
+    nearest1 = _nearest(descriptors1, descriptors2)
+    mutual = _nearest(descriptors2, descriptors1)[nearest1] == np.arange(len(views1))
     shared = np.zeros((len(first), len(second)), np.int64)
     np.add.at(shared, (views1[mutual], views2[nearest1[mutual]]), 1)
     chosen = np.argsort(-shared, axis=None, kind="stable")[:count]
     return [(first[i], second[j]) for i, j in zip(*np.divmod(chosen, len(second)), strict=True)]
+
+
+def _nearest(queries: Singles, descriptors: Singles) -> Indices:
+    """Return the most similar of (M, D) descriptors for each of (N, D) queries."""
+    chunks = (queries[i : i + CHUNK_ROWS] for i in range(0, len(queries), CHUNK_ROWS))
+    return np.concatenate([(chunk @ descriptors.T).argmax(axis=1) for chunk in chunks])
 
 
 def united(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matches:

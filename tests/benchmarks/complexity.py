@@ -47,7 +47,8 @@ def cost(extractor: ImageExtractor, path: Path) -> np.ndarray:
     photograph, _ = extractor.photograph(path)
     level = inspect_level(extractor, photograph, 0)
     area_mpx = level.plan.rectified_area_px / 1_000_000
-    counts = len(level.features), level.plan.num_regions, len(level.plan.items)
+    regions = {item.segment_id for item in level.plan.items}
+    counts = len(level.features), len(regions), len(level.plan.items)
     return np.array([area_mpx, *counts, sum(level.seconds.values())])
 
 

@@ -129,7 +129,7 @@ def test_file_of_another_format_or_with_pickled_objects_is_unreadable(tmp_path, 
     np.save(pickled, np.array([[{}, {}]]), allow_pickle=True)
     for content in (b"not what the name says" * 20, pickled.read_bytes()):
         (tmp_path / f"a{suffix}").write_bytes(content)
-        with pytest.raises(DepthError, match=r"not what its suffix says|found object"):
+        with pytest.raises(DepthError, match="not what its suffix says"):
             source(tmp_path).depth(photograph())
 
 
@@ -147,14 +147,12 @@ def test_array_that_is_no_map_of_numbers_is_refused(tmp_path, values):
         source(tmp_path).depth(photograph())
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".png", ".tif"])
-def test_map_far_larger_than_the_photograph_is_refused_by_its_header(tmp_path, suffix):
-    large = np.ones((1800, 2700), np.uint16)
-    write_map(tmp_path / f"a{suffix}", large)
-    with pytest.raises(DepthError, match=r"is of shape .*1800.*, too large for a depth map"):
+@pytest.mark.parametrize("suffix", [".npy", ".png"])
+def test_map_of_too_many_values_is_refused_by_its_header(tmp_path, suffix, monkeypatch):
+    monkeypatch.setattr("colmap_affrect.images.depth.MAX_NUM_VALUES", 23)
+    write_map(tmp_path / f"a{suffix}", np.ones((4, 6), np.uint16))
+    with pytest.raises(DepthError, match="too large"):
         source(tmp_path).depth(photograph())
-    stored = write_image(tmp_path / "photo.png", np.zeros((1200, 1800), np.uint8))
-    assert source(tmp_path).depth(photograph(path=stored)).shape == (1800, 2700)
 
 
 @pytest.mark.parametrize("size", [(4, 6), (12, 7)])

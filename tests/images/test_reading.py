@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -27,21 +26,6 @@ from colmap_affrect.images.reading import (
     shrink_to,
     tones,
 )
-from colmap_affrect.parallel.executor import SHARED_OPENCV_THREADS
-
-
-def test_opencv_threads_are_shared_by_those_who_hold_them() -> None:
-    given = cv2.getNumThreads()
-    try:
-        for all_threads, shares in ((4, [4, 2, 1]), (1, [1, 1, 1])):
-            cv2.setNumThreads(all_threads)
-            with ExitStack() as stack:
-                for share in shares:
-                    stack.enter_context(SHARED_OPENCV_THREADS)
-                    assert cv2.getNumThreads() == share
-            assert cv2.getNumThreads() == all_threads
-    finally:
-        cv2.setNumThreads(given)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])

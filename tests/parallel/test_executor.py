@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 
+import cv2
 import pytest
 
 from colmap_affrect.parallel.executor import map_ordered
@@ -29,6 +30,17 @@ def test_map_ordered_keeps_the_order_and_bounds_what_is_in_flight() -> None:
         results.append(result)
     assert results == [task * task for task in range(50)]
     assert sorted(started) == list(range(50))
+
+
+def test_threads_share_those_of_opencv() -> None:
+    given = cv2.getNumThreads()
+    try:
+        for all_threads, share in ((4, 2), (1, 1)):
+            cv2.setNumThreads(all_threads)
+            assert list(map_ordered(lambda _: cv2.getNumThreads(), [0], 2)) == [share]
+            assert cv2.getNumThreads() == all_threads
+    finally:
+        cv2.setNumThreads(given)
 
 
 def test_map_ordered_raises_an_error_in_its_place() -> None:
