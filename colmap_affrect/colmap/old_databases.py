@@ -11,7 +11,6 @@ from colmap_affrect.colmap.database_copy import copy_database, read_names
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import new_results
-from colmap_affrect.project.workspace import Workspace
 
 VERSION = 3800  # ``user_version`` of COLMAP 3.8; newer ones take the tables over by it
 
@@ -72,8 +71,7 @@ def export_database(source: Path, target: Path) -> None:
     longitude and altitude, or in metres. DatabaseError when the source cannot be used or has a
     camera model that COLMAP 3.8 does not know, OptionError when the target exists.
     """
-    photographs = Workspace(source.parent).photographs()
-    with new_results(target, photographs=photographs, names=read_names(source)) as (old,):
+    with new_results(target, names=read_names(source)) as (old,):
         new = old.with_name("new.db")
         copy_database(source, new, FATAL)
         require_space(target, new.stat().st_size)

@@ -54,7 +54,7 @@ def convert_images(
     if not names:
         raise ImageError(f"{image_path}: holds no photographs")
     with (
-        new_results(output_path, photographs=image_path) as (folder,),
+        new_results(output_path, names=names) as (folder,),
         progress.stage("convert", len(names), "images") as advance,
     ):
         for name in names:

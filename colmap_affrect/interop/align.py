@@ -17,7 +17,6 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.tables import read_table
-from colmap_affrect.project.workspace import Workspace
 
 GEOREFERENCE = "georeference.json"  # beside a model: what COLMAP's files have no place for
 MIN_WIDTH = 0.01  # of known places across the line that fits them best, in units of its length
@@ -88,8 +87,7 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
             raise OptionError("give --gps, --positions, --points or --distance")
         new_from_old, residuals, origin = _similarity(old, true, is_on_earth=is_on_earth)
     model.transform(new_from_old)
-    photographs = Workspace.of_model(model_path).photographs()
-    with new_results(output_path, photographs=photographs, names=images) as (folder,):
+    with new_results(output_path, names=images) as (folder,):
         write_model(model, folder)
         if origin:
             content = dict(zip(ON_EARTH, origin, strict=True))

@@ -59,7 +59,7 @@ def export(
     names = dict.fromkeys(made for _, made in chosen.values())
     targets = [output_path / name for name in names]
     images = [image.name for image in source.images()]
-    with new_results(*targets, photographs=photographs, names=images) as made:
+    with new_results(*targets, names=images) as made:
         folder = made[0].parent
         written = {name: write(source, folder) for name, (write, _) in chosen.items()}
     return {name: output_path / path.relative_to(folder) for name, path in written.items()}

@@ -162,7 +162,7 @@ def import_h5(
     InitialCameras(image_path, cameras).check(names)
     with (
         # Verification may take hours, and half a database must not be left behind.
-        new_results(database_path, photographs=image_path) as (new,),
+        new_results(database_path, names=names) as (new,),
         _opened(features_path) as features,
         _opened(matches_path) as matches,
     ):

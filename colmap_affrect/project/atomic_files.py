@@ -122,19 +122,19 @@ def uninterrupted() -> Iterator[None]:
 
     A ``KeyboardInterrupt`` inside a callback of a C library would leave it in disorder.
     """
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    known = {number: handler for number, handler in handlers.items() if handler is not None}
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     put_off: list[int] = []
-    for number in known:
-        signal.signal(number, lambda number, _: put_off.append(number))
+    handlers = {
+        number: signal.signal(number, lambda number, _: put_off.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
-        for number, handler in known.items():
-            signal.signal(number, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler or signal.SIG_DFL)
         for again in dict.fromkeys(put_off):
             signal.raise_signal(again)
 

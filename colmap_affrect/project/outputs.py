@@ -55,44 +55,27 @@ def refuse_link(path: Path) -> None:
         )
 
 
-def photograph_folder_above(names: Collection[str], target: Path) -> Path | None:
-    """Return the folder of a file to be written, or that above, if photographs lie there."""
-    inner = [name for name in names if not leads_outside(name)]
-    for folder in _resolved(target).parents[:2]:
-        for name in inner:
-            with suppress(OSError):  # a name that is too long, for one
-                if (folder / name).is_file():
-                    return folder
-    return None
+def refuse_photographs(target: Path, names: Collection[str]) -> None:
+    """Refuse to write among photographs of these names: results would be taken for some.
 
-
-def refuse_photographs(target: Path, photographs: Path) -> None:
-    """Refuse to write among photographs, where results would be taken for some; OptionError.
-
-    Work folders of ours are allowed there: the search for photographs skips them.
+    Work folders of ours are allowed there: the search for photographs skips them. Raises
+    OptionError.
     """
-    place, folder = _resolved(target), photographs.resolve()
-    inside = [p for p in (place, *place.parents) if folder in p.parents]
-    if place != folder and not inside:
-        return
-    if not any(map(is_output_folder, inside)):
-        raise OptionError(
-            f"{target}: lies in the folder of the photographs, {photographs}; give another name or "
-            "folder"
-        )
-
-
-def _resolved(target: Path) -> Path:
-    """Return where a file or folder will be; if it is a link itself, where that is."""
-    return target.parent.resolve() / target.name
+    inner = [name for name in names if not leads_outside(name)]
+    for folder in target.parent.resolve(), *target.parent.resolve().parents:
+        if not inner or is_output_folder(folder):
+            return
+        with suppress(OSError):  # a name that is too long, for one
+            if all((folder / name).is_file() for name in inner):
+                raise OptionError(
+                    f"{target}: lies in the folder of the photographs, {folder}; give another name "
+                    "or folder"
+                )
 
 
 @contextmanager
 def new_results(
-    *targets: Path,
-    photographs: Path | None = None,
-    names: Collection[str] = (),
-    replaces: bool = False,
+    *targets: Path, names: Collection[str] = (), replaces: bool = False
 ) -> Iterator[list[Path]]:
     """Yield paths for files or folders to be made, which get their names when all are whole.
 
@@ -100,8 +83,7 @@ def new_results(
 
     Args:
         *targets: what is to be made; missing folders above are made.
-        photographs: folder in which nothing may be made.
-        names: of the photographs, where their folder is not known: nothing is made where they lie.
+        names: of the photographs: nothing is made in the folder where they lie.
         replaces: files that are there give way; else nothing is overwritten.
 
     Raises:
@@ -116,8 +98,7 @@ def new_results(
                 f"{target}: lies beside the models of a run, which mapping removes; give another "
                 "name or folder"
             )
-        if place := photographs or photograph_folder_above(names, target):
-            refuse_photographs(target, place)
+        refuse_photographs(target, names)
         if not replaces:
             _refuse_existing(target)
     with ExitStack() as stack:

@@ -101,17 +101,18 @@ def test_nothing_is_made_beside_the_models_of_a_run(tmp_path: Path) -> None:
 
 
 def test_among_photographs_only_work_folders_are_written(tmp_path: Path) -> None:
-    photographs = tmp_path / "photographs"
+    photographs, names = tmp_path / "photographs", ["a.png", "side/b.png", "../c.png"]
+    for name in names[:2]:
+        (photographs / name).parent.mkdir(parents=True, exist_ok=True)
+        (photographs / name).touch()
     work = Workspace(photographs / "out")
-    refuse_photographs(tmp_path / "photographs2", photographs)
-    for target in (photographs, photographs / "a.ply", work.path / "export" / "a.ply"):
-        with pytest.raises(OptionError, match="lies in the folder of the photographs"):
-            refuse_photographs(target, photographs)
-    work.begin()
-    refuse_photographs(work.path / "export" / "a.ply", photographs)
+    refuse_photographs(tmp_path / "photographs2", names)
     (tmp_path / "link").symlink_to(photographs)
-    with pytest.raises(OptionError, match="lies in the folder of the photographs"):
-        refuse_photographs(tmp_path / "link" / "a.ply", photographs)
+    for target in (photographs, work.path / "export", tmp_path / "link"):
+        with pytest.raises(OptionError, match="lies in the folder of the photographs"):
+            refuse_photographs(target / "a.ply", names)
+    work.begin()
+    refuse_photographs(work.path / "export" / "a.ply", names)
 
 
 def test_temporary_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path) -> None:
