@@ -3,7 +3,6 @@
 Everything is checked before it is written: an index out of range would later end the process.
 """
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -110,20 +109,6 @@ def generated_pairs(
         names = {image.image_id: image.name for image in database.read_all_images()}
         found = kind(options, database).all_pairs()
     return sorted({(min(names[i], names[j]), max(names[i], names[j])) for i, j in found})
-
-
-def geometry_digest(path: Path) -> str:
-    """Return a sha256 of which pairs are verified with how many inliers, and of the cameras."""
-    with open_database(path) as database:
-        pair_ids, counts = database.read_two_view_geometry_num_inliers()
-        cameras = database.read_all_cameras()
-    lines = sorted(f"{pair} {count}" for pair, count in zip(pair_ids, counts, strict=True))
-    lines += sorted(
-        f"{camera.camera_id} {camera.model.name} {camera.params.tolist()}"
-        f" {camera.has_prior_focal_length}"
-        for camera in cameras
-    )
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def num_matched_pairs(path: Path) -> int:

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from colmap_affrect.colmap.database import geometry_digest
 from colmap_affrect.colmap.model_files import registered_names, require_intact
+from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import MapperOptions, MappingTask
 from colmap_affrect.options import digest_of
@@ -44,7 +44,7 @@ def with_snapshots(
         yield task
         return
     given = {str(key): record.given for key, record in task.cameras.items()}
-    made_from = [geometry_digest(task.database_path), options.to_mapping(), given]
+    made_from = [rows_digest(task.database_path), options.to_mapping(), given]
     digest = digest_of(made_from)
     record = folder / INPUTS
     if not (record.exists() and record.read_bytes() == digest.encode()):

@@ -9,6 +9,7 @@ from pathlib import Path
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.features.weights import install_hint
@@ -113,7 +114,7 @@ def _may_share(context: Context) -> bool:
 
 def _inputs(workspace: Workspace, extend: Extension | None) -> str:
     """Return the digests of verified pairs and, after a space, of the model that is extended."""
-    geometry = colmap_database.geometry_digest(workspace.database)
+    geometry = rows_digest(workspace.database)
     if not extend:
         return geometry
     own = extend.model_path.resolve().is_relative_to(workspace.sparse.resolve())

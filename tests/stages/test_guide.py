@@ -13,7 +13,8 @@ from results import database_content
 from small_scene import INTRINSICS, NAMES
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import geometry_digest, image_ids, open_database
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.incremental import IncrementalOptions
@@ -90,7 +91,7 @@ def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, contex
             assert len(np.unique(verified[pair][:, side])) == len(verified[pair])
     raw = [raw_matches(item.database) for item in (before, context.workspace)]
     assert raw[0] == raw[1]
-    assert geometry_digest(before.database) != geometry_digest(context.workspace.database)
+    assert rows_digest(before.database) != rows_digest(context.workspace.database)
 
 
 def raw_matches(path: Path) -> list[tuple[int, bytes]]:
@@ -116,10 +117,10 @@ def test_guided_matches_are_right(guided: Context) -> None:
 
 
 def test_sets_that_hang_together_are_left_alone(before: Workspace, context: Context) -> None:
-    digest = geometry_digest(before.database)
+    digest = rows_digest(before.database)
     assert guide(context).num_done == 0
     assert not context.workspace.guided.exists()
-    assert geometry_digest(context.workspace.database) == digest
+    assert rows_digest(context.workspace.database) == digest
 
 
 def test_only_images_in_need(context: Context) -> None:
