@@ -5,7 +5,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from typing import TextIO
 
@@ -65,10 +65,9 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
         workspace.require_own(options.image_path or options.dataset_path)
         log_path = workspace.log
     log_path.parent.mkdir(parents=True, exist_ok=True)
-    python_stderr, terminal_fd = sys.stderr, os.dup(2)
-    terminal = os.fdopen(terminal_fd, "w", buffering=1, encoding="utf-8", errors="replace")
+    terminal = os.fdopen(os.dup(2), "w", buffering=1, encoding="utf-8", errors="replace")
     log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
-    with terminal, closing(log):
+    with terminal, closing(log), redirect_stderr(terminal):
         shown = logging.StreamHandler(terminal)
         level = logging.DEBUG if options.verbose else logging.WARNING
         shown.setLevel(logging.ERROR if options.quiet else level)
@@ -79,7 +78,6 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
         logger.setLevel(logging.DEBUG)
         logger.info("colmap-affrect %s: %s", __version__, " ".join(sys.argv[1:]))
         os.dup2(log.stream.fileno(), 2)
-        sys.stderr = terminal
         try:
             yield
         except Exception as error:
@@ -89,7 +87,6 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
                 remove_own([new])
             raise
         finally:
-            sys.stderr = python_stderr
             os.dup2(terminal.fileno(), 2)
             logger.removeHandler(shown)
             logger.removeHandler(log)

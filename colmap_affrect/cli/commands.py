@@ -19,7 +19,6 @@ from colmap_affrect.comparison.method_run import CompareOptions
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.errors import ComparisonError, ImageError, NoModelError, OptionError, such_as
 from colmap_affrect.evaluation import evaluate as evaluating
-from colmap_affrect.evaluation.truths import ScoreOptions
 from colmap_affrect.features import weights as files
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs
@@ -31,7 +30,7 @@ from colmap_affrect.options import described_toml
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe, recipe_names, with_settings
+from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.stages.escalate import escalate as escalate_pairs
 from colmap_affrect.stages.extract import extract as extract_features
@@ -145,7 +144,6 @@ def compare(options: argparse.Namespace) -> None:
 
 
 def evaluate(options: argparse.Namespace) -> None:
-    scores = with_settings({}, options.protocol_options, "--protocol-options")
     evaluation = evaluating.evaluate(
         options.protocol,
         options.dataset_path,
@@ -154,7 +152,6 @@ def evaluate(options: argparse.Namespace) -> None:
             recipes=parse_methods(options.recipes, given.depth_settings(options)),
             max_num_keypoints=options.max_num_keypoints,
             random_seed=options.random_seed or 0,
-            scores=ScoreOptions.from_mapping(scores, "--protocol-options"),
             resources=given.resources(options),
         ),
         overwrite=options.overwrite,
@@ -173,7 +170,6 @@ def import_h5(options: argparse.Namespace) -> None:
         options.matches_path,
         options.database_path,
         cameras=given.over(CameraOptions(), options, "cameras"),
-        skip_verification=options.skip_verification,
         random_seed=options.random_seed or 0,
         progress=given.progress(options),
     )

@@ -11,7 +11,6 @@ from colmap_affrect.options import PRESETS
 
 Settings = dict[str, Any]
 """What ``add_argument`` takes."""
-MANY: Settings = {"nargs": "+", "action": "extend", "default": []}
 
 
 def _value(metavar: str, text: str, **settings: Any) -> Settings:
@@ -23,7 +22,7 @@ def _path(metavar: str, text: str, **settings: Any) -> Settings:
 
 
 def _switch(text: str, **settings: Any) -> Settings:
-    return {"action": "store_true", "help": text, **settings}
+    return {"action": "store_true", "default": None, "help": text, **settings}
 
 
 def integers(text: str) -> tuple[int, ...]:
@@ -114,7 +113,7 @@ FLAGS: dict[str, Settings] = {
     "--mapper-options": _value("KEY=VALUE", "options of pycolmap's IncrementalPipelineOptions or "
         "GlobalPipelineOptions, e.g. ba_refine_principal_point=true "
         "mapper.abs_pose_min_num_inliers=10; they win over the preset. With num_threads other "
-        "than 1 results vary from run to run", **MANY),
+        "than 1 results vary from run to run", nargs="+", action="extend", default=[]),
     "--extend": _path("MODEL", "register new photographs into this COLMAP model, whose poses and "
         "cameras stay; it may be of another program, and its photographs must be among those "
         "given"),
@@ -140,14 +139,11 @@ FLAGS: dict[str, Settings] = {
         default=["unrectified-rootsift", "default"]),
     "--max-num-keypoints": _value("N", "equal budget: match only the strongest N features of each "
         "image, warps included", type=int),
-    "--protocol-options": _value("KEY=VALUE", "settings of the protocol, e.g. threshold_px=1, "
-        "max_num_iterations=1000 (svp, imc: what the code of the paper did)", **MANY),
     # features and models from and for other programs
     "--output-path@photographs": _path("PATH", "new folder for them", dest="target_path"),
     "--features-path": _path("FILE", "HDF5 file of features"),
     "--matches-path": _path("FILE", "HDF5 file of matches"),
     "--database-path": _path("FILE", "the database to make; must not exist"),
-    "--skip-verification": _switch("no two-view geometries"),
     "--database-path@read": _path("FILE", "any COLMAP database; a copy of it is read"),
     "--colmap": _value("VERSION", "whose tables to write; COLMAP 3.8 to 3.13 read those of 3.8",
         choices=["3.8"], default="3.8"),

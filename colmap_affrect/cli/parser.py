@@ -4,7 +4,7 @@ import argparse
 import re
 import sys
 from difflib import get_close_matches
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 from colmap_affrect import __version__
 from colmap_affrect.cli.flags import FLAGS
@@ -87,38 +87,24 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"colmap-affrect {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, command in COMMANDS.items():
-        summary = command.summary
+    for name, (summary, flags) in COMMANDS.items():
         subparser = commands.add_parser(
             name, help=summary, description=summary, epilog=epilog(name), **usual
         )
-        found = {action.dest for word in command.flags.split() for action in _add(subparser, word)}
+        found = {action.dest for word in flags.split() for action in _add(subparser, word)}
         parser.set_defaults(**dict.fromkeys(found))
     return parser
 
 
 def _add(parser: argparse.ArgumentParser, word: str) -> list[argparse.Action]:
-    """Add a flag, or several that exclude each other; see :class:`Command`."""
-    names, required = word.rstrip("!").split("|"), word.endswith("!")
-    target: Any = parser
-    if len(names) > 1:
-        target = parser.add_mutually_exclusive_group(required=required)
-    more = {"required": True} if required and target is parser else {}
+    """Add a flag, or several that exclude each other; see :data:`COMMANDS`."""
+    names = word.removesuffix("!").split("|")
+    required: dict[str, Any] = {"required": True} if word.endswith("!") else {}
+    target = parser.add_mutually_exclusive_group() if len(names) > 1 else parser
     return [
-        target.add_argument(*spelled.split(","), **{"default": None, **FLAGS[name]}, **more)
+        target.add_argument(*name.partition("@")[0].split(","), **FLAGS[name], **required)
         for name in names
-        for spelled in [name.partition("@")[0]]
     ]
-
-
-class Command(NamedTuple):
-    """A command: what it does in one line, and its flags of :data:`.flags.FLAGS`.
-
-    One with an exclamation mark must be given; of those that ``|`` joins only one may be.
-    """
-
-    summary: str
-    flags: str
 
 
 VOLUME = "-q,--quiet|-v,--verbose"
@@ -133,54 +119,58 @@ NETWORKS = "--weights --device"
 MAPPER = "--preset --mapper --mapper-options"
 MODEL = "--extend --refine-existing --random-seed --json --no-page"
 
-COMMANDS = {
-    "run": Command("all stages: photographs in, COLMAP model out",
+COMMANDS: dict[str, tuple[str, str]] = {
+    "run": ("all stages: photographs in, COLMAP model out",
         f"{RESULTS} {IMAGES} {RECIPE} --depth-path --database-descriptors {NETWORKS} --scheduler "
         f"{PAIRS} {MAPPER} {MODEL}"),
-    "extract": Command("features into features.h5 and database.db",
+    "extract": ("features into features.h5 and database.db",
         f"{RESULTS} {IMAGES} {RECIPE} --depth-path --database-descriptors {NETWORKS} --scheduler"),
-    "pairs": Command("which images to match, into pairs.txt", f"{RESULTS} {PAIRS}"),
-    "match": Command("matches into matches.h5 and database.db",
+    "pairs": ("which images to match, into pairs.txt", f"{RESULTS} {PAIRS}"),
+    "match": ("matches into matches.h5 and database.db",
         f"{RESULTS} --set {NETWORKS} --scheduler"),
-    "verify": Command("two-view geometries into database.db", f"{RESULTS} --preset --random-seed"),
-    "escalate": Command(
+    "verify": ("two-view geometries into database.db", f"{RESULTS} --preset --random-seed"),
+    "escalate": (
         "match pairs that failed again, with more warps (recipes that escalate, as on-demand)",
         f"{RESULTS} --set {NETWORKS} --scheduler"),
-    "guide": Command("match verified pairs again, guided by their geometry",
+    "guide": ("match verified pairs again, guided by their geometry",
         f"{RESULTS} --set --scheduler"),
-    "map": Command("COLMAP models into sparse/",
+    "map": ("COLMAP models into sparse/",
         f"{RESULTS} --from-database@map --image-path@map {MAPPER} {MODEL}"),
-    "compare": Command(
+    "compare": (
         "how many photographs, and which, COLMAP's SIFT and recipes register; with pictures",
         f"{RESULTS} {IMAGES} --methods --seeds --ground-truth-path --depth-path {NETWORKS} "
         f"--match-list-path {MAPPER} --json"),
-    "evaluate": Command(
+    "evaluate": (
         "score recipes on pairs of images with a known truth, as the paper does on its datasets",
-        f"{RESULTS} protocol --dataset-path! --recipes --max-num-keypoints --protocol-options "
+        f"{RESULTS} protocol --dataset-path! --recipes --max-num-keypoints "
         f"--depth-path {NETWORKS} --random-seed --json"),
-    "convert": Command(
+    "convert": (
         "a folder of photographs in formats that COLMAP reads: JPEG 2000, WebP, HEIC, pages",
         f"--image-path! --output-path@photographs! {VOLUME}"),
-    "inspect": Command(
+    "inspect": (
         "draw what a recipe does to one image: regions, warps, features; the plan as JSON",
         f"image --output-path! {VOLUME} {MASKS} {RECIPE} --depth-path {NETWORKS}"),
-    "import-h5": Command("features and matches in hloc's files into a new COLMAP database",
-        "--image-path! --features-path! --matches-path! --database-path! --skip-verification "
+    "import-h5": ("features and matches in hloc's files into a new COLMAP database",
+        "--image-path! --features-path! --matches-path! --database-path! "
         f"{CAMERAS} --random-seed {VOLUME}"),
-    "export-h5": Command("features and matches of any COLMAP database for hloc",
+    "export-h5": ("features and matches of any COLMAP database for hloc",
         f"--database-path@read! --features-path! --matches-path! {VOLUME}"),
-    "export-database": Command(
+    "export-database": (
         "any database for COLMAP 3.8 to 3.13, as Linux distributions have them",
         f"path database_path --colmap {VOLUME}"),
-    "export": Command(
+    "export": (
         "a model for other programs: points, text, undistorted photographs, tables",
         f"--model-path! --output-path@files! --format --image-path@export {VOLUME}"),
-    "align": Command("give a model its scale and place, by GPS, control points or a distance",
+    "align": ("give a model its scale and place, by GPS, control points or a distance",
         f"--model-path! --output-path@model! --gps|--positions|--points --distance {VOLUME}"),
-    "doctor": Command(
+    "doctor": (
         "look for what is wrong with results or the installation, and say what to do about it",
         f"path@optional --weights --json {VOLUME}"),
-    "recipes": Command("list the recipes and what they need", "name"),
-    "weights": Command("list the files of weights, or fetch them beforehand",
+    "recipes": ("list the recipes and what they need", "name"),
+    "weights": ("list the files of weights, or fetch them beforehand",
         f"action keys --weights {VOLUME}"),
 }  # fmt: skip
+"""What a command does in one line, and its flags of :data:`.flags.FLAGS`.
+
+One with an exclamation mark must be given; of those that ``|`` joins only one may be.
+"""

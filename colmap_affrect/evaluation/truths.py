@@ -49,7 +49,7 @@ Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value 
 
 
 class ScoreOptions(Options):
-    """How models are estimated from matches: ``--protocol-options`` of the command line."""
+    """How models are estimated from matches."""
 
     threshold_px: Annotated[float, within(1e-6, 1e9)] = 0.5
     """Of an inlier of plain RANSAC, for homographies and poses (the paper: 0.5)."""

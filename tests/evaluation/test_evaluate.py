@@ -210,7 +210,6 @@ def test_command_prints_tables_and_errors_are_one_line(dataset: Path, tmp_path: 
     common = ["evaluate", "evd", "--output-path", tmp_path / "out", "-q"]
     ended = run_in_process_of_its_own(
         *common, "--dataset-path", dataset, "--recipes", PLAIN,
-        "--protocol-options", "max_num_iterations=2000", "threshold_px=1",
     )  # fmt: skip
     assert (ended.code, ended.errors) == (0, [])
     assert "< 1 px  < 2 px  < 3 px  < 5 px  < 10 px  < 20 px  seconds" in ended.stdout
