@@ -22,6 +22,9 @@ from colmap_affrect.geometry.epipolar import (
 from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
 from colmap_affrect.geometry.significance import log10_bayes_factor, log10_false_alarms, shuffled
 
+Cameras = tuple[pycolmap.Camera, pycolmap.Camera]  # of the two images
+Keypoints = tuple[Floats, Floats]  # (N, 2, 4 or 6) of each image, as in the database
+
 PLANAR = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
     pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
@@ -38,9 +41,7 @@ MIN_TRANSLATION = 1e-9  # of a decomposed homography, in units of the distance o
 
 
 def epipolar_pair(
-    geometry: pycolmap.TwoViewGeometry,
-    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    keypoints: tuple[Floats, Floats],
+    geometry: pycolmap.TwoViewGeometry, cameras: Cameras, keypoints: Keypoints
 ) -> EpipolarModel | None:
     """Return the epipolar geometry of a pair and all keypoints; None where it has none.
 
@@ -84,9 +85,7 @@ def _keypoint_shapes(keypoints: Floats) -> Array | None:
     return None
 
 
-def decomposed_homography(
-    homography: Array, cameras: tuple[pycolmap.Camera, pycolmap.Camera]
-) -> list[Pose]:
+def decomposed_homography(homography: Array, cameras: Cameras) -> list[Pose]:
     """Return the relative poses into which a homography of px can be decomposed.
 
     Translations have length 1; a homography of a pure rotation has none.
@@ -109,10 +108,7 @@ def homography_matrix(geometry: pycolmap.TwoViewGeometry) -> Array | None:
 
 
 def significance(
-    geometry: pycolmap.TwoViewGeometry,
-    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    keypoints: tuple[Floats, Floats],
-    max_error_px: float,
+    geometry: pycolmap.TwoViewGeometry, cameras: Cameras, keypoints: Keypoints, max_error_px: float
 ) -> float:
     """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
 
@@ -144,9 +140,7 @@ def telling_shapes(keypoints: Floats) -> Points | None:
 
 
 def pair_model(
-    geometry: pycolmap.TwoViewGeometry,
-    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    keypoints: tuple[Floats, Floats],
+    geometry: pycolmap.TwoViewGeometry, cameras: Cameras, keypoints: Keypoints
 ) -> PairModel | None:
     """Return what (M, 2 or more) matched keypoints can be tested with; None of a watermark."""
     if geometry.config in PLANAR and geometry.H is not None:

@@ -17,6 +17,7 @@ from colmap_affrect.colmap.database import (
     colmap_keypoints,
     image_ids,
     open_database,
+    read_cameras,
     require_database_space,
     unverified_pairs,
 )
@@ -28,6 +29,9 @@ from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 T = TypeVar("T", int, str)
+Names = tuple[str, str]
+Frames = tuple[Floats, Floats]  # (N, 2, 3) of each image of a pair, in pixel-centre px
+Matches = NDArray[np.integer]  # (M, 2), rows of the features of each image of a pair
 
 PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
@@ -98,7 +102,7 @@ class Side:
 
 def estimate_geometry(
     sides: tuple[Side, Side],
-    matches: NDArray[np.integer],
+    matches: Matches,
     options: VerificationOptions,
     extracted_px: int | None = None,
 ) -> pycolmap.TwoViewGeometry:
@@ -175,7 +179,7 @@ def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
     return extracted_px.get(ids) if isinstance(extracted_px, Mapping) else extracted_px
 
 
-_Task = tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]  # ids, images, raw matches
+_Task = tuple[tuple[int, int], tuple[Side, Side], Matches]  # ids, images, raw matches
 _Done = tuple[tuple[int, int], pycolmap.TwoViewGeometry]
 
 
@@ -231,36 +235,21 @@ class PairVerifier:
         self, path: Path, options: VerificationOptions, extracted_px: ExtractedPx = None
     ) -> None:
         self._options, self._extracted_px = options, extracted_px
-        self._ids = image_ids(path)
-        with open_database(path) as database:
-            self._cameras = cameras_of_images(database)
+        self._ids, self._cameras = image_ids(path), read_cameras(path)
 
-    def inliers(
-        self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
-    ) -> Indices:
-        """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected.
-
-        Of (M, 2) ``indices`` of (N1, 2, 3) and (N2, 2, 3) frames in pixel-centre px.
-        """
+    def inliers(self, names: Names, frames: Frames, indices: Matches) -> Indices:
+        """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected."""
         geometry = self.geometry(names, frames, indices)
         found = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
         return found if self._ids[names[0]] < self._ids[names[1]] else found[:, ::-1]
 
-    def geometry(
-        self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
-    ) -> pycolmap.TwoViewGeometry:
+    def geometry(self, names: Names, frames: Frames, indices: Matches) -> pycolmap.TwoViewGeometry:
         """Return the geometry of the same from the image with the lower id; empty if rejected."""
         ids, sides, indices = self._ordered(names, frames, indices)
         size_px = of_pair(self._extracted_px, ids)
         return estimate_geometry(sides, indices, self._options, size_px)
 
-    def are_explained(
-        self,
-        names: tuple[str, str],
-        frames: tuple[Floats, Floats],
-        indices: NDArray[np.integer],
-        by: NDArray[np.integer],
-    ) -> Bools:
+    def are_explained(self, names: Names, frames: Frames, indices: Matches, by: Matches) -> Bools:
         """Tell which of (M, 2) matches the geometry of other ones, ``by``, explains, as inliers.
 
         All where that geometry is rejected, or one that nothing can contradict.
@@ -278,13 +267,13 @@ class PairVerifier:
             return np.asarray(model.errors(rows, rows) <= limit_px)
 
     def _ordered(
-        self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
-    ) -> tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]:
+        self, names: Names, frames: Frames, indices: Matches
+    ) -> tuple[tuple[int, int], tuple[Side, Side], Matches]:
         """Return ids, sides and (M, 2) matches of a pair from the image with the lower id."""
         ids = self._ids[names[0]], self._ids[names[1]]
         first, second = (
-            Side(self._cameras[image_id], colmap_keypoints(lafs))
-            for image_id, lafs in zip(ids, frames, strict=True)
+            Side(self._cameras[name], colmap_keypoints(lafs))
+            for name, lafs in zip(names, frames, strict=True)
         )
         if ids[0] > ids[1]:
             return ids[::-1], (second, first), indices[:, ::-1]

@@ -17,7 +17,7 @@ from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
-from colmap_affrect.errors import OptionError, PairListError
+from colmap_affrect.errors import PairListError
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
@@ -371,11 +371,7 @@ def _context(
 ) -> Iterator[Context]:
     """Lock the folder beside a database and return what the stages work with."""
     weights = Path(weights_path) if weights_path else None
-    name, index = str(getattr(device, "name", device)), str(asked.get("gpu_index", "-1"))
-    if name == "cuda" and index != "-1":
-        if not index.isdigit():
-            raise OptionError(f"gpu_index={index}: give the number of one GPU")
-        name = f"cuda:{index}"
+    name = str(getattr(device, "name", device))
     threads = asked.get("num_threads", -1)
     executor = Threads(threads) if threads > 0 else None
     with Workspace.beside(Path(database_path)).locked() as workspace:

@@ -30,7 +30,7 @@ VERIFICATION_NAMES = {
 }
 """Names in pycolmap's TwoViewGeometryOptions and in ours."""
 
-WHERE = ("num_threads", "use_gpu", "gpu_index")
+WHERE = ("num_threads", "use_gpu")
 """Where the work is done; of ``use_gpu`` the argument ``device`` decides, as in pycolmap."""
 
 HONOURED: dict[type, tuple[str, ...]] = {
