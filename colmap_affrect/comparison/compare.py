@@ -4,28 +4,24 @@ What differs between methods are features and raw matches, and nothing else: cam
 masks, pairs, verification, mapping and seeds are the same for all.
 """
 
-import pickle
-import signal
-from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
-from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.pose_scores import pose_scores
 from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.tables import to_json
+from colmap_affrect.comparison.worker import run_alone
 from colmap_affrect.errors import ComparisonError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.base import Pair, PairOptions
-from colmap_affrect.parallel.subprocesses import child
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import content_of
@@ -69,7 +65,8 @@ def compare(
         results = []
         for number, run in enumerate(runs, 1):
             title = f"method {number} of {len(runs)}, {run.method.label}: "
-            results.append(run.finished() or _run(run, progress, title))
+            failed = "" if run.finished() else run_alone(run, title, progress)
+            results.append(run.finished() or replace(run.result, seeds=(), failed=failed))
         if truth:
             results = [_measured(result, output_path, truth, names) for result in results]
         comparison = Comparison(
@@ -147,24 +144,6 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
             f"{min(names)}); rename the images of one of them"
         )
     return truth
-
-
-def _run(run: MethodRun, progress: Progress, title: str) -> MethodResult:
-    """Run a method in a process of its own; what it prints goes to ``run.log`` in its folder."""
-    log_path, argument = run.workspace.log, b64encode(pickle.dumps((run, title))).decode()
-    with (
-        log_path.open("a", encoding="utf-8") as log,
-        child(worker.__name__, argument, stdout=progress.file_number, stderr=log) as process,
-    ):
-        process.wait()
-    failed = ""
-    if code := process.returncode:
-        ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-        memory = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
-        failed = f"its process ended {ending}{memory}; {log_path} may say why"
-    elif run.failure.exists():
-        failed = run.failure.read_text(encoding="utf-8")
-    return run.finished() or replace(run.result, seeds=(), failed=failed)
 
 
 def _measured(

@@ -1,14 +1,18 @@
-"""One method of a comparison, in a process of its own: ``python -m ... TASK``.
+"""A method of a comparison in a process of its own, which ends when this one ends.
 
-Progress goes to stdout; everything else that is printed goes to stderr.
+Started by the name of this module, not by ``multiprocessing``, which would run a user's script
+again.
 """
 
 import logging
 import os
 import pickle
+import signal
+import subprocess
 import sys
-from base64 import b64decode
+from base64 import b64decode, b64encode
 
+from colmap_affrect.comparison.method_run import MethodRun
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.parallel.subprocesses import end_with
 from colmap_affrect.progress import Progress
@@ -17,24 +21,55 @@ from colmap_affrect.project.atomic_files import replace_text
 logger = logging.getLogger("colmap_affrect")
 
 
+def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
+    """Run a method in another process; return why it failed, empty if it did not.
+
+    What it prints goes to ``run.log`` in its folder. The process is killed where this raises, also
+    for Ctrl-C.
+    """
+    argument, log_path = b64encode(pickle.dumps((run, title))).decode(), run.workspace.log
+    with (
+        log_path.open("a", encoding="utf-8") as log,
+        subprocess.Popen(  # noqa: S603  (this Python and this module)
+            # -P and the path: the package is found as it was here, not in the current folder.
+            [sys.executable, "-P", "-m", __name__, argument, str(os.getpid())],
+            stdin=subprocess.DEVNULL,
+            stdout=progress.file_number,
+            stderr=log,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # else Ctrl-C would reach it too
+        ) as process,
+    ):
+        try:
+            code = process.wait()
+        except BaseException:
+            process.kill()
+            raise
+    if not code:
+        return run.failure.read_text(encoding="utf-8") if run.failure.exists() else ""
+    ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+    memory = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
+    return f"its process ended {ending}{memory}; {log_path} may say why"
+
+
 def main() -> None:
-    """Run the method that is asked for, unless the parent ends before."""
+    """Run the method that is asked for: progress to stdout, all else that is printed to stderr."""
     end_with(int(sys.argv[2]))
     shown = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what others print
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     logger.addHandler(handler)
-    method, title = pickle.loads(b64decode(sys.argv[1]))  # noqa: S301 (of our parent)
-    method.progress = Progress(shown, 1).titled(title)
+    run, title = pickle.loads(b64decode(sys.argv[1]))  # noqa: S301 (of our parent)
+    run.progress = Progress(shown, 1).titled(title)
     try:
-        with method.workspace.locked():
-            method.run()
+        with run.workspace.locked():
+            run.run()
     except AffrectError as error:
-        replace_text(method.failure, str(error))
+        replace_text(run.failure, str(error))
     except Exception as error:
         logger.exception("failed")
-        replace_text(method.failure, f"{type(error).__name__}: {error}")
+        replace_text(run.failure, f"{type(error).__name__}: {error}")
 
 
 if __name__ == "__main__":

@@ -17,9 +17,10 @@ from small_scene import INTRINSICS, NAMES, write_photographs
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.comparison import compare as module
+from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.compare import CompareOptions, compare
 from colmap_affrect.comparison.method_run import MethodRun
-from colmap_affrect.comparison.results import Comparison, MethodResult
+from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.tables import to_json, verdict
 from colmap_affrect.errors import (
     ComparisonError,
@@ -94,11 +95,11 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[MethodRun]:
     """What would be run in other processes; nothing is."""
     asked = []
 
-    def run(method_run: MethodRun, *_: object) -> MethodResult:
-        asked.append(method_run)
-        return MethodResult(method_run.method.label, failed="not run")
+    def run_alone(run: MethodRun, *_: object) -> str:
+        asked.append(run)
+        return "not run"
 
-    monkeypatch.setattr(module, "_run", run)
+    monkeypatch.setattr(module, "run_alone", run_alone)
     return asked
 
 
@@ -239,7 +240,7 @@ def test_method_whose_process_dies_is_reported(
 ) -> None:
     (tmp_path / "dying_worker.py").write_text(DYING)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(module.worker, "__name__", "dying_worker")
+    monkeypatch.setattr(worker, "__name__", "dying_worker")
     (method,) = compare(
         scene / "images", tmp_path / "out", replace(options, methods=["sift"])
     ).methods
