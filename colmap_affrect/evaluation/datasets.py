@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,8 +13,9 @@ import h5py
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import camera_matrix
 from colmap_affrect.colmap.model_files import Pose, relative_pose
-from colmap_affrect.errors import AffrectError, EvaluationError, OptionError, damage, such_as
+from colmap_affrect.errors import EvaluationError, OptionError, damage, such_as
 from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import colmap_from_pixel, pixel_from_colmap
@@ -43,22 +44,17 @@ class EvaluationImage:
     @property
     def intrinsics(self) -> Array | None:
         """(3, 3) camera matrix in pixel-centre px, without distortion; None without a camera."""
-        if self.camera is None:
-            return None
-        matrix = np.asarray(self.camera.calibration_matrix(), dtype=np.float64)
-        matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])
-        return matrix
+        return camera_matrix(self.camera) if self.camera else None
 
 
 @dataclass(frozen=True)
 class EvaluationPair:
-    """Two images whose matches are scored; one with a problem has no truth, and fails."""
+    """Two images whose matches are scored."""
 
     name: str
     images: tuple[EvaluationImage, EvaluationImage]
+    truth: TrueHomography | TruePose | Correspondences
     category: str = ""  # of difficulty, as tables group pairs; empty for none
-    truth: Any = None  # one of :mod:`colmap_affrect.evaluation.truths`
-    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -134,7 +130,7 @@ def _posed_pairs(
         truth = TruePose((camera1, camera2), relative_pose(pose1, pose2))
         both = images[names[0]], images[names[1]]
         title = f"{both[0].name} {both[1].name}"
-        pairs[title] = EvaluationPair(title, both, category(*names), truth)
+        pairs[title] = EvaluationPair(title, both, truth, category(*names))
     note = (
         f"{scene}: {len(lacking)} of {len(listed)} listed pairs are left out, without an image or "
         f"its camera: {such_as(dict.fromkeys(lacking))}"
@@ -151,16 +147,12 @@ def _svp_scene(list_path: Path) -> Dataset:
             raise EvaluationError(f"{list_path}: '{' '.join(words)}' is no pair of images")
         listed.append((stem(words[0]), stem(words[1])))
 
-    def category(name1: str, name2: str) -> str:
-        return f"{CATEGORY_DEG * difficulty(views[name1][1], views[name2][1])}°"
+    def category(name1: str, name2: str) -> str:  # tens of degrees of rotation
+        rotation, _ = relative_pose(views[name1][1], views[name2][1])
+        angle_deg = np.rad2deg(pycolmap.Rotation3d(rotation).angle())
+        return f"{CATEGORY_DEG * int(angle_deg // CATEGORY_DEG)}°"
 
     return _posed_pairs(scene, folder / "images", views, listed, category)
-
-
-def difficulty(pose1: Pose, pose2: Pose) -> int:
-    """Return the category of two cam_from_world poses: tens of degrees of rotation."""
-    angle = pycolmap.Rotation3d(relative_pose(pose1, pose2)[0]).angle()
-    return int(np.rad2deg(angle) // CATEGORY_DEG)
 
 
 load_svp = partial(_scenes, f"*{PAIR_LIST_SUFFIX}", _svp_scene)
@@ -262,13 +254,15 @@ def pinhole(matrix: Array, what: str) -> pycolmap.Camera:
 
 
 def load_pairs(folder: Path) -> Dataset:
-    """Read ``pairs.json``; pairs that cannot be used have a problem, else EvaluationError."""
+    """Read ``pairs.json``; EvaluationError says what is wrong."""
     path = folder / "pairs.json"
     with _damaged(path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
         entries = [_entry(each, f"{path}: pairs[{k}]") for k, each in enumerate(content["pairs"])]
         offset_px = ORIGIN_PX[content.get("pixel_origin", "center")]
     names = [entry.name for entry in entries]
+    if not names:
+        raise EvaluationError(f"{path}: has no pairs")
     if twice := [name for name in names if names.count(name) > 1]:
         raise EvaluationError(f"{path}: two pairs are called '{twice[0]}'; give them names")
     return _loaded(entries, folder, offset_px)
@@ -294,20 +288,11 @@ def _loaded(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Datase
 
 
 def _pair(entry: _Entry, folder: Path, offset_px: float) -> EvaluationPair:
-    """Return the pair of an entry, with its truth, or with the problem why there is none."""
-    first, second = (EvaluationImage(name, folder / name) for name in (entry.image1, entry.image2))
-    pair = EvaluationPair(entry.name, (first, second), entry.category)
-    try:
-        for image in pair.images:
-            if not image.path.is_file():
-                raise EvaluationError(f"{image.path}: missing")
-        truth = _truth(entry, folder, offset_px)
-    except AffrectError as error:
-        return replace(pair, problem=str(error))
-    if isinstance(truth, TruePose):
-        both = zip(pair.images, truth.cameras, strict=True)
-        first, second = (replace(image, camera=camera) for image, camera in both)
-    return replace(pair, images=(first, second), truth=truth)
+    truth, names = _truth(entry, folder, offset_px), (entry.image1, entry.image2)
+    cameras = truth.cameras if isinstance(truth, TruePose) else (None, None)
+    both = zip(names, cameras, strict=True)
+    first, second = (EvaluationImage(name, folder / name, camera) for name, camera in both)
+    return EvaluationPair(entry.name, (first, second), truth, entry.category)
 
 
 def _truth(

@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import fmean
 
 from colmap_affrect.comparison.methods import Method, parse_methods
-from colmap_affrect.errors import EvaluationError, OptionError, such_as
+from colmap_affrect.errors import OptionError
 from colmap_affrect.evaluation import datasets, truths
 from colmap_affrect.evaluation.datasets import Dataset
 from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, published
@@ -62,7 +62,7 @@ def evaluate(
 ) -> Evaluation:
     """Score recipes on a dataset by one of ``PROTOCOLS``.
 
-    An image or pair that cannot be used counts as failed. One that was stopped goes on, unless
+    A pair with an image that cannot be used counts as failed. One that was stopped goes on, unless
     ``overwrite`` discards features and scores of these recipes. Writes ``evaluation.json``, too.
     AffrectError for what the caller can mend, before any image is worked on.
     """
@@ -81,10 +81,6 @@ def evaluate(
     inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
     with Workspace(output_path).locked():
         dataset = PROTOCOLS[protocol](dataset_path)
-        problems = [f"{pair.name}: {pair.problem}" for pair in dataset.pairs if pair.problem]
-        note = f"{len(problems)} of {len(dataset.pairs)} pairs count as failed: {such_as(problems)}"
-        if len(problems) == len(dataset.pairs):
-            raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {note}")
         given = dataset.pairs, output_path, inputs, settings, options.resources
         runs = [RecipeRun(method, *given, overwrite=overwrite) for method in methods]
         results = {run.label: run.results(progress) for run in runs}
@@ -92,7 +88,7 @@ def evaluate(
             protocol=protocol,
             dataset_path=inputs["dataset_path"],
             settings=settings,
-            notes=(*dataset.notes, *([note] if problems else [])),
+            notes=dataset.notes,
             recipes=tuple(_summed(run, results[run.label]) for run in runs),
             published=published(protocol),
             versions=installed_versions(),

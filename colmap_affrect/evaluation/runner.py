@@ -72,7 +72,7 @@ class RecipeRun:
         self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
         self._options = ScoreOptions(**settings["scores"]), settings["random_seed"]
         extraction, matching = self.recipe.extraction, self.recipe.matching
-        images = {image.name for pair in pairs if not pair.problem for image in pair.images}
+        images = {image.name for pair in pairs for image in pair.images}
         self._extractor = prepare(extraction, resources, sorted(images))
         if overwrite:
             names = [f"*/{method.folder_name}-????????{end}" for end in ("", ".h5")]
@@ -100,7 +100,7 @@ class RecipeRun:
             keys = {p.name: digest_of([p.name, repr(p.truth)]) for p in self._pairs}
         paths = {name: self._scores / f"{key}.json" for name, key in keys.items()}
         done = {n: RESULT.validate_json(p.read_bytes()) for n, p in paths.items() if p.exists()}
-        todo = [pair for pair in self._pairs if not pair.problem and pair.name not in done]
+        todo = [pair for pair in self._pairs if pair.name not in done]
         with progress.stage(self.label, len(todo), "pairs") as advance:
             work = partial(self._result, [CachedMatcher(task) for task in self._matchings])
             for result in map_ordered(work, todo, available_cores()):
@@ -108,7 +108,7 @@ class RecipeRun:
                     replace_bytes(paths[result.name], RESULT.dump_json(result))
                 done[result.name] = result
                 advance(1)
-        return [done.get(pair.name) or self._failed(pair, pair.problem) for pair in self._pairs]
+        return [done[pair.name] for pair in self._pairs]
 
     def _result(self, matchers: Sequence[CachedMatcher], pair: EvaluationPair) -> PairResult:
         """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
@@ -126,7 +126,7 @@ class RecipeRun:
         return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
 
     def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
-        score = pair.truth.score(*NOTHING, *self._options) if pair.truth else NO_SCORE
+        score = pair.truth.score(*NOTHING, *self._options)
         return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
 
     def _matched(
