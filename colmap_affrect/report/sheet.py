@@ -1,9 +1,9 @@
 """One picture of one level of a recipe: the photograph with its regions, features, and warps."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,13 +14,11 @@ from colmap_affrect.data import (
     LocalFeatures,
     Photograph,
     RectificationPlan,
+    View,
 )
 from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.project.atomic_files import replace_bytes
-
-if TYPE_CHECKING:
-    from colmap_affrect.report.inspection import InspectedLevel
 
 Color = tuple[int, int, int]
 Marks = dict[tuple[float, float], str]  # text by place, px
@@ -37,7 +35,24 @@ UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
 DARK: Color = (85, 85, 85)
 
 
-def draw_sheet(level: "InspectedLevel", summary: str, path: Path) -> None:
+@dataclass(frozen=True)
+class InspectedLevel:
+    """One level of a recipe, carried out on one photograph.
+
+    Coordinates are px of the photograph at the size of processing where nothing else is said.
+    """
+
+    photograph: Photograph
+    plan: RectificationPlan
+    warning: str  # why it was not rectified though it was to be; empty if all went well
+    # by rectification id, 0 for the photograph itself: what features were looked for in, and all
+    # that were detected there, frames in px of the view
+    seen: Mapping[int, tuple[View, LocalFeatures]]
+    features: LocalFeatures  # those of all views that were kept
+    seconds: float
+
+
+def draw_sheet(level: InspectedLevel, summary: str, path: Path) -> None:
     """Draw one level under its summary, and write it as PNG.
 
     Above the photograph with the regions and their warps in one colour each, beside it its
@@ -55,7 +70,7 @@ def draw_sheet(level: "InspectedLevel", summary: str, path: Path) -> None:
     replace_bytes(path, data.tobytes())
 
 
-def _regions(level: "InspectedLevel") -> tuple[ColorImage, str]:
+def _regions(level: InspectedLevel) -> tuple[ColorImage, str]:
     image = tinted(level.photograph, level.plan)
     if level.photograph.mask is not None:
         image[~level.photograph.mask] //= 3
@@ -71,7 +86,7 @@ def _regions(level: "InspectedLevel") -> tuple[ColorImage, str]:
     return _panel(image, PANELS_PER_ROW, marks=marks), title
 
 
-def _features(level: "InspectedLevel", colors: Sequence[Color]) -> tuple[ColorImage, str]:
+def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImage, str]:
     features = level.features
     palette = [DARK, *colors]
     drawn = [palette[number] for number in features.rectification_ids.tolist()]
@@ -81,10 +96,10 @@ def _features(level: "InspectedLevel", colors: Sequence[Color]) -> tuple[ColorIm
     return image, f"the strongest {shown} of {len(features)} features; gray: without a warp"
 
 
-def _warp(level: "InspectedLevel", index: int, color: Color) -> tuple[ColorImage, str]:
+def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, str]:
     item = level.plan.items[index]
-    found, kept = level.found[index + 1], level.kept_of(index + 1)
-    image, mask = level.views[index + 1]
+    (image, mask), found = level.seen[index + 1]
+    kept = level.features.select(level.features.rectification_ids == index + 1)
     if mask is not None:
         outside = 255 - (255 - image) // 4
         image = np.where(mask if image.ndim == 2 else mask[:, :, None], image, outside)

@@ -51,9 +51,9 @@ def test_level_has_the_plan_and_the_features_of_extraction(
     features = extractor.extract_file(photo).features
     assert len(level.plan.items) == len(plan.items) > 0
     assert_array_equal(level.features.lafs, features.lafs)
-    assert set(level.found) == set(level.views) == set(range(len(plan.items) + 1))
-    assert all(len(level.kept_of(number)) <= len(level.found[number]) for number in level.found)
-    assert set(level.seconds) == {"plan", "warp and choose", "detect", "describe"}
+    kept = np.bincount(level.features.rectification_ids, minlength=len(plan.items) + 1)
+    assert set(level.seen) == set(range(len(plan.items) + 1))
+    assert all(kept[number] <= len(found) for number, (_, found) in level.seen.items())
     said = inspect(extractor, photo, tmp_path / "new" / "out")
     assert f"{len(plan.items)} warp" in said
     assert f"{len(features)} features" in said
