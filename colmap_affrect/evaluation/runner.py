@@ -25,7 +25,7 @@ from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.evaluation.datasets import EvaluationImage, EvaluationPair
 from colmap_affrect.evaluation.truths import PairResult, PairScore, ScoreOptions
 from colmap_affrect.features.weights import digests
-from colmap_affrect.geometry.arrays import Array, Floats
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.options import digest_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -42,6 +42,19 @@ logger = logging.getLogger(__name__)
 RESULT = TypeAdapter(PairResult)  # from and to JSON; infinite errors are null
 NO_SCORE = PairScore(math.inf, 0)
 NOTHING = np.zeros((0, 2)), np.zeros((0, 2))  # points of a pair that could not be matched
+
+
+class _StrongestFeatures(FeatureStore):
+    """Features of which the strongest of each image are matched."""
+
+    budget: int | None = None  # how many of each level; None for all
+
+    def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
+        indices = super().level_indices(name, level, base)
+        if self.budget is None:
+            return indices
+        order = np.argsort(-self.read(name).responses[indices], kind="stable")
+        return indices[np.sort(order[: self.budget])]
 
 
 class RecipeRun:
@@ -83,12 +96,12 @@ class RecipeRun:
         features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
         for folder in (features.parent, self._scores):
             folder.mkdir(parents=True, exist_ok=True)
-        self._store = FeatureStore(features)
-        budget = settings["max_num_keypoints"]
+        self._store = _StrongestFeatures(features)
+        self._store.budget = settings["max_num_keypoints"]
         self._matchings = []
         for level, chosen in enumerate(extraction.levels):
             of, kind = chosen.matching or matching, chosen.features.kind
-            task = Matching(self._store, of, level, chosen.base, kind, resources, budget)
+            task = Matching(self._store, of, level, chosen.base, kind, resources)
             self._matchings.append(task)
         self.failures: dict[str, str] = {}
         self.warnings: dict[str, str] = {}
