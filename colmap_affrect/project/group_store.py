@@ -22,14 +22,13 @@ from colmap_affrect.project.atomic_files import (
     uninterrupted,
 )
 
-FORMAT_VERSION = 2
 CHECKSUM = "crc32"  # of the values of a dataset, its attribute
 
 
 class GroupStore:
     """A HDF5 file of complete groups."""
 
-    kind = ""
+    format = ""  # attribute of the file
     stage = ""  # that makes it again
 
     def __init__(self, path: Path) -> None:
@@ -63,26 +62,19 @@ class GroupStore:
         with damage(self.path, mend):
             apply_journal(self.path)
             with h5py.File(where, mode) as file:
-                self._check_format(file)
+                if (found := file.attrs.get("format")) != self.format:
+                    raise StoreError(
+                        f"{self.path}: expected the format {self.format}, found {found}; use "
+                        "another --output-path"
+                    )
                 yield file
 
     def _create(self) -> None:
         content = io.BytesIO()
         with h5py.File(content, "w") as file:
-            file.attrs["format"] = f"colmap_affrect/{self.kind}"
-            file.attrs["format_version"] = FORMAT_VERSION
-            file.attrs["pixel_origin"] = "center"
+            file.attrs.update(format=self.format, pixel_origin="center")
         journal_of(self.path).unlink(missing_ok=True)
         replace_bytes(self.path, content.getvalue())
-
-    def _check_format(self, file: h5py.File) -> None:
-        known, version = file.attrs.get("format"), file.attrs.get("format_version")
-        if known != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
-            found = f"{known} {version}" if known else "a file of another program"
-            raise StoreError(
-                f"{self.path}: expected {self.kind} of format version {FORMAT_VERSION}, found "
-                f"{found}; use another --output-path"
-            )
 
     def note(self, key: str) -> Any:
         """Return what is kept with the whole file, as JSON has it; None where nothing is."""
@@ -96,18 +88,13 @@ class GroupStore:
         with self._open("a") as file:
             file.attrs[key] = json.dumps(value)
 
-    def check_all(self) -> int:
-        """Read all that is there, and return how many groups; StoreError if it is damaged."""
-        if not self.path.exists():
-            return 0
-        with self._open("r") as file:
-            count = 0
-            for _, group in complete_groups(file):
-                for name in group:  # items() has None for what cannot be opened
-                    if isinstance(group[name], h5py.Dataset):
+    def check_all(self) -> None:
+        """Read all that is there; StoreError if it is damaged."""
+        if self.path.exists():
+            with self._open("r") as file:
+                for _, group in complete_groups(file):
+                    for name in group:  # items() has None for what cannot be opened
                         checked(group, name)
-                count += 1
-            return count
 
     @staticmethod
     def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:

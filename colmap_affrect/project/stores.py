@@ -78,7 +78,7 @@ def frame_datasets(lafs: Floats) -> dict[str, Singles]:
 class FeatureStore(GroupStore):
     """Local features by image name."""
 
-    kind, stage = "features", "extract"
+    format, stage = "colmap_affrect/features", "extract"
 
     def _entries(self) -> Entries:
         return _entries_of(self.path, stamp_of([self.path])) if self.path.exists() else {}
@@ -226,7 +226,7 @@ def hloc_matches(pair: PairMatches) -> dict[str, NDArray[Any]]:
 class MatchStore(GroupStore):
     """Raw matches by pair of image names."""
 
-    kind, stage = "matches", "match"
+    format, stage = "colmap_affrect/matches", "match"
 
     def write(
         self,
@@ -310,7 +310,7 @@ class GuidedPair:
 class GuidedStore(GroupStore):
     """Which pairs were matched again by their geometry."""
 
-    kind, stage = "guided matches", "verify"
+    format, stage = "colmap_affrect/guided matches", "verify"
 
     def write(self, pairs: Iterable[GuidedPair]) -> None:
         """Write a batch of pairs, in the place of what is there of them."""
