@@ -128,12 +128,11 @@ def _opened(path: Path) -> Iterator[_Source]:
 
     with damage(path, f"or still being written; {MEND}"):
         file = h5py.File(path, "r")
+        try:
+            file.visititems(visit)
+        except SystemError as error:  # h5py's, for a name that is no UTF-8
+            raise ValueError(error) from error
     with file:
-        with damage(path, MEND):
-            try:
-                file.visititems(visit)
-            except SystemError as error:  # h5py's, for a name that is no UTF-8
-                raise ValueError(error) from error
         yield _Source(path, file, shapes)
 
 

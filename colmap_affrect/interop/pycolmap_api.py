@@ -199,7 +199,14 @@ def _match(
     if context.extraction.escalation:
         reports.append(escalate(context))
     if asked.get("rig_verification"):
-        _verify_rigs(context.workspace.database, verification, token)
+        rigs = pycolmap.GeometricVerifierOptions(rig_verification=True)
+        path, native = context.workspace.database, two_view_options(verification)
+        run_cancellable(
+            lambda token: pycolmap.geometric_verification(
+                path, rigs, two_view_geometry_options=native, cancellation_token=token
+            ),
+            token,
+        )
     if asked.get("guided_matching"):
         reports.append(guide(context, GuidedOptions(enabled="always")))
     return tuple(reports)
@@ -248,19 +255,6 @@ def _of_different_frames(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
             for image in database.read_all_images()
         }
     return [(first, second) for first, second in pairs if frames[first] != frames[second]]
-
-
-def _verify_rigs(path: Path, options: VerificationOptions, token: Token) -> None:
-    """Let pycolmap verify frames of known rigs, whose pairs get the geometry that the rigs have."""
-    rigs = pycolmap.GeometricVerifierOptions(rig_verification=True)
-
-    def call(token: pycolmap.CancellationToken) -> None:
-        pycolmap.geometric_verification(
-            path, rigs, two_view_geometry_options=two_view_options(options),
-            cancellation_token=token,
-        )  # fmt: skip
-
-    run_cancellable(call, token)
 
 
 def incremental_mapping(
