@@ -5,7 +5,7 @@ COLMAP's database only has a flag that somebody does; ``cameras.json`` beside it
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -109,14 +109,15 @@ def _split(text: object) -> object:
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-class _Row(Options):
-    """What a row of a table, or the options, say of a camera; only the name is needed."""
+class GivenCamera(Options):
+    """What the user says of the camera of an image, in a table, a model or the options."""
 
     model_config = ConfigDict(strict=False)
 
     name: str
+    """Of the image; empty for all others."""
     camera: str = ""
-    """Images with the same label share a camera."""
+    """Label; images with the same one share a camera."""
     model: Annotated[str, AfterValidator(_known_model)]
     params: Annotated[tuple[FiniteFloat, ...], BeforeValidator(_split)] = ()
     focal_px: Positive | None = None
@@ -125,6 +126,16 @@ class _Row(Options):
     """Width of what the whole image shows, of a plate or a sensor."""
     cx: FiniteFloat | None = None
     cy: FiniteFloat | None = None
+    """Principal point in COLMAP's px, from the corner of the image."""
+    size: tuple[int, ...] = ()
+    """(width, height) in px of its images; only of a model."""
+    where: str = ""
+    """File and line."""
+
+    @property
+    def said(self) -> Self:
+        """The same of any image: equal where the same is said."""
+        return self.changed(name="", camera="", where="")
 
     @model_validator(mode="after")
     def _says_all_once(self) -> Self:
@@ -150,20 +161,6 @@ class _Row(Options):
         return self
 
 
-@dataclass(frozen=True)
-class GivenCamera:
-    """What the user says of the camera of an image; empty where nothing is said."""
-
-    model: str = ""  # COLMAP's name of the camera model
-    params: tuple[float, ...] = ()  # all parameters of the model
-    focal_px: float = 0.0  # focal length
-    focal_widths: float = 0.0  # focal length in units of the width of what the whole image shows
-    principal_point: tuple[float, ...] = ()  # x, y in COLMAP's px, from the corner of the image
-    size: tuple[int, ...] = ()  # (width, height) in px of its images; only of a model
-    label: str = field(default="", compare=False)  # images with one label share a camera
-    where: str = field(default="", compare=False)  # file and line
-
-
 def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     """Return the cameras that the user gives by image name; ``""`` stands for all other images.
 
@@ -176,7 +173,7 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     if options.principal_point:
         says["cx"], _, says["cy"] = options.principal_point.replace(",", " ").partition(" ")
     where = "--camera-model, --camera-params, --focal-length-px or --principal-point"
-    others = _given(_Row.from_mapping(says, where), "the options")
+    others = GivenCamera.from_mapping({**says, "where": "the options"}, where)
     if not options.cameras_path:
         return {"": others}
     path = Path(options.cameras_path)
@@ -185,31 +182,20 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     return {"": others, **found}
 
 
-def _given(row: _Row, where: str) -> GivenCamera:
-    return GivenCamera(
-        row.model,
-        row.params,
-        row.focal_px or 0.0,
-        row.focal_mm / row.plate_width_mm if row.focal_mm and row.plate_width_mm else 0.0,
-        () if row.cx is None or row.cy is None else (row.cx, row.cy),
-        label=f"label/{row.camera}" if row.camera else "",
-        where=where,
-    )
-
-
 def _read_model(path: Path) -> dict[str, GivenCamera]:
     folder = path if path.is_dir() else path.parent
     model = read_given_model(folder, "--cameras-path ")
-    cameras = {
-        key: GivenCamera(
-            camera.model_name,
-            tuple(camera.params.tolist()),
-            size=(camera.width, camera.height),
-            label=f"model/{key}",
-            where=f"--cameras-path {folder}, camera {key}",
-        )
-        for key, camera in model.cameras.items()
-    }
+    cameras = {}
+    for key, camera in model.cameras.items():
+        says = {
+            "name": "",
+            "camera": str(key),
+            "model": camera.model_name,
+            "params": tuple(camera.params.tolist()),
+            "size": (camera.width, camera.height),
+            "where": f"--cameras-path {folder}, camera {key}",
+        }
+        cameras[key] = GivenCamera.from_mapping(says, says["where"])
     return {image.name: cameras[image.camera_id] for image in model.images.values()}
 
 
@@ -217,22 +203,23 @@ def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
     """Read a CSV file with a header; rows may leave cells empty, which are as in the options."""
     found: dict[str, GivenCamera] = {}
     labels: dict[str, GivenCamera] = {}
-    for place, cells in read_table(path, f"--cameras-path {path}", list(_Row.model_fields)):
-        row = _Row.from_mapping({"model": others.model, **cells}, place)
-        if row.name in found:
-            raise OptionError(f"{place}: {row.name} is there twice")
-        given = _given(row, place)
+    columns = list(GivenCamera.model_fields.keys() - {"size", "where"})
+    for place, cells in read_table(path, f"--cameras-path {path}", columns):
+        says = {"model": others.model, **cells, "where": place}
+        given = GivenCamera.from_mapping(says, place)
+        if given.name in found:
+            raise OptionError(f"{place}: {given.name} is there twice")
         if cells.keys() <= {"name", "camera"}:
-            given = replace(given, params=others.params)
-        if not (given.params or given.focal_px or given.focal_widths):
-            given = replace(given, focal_px=others.focal_px)
-        if not (row.params or given.principal_point):
-            given = replace(given, principal_point=others.principal_point)
-        found[row.name] = given
-        first = labels.setdefault(given.label, given)
-        if given.label and given != first:
+            given = given.changed(params=others.params)
+        if not (given.params or given.focal_px or given.focal_mm):
+            given = given.changed(focal_px=others.focal_px)
+        if not given.params and given.cx is None:
+            given = given.changed(cx=others.cx, cy=others.cy)
+        found[given.name] = given
+        first = labels.setdefault(given.camera, given)
+        if given.camera and given.said != first.said:
             raise OptionError(
-                f"{place}: says something else of camera '{row.camera}' than "
+                f"{place}: says something else of camera '{given.camera}' than "
                 f"{first.where.rpartition(', ')[2]}; give them two labels, or the same values"
             )
     return found

@@ -83,12 +83,11 @@ class InitialCameras:
                 return ("per-folder", str(PurePosixPath(name).parent))
             case "per-image":
                 return ("per-image", name)
-        label = self.given(name).label
-        if label:
+        if label := self.given(name).camera:
             return ("given", label)
         tags = None if self.options.ignore_exif else self._tags(name)
         if tags and tags.identity:
-            return ("exif", *tags.identity, self.given(name))
+            return ("exif", *tags.identity, self.given(name).said)
         return ("image", name)
 
     def groups(self, names: Sequence[str]) -> dict[Group, list[str]]:
@@ -131,7 +130,7 @@ class InitialCameras:
         named = [self._given[name] for name in names if name in self._given]
         first = named[0] if named else self._given[""]
         for other in named:
-            if other != first:
+            if other.said != first.said:
                 raise OptionError(
                     f"{other.where}: says something else than {first.where.rpartition(', ')[2]}, "
                     f"and --camera-mode {self.options.mode} lets these images share a camera"
@@ -148,9 +147,9 @@ class InitialCameras:
         parts: list[Given] = ["focal"] if source == "given" else []
         if given.params:
             camera.params = list(given.params)
-        elif given.principal_point and len(camera.principal_point_idxs()):
-            camera.principal_point_x, camera.principal_point_y = given.principal_point
-        if given.params or given.principal_point:
+        elif given.cx is not None and given.cy is not None and len(camera.principal_point_idxs()):
+            camera.principal_point_x, camera.principal_point_y = given.cx, given.cy
+        if given.params or given.cx is not None:
             parts.append("principal-point")
         if given.params or (parts and not len(camera.extra_params_idxs())):
             parts.append("distortion")
@@ -167,7 +166,9 @@ class InitialCameras:
         self, camera: pycolmap.Camera, given: GivenCamera, names: Sequence[str]
     ) -> tuple[Source, str]:
         source: Source = "given"
-        focal, why = given.focal_px or given.focal_widths * camera.width, ""
+        focal, why = given.focal_px or 0.0, ""
+        if given.focal_mm and given.plate_width_mm:
+            focal = given.focal_mm / given.plate_width_mm * camera.width
         if given.params:
             return source, why
         if not focal:

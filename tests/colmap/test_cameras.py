@@ -44,13 +44,13 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
         principal_point="1,2",
     )
     assert found["a.jpg"].focal_px == 900
-    assert found["a.jpg"].principal_point == (1, 2)
-    assert found["b č.jpg"].focal_widths == pytest.approx(210 / 180)
-    assert found["b č.jpg"].label
-    assert found["side/c.jpg"] == found["d.jpg"]
+    assert (found["a.jpg"].cx, found["a.jpg"].cy) == (1, 2)
+    assert found["b č.jpg"].focal_mm == 210
+    assert found["b č.jpg"].camera == "plates"
+    assert found["side/c.jpg"].said == found["d.jpg"].said
     assert found["d.jpg"].params == (901, 902, 401, 301)
-    assert found["e.jpg"].principal_point == (390.5, 310)
-    assert (found["f.jpg"].model, found["f.jpg"].focal_px) == ("OPENCV", 0)
+    assert (found["e.jpg"].cx, found["e.jpg"].cy) == (390.5, 310)
+    assert (found["f.jpg"].model, found["f.jpg"].focal_px) == ("OPENCV", None)
     assert found["f.jpg"].where.endswith("plates.csv, line 8")
 
 
