@@ -5,6 +5,7 @@
 """
 
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -119,17 +120,12 @@ class MethodRun:
         if self.method.escalates:  # verification of this seed decides
             asked["seed"] = self.options.seeds[0]
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
-        if record.exists():
-            if difference := first_difference(json.loads(record.read_bytes()), asked):
-                raise StaleStoreError(
-                    f"{folder}: {self.method.label} was run there with {difference}; use "
-                    "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
-                    "or another --output-path"
-                )
-        elif folder.exists():
+        known = json.loads(record.read_bytes()) if record.exists() else {}
+        if folder.exists() and (difference := first_difference(known, asked)):
             raise StaleStoreError(
-                f"{folder}: was not made here, or by an older version; use --overwrite to redo "
-                "the methods that are named, or another --output-path"
+                f"{folder}: {self.method.label} was run there with {difference}; use "
+                "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
+                "or another --output-path"
             )
         self.workspace.begin()
         replace_text(record, json.dumps(asked, indent=1))
@@ -169,12 +165,14 @@ class MethodRun:
             advance(len(names))
 
     def _match_sift(self) -> None:
-        taken = image_ids(self.database).keys()
-        names = self.options.inputs(self.image_path).names()
-        pairs = [pair for pair in self.options.pairs_of(names) if taken >= set(pair)]
-        with self.progress.stage("match", len(pairs), "pairs") as advance:
+        taken, pairs = image_ids(self.database).keys(), None
+        if self.options.pairs.match_list_path:
+            names = self.options.inputs(self.image_path).names()
+            pairs = [pair for pair in self.options.pairs_of(names) if taken >= set(pair)]
+        num_pairs = math.comb(len(taken), 2) if pairs is None else len(pairs)
+        with self.progress.stage("match", num_pairs, "pairs") as advance:
             match_sift(self.database, pairs)
-            advance(len(pairs))
+            advance(num_pairs)
 
     def _match_recipe(self, recipe: Recipe) -> None:
         context = Context(self.workspace, self.options.resources, None, self.progress)

@@ -1,17 +1,15 @@
 """COLMAP's SIFT through pycolmap, on the images and pairs of a database that has no features."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.errors import ComparisonError
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import temporary_folder
-
-TEMPORARY_NAME = "id:{}"  # name of an image by its id while COLMAP matches
 
 
 def extract_sift(
@@ -51,30 +49,22 @@ def extract_sift(
     return impossible | dict.fromkeys(failed, "COLMAP cannot read it or its mask")
 
 
-def match_sift(database_path: Path, pairs: Sequence[Pair]) -> None:
-    """Match pairs of images by COLMAP's defaults, without verification.
+def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
+    """Match pairs of images, or all, by COLMAP's defaults, without verification.
 
-    In a copy in which images have other names: COLMAP's lists of pairs cannot hold spaces.
+    ComparisonError for listed names with spaces, which COLMAP's lists of pairs cannot hold.
     """
-    ids = image_ids(database_path)
-    names = {image_id: name for name, image_id in ids.items()}
-    lines = [f"{TEMPORARY_NAME.format(ids[a])} {TEMPORARY_NAME.format(ids[b])}\n" for a, b in pairs]
+    options = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True)
+    if pairs is None:
+        pycolmap.match_exhaustive(database_path, matching_options=options)
+        return
+    if spaced := [name for pair in pairs for name in pair if " " in name]:
+        raise ComparisonError(f"{spaced[0]}: COLMAP matches no listed names with spaces; rename it")
     with temporary_folder(database_path.parent) as folder:
-        list_path, copy = folder / "pairs.txt", folder / database_path.name
-        replace_text(list_path, "".join(lines))
-        copy_database(database_path, copy)
-        _rename_images(copy, {image_id: TEMPORARY_NAME.format(image_id) for image_id in names})
+        list_path = folder / "pairs.txt"
+        replace_text(list_path, "".join(f"{first} {second}\n" for first, second in pairs))
         pycolmap.match_image_pairs(
-            copy,
-            matching_options=pycolmap.FeatureMatchingOptions(skip_geometric_verification=True),
+            database_path,
+            matching_options=options,
             pairing_options=pycolmap.ImportedPairingOptions(match_list_path=list_path),
         )
-        _rename_images(copy, names)
-        copy.replace(database_path)
-
-
-def _rename_images(database_path: Path, names: Mapping[int, str]) -> None:
-    with open_database(database_path) as database:
-        for image in database.read_all_images():
-            image.name = names[image.image_id]
-            database.update_image(image)

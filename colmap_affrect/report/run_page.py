@@ -11,7 +11,13 @@ import numpy as np
 from colmap_affrect.errors import such_as
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport, by_story
+from colmap_affrect.project.report import (
+    MAX_LINES,
+    SOURCES,
+    ModelSummary,
+    ReconstructionReport,
+    by_story,
+)
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.page import TEMPLATES, write_page
 from colmap_affrect.report.pictures import base64_text, thumbnails
@@ -29,14 +35,6 @@ FILTERS = {
     "all": "All", "missing": "Missing", "doubtful": "Doubtful", "added": "New",
     "guided": "Guided", "bridged": "Bridged",
 }  # fmt: skip
-
-SOURCES = {
-    "given": "given",
-    "exif": "EXIF",
-    "exif-rescaled": "EXIF, scaled to a photograph that was shrunk",
-    "pairs": "verified pairs",
-    "guess": "guess",
-}
 
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
@@ -168,18 +166,18 @@ def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
 def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
     rows = []
     for camera in report.cameras[:MAX_NUM_CAMERAS]:
-        refined = camera["refined_px"]
+        refined, source = camera["refined_px"], camera["source"]
         names = (f"{index[name] + 1} {name}" for name in camera["names"] if name in index)
         rows.append(
             {
                 "photographs": such_as(names),
                 "focal": f"{camera['focal_px']:,.0f}",
                 "refined": f"{refined:,.0f}" if refined else "-",
-                "source": f"{SOURCES[camera['source']]}{camera['why'] and ': '}{camera['why']}",
+                "source": f"{SOURCES.get(source, source)}{camera['why'] and ': '}{camera['why']}",
             }
         )
     counts, total = Counter(camera["source"] for camera in report.cameras), len(report.cameras)
-    sources = ", ".join(f"{count} by {SOURCES[key]}" for key, count in counts.most_common())
+    sources = ", ".join(f"{count} {SOURCES.get(key, key)}" for key, count in counts.most_common())
     note = f"{total} camera{'s' if total != 1 else ''}, focal lengths: {sources}."
     if total > len(rows):
         note += f" The first {len(rows)} are listed, report.json has all."

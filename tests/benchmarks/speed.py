@@ -26,7 +26,6 @@ from colmap_affrect.colmap.verification import VerificationOptions, verified_pai
 from colmap_affrect.comparison.methods import SIFT, SIFT_AFFINE_DSP, Method, parse_method
 from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
-from colmap_affrect.pairs.lists import exhaustive_pairs
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.context import Resources
@@ -70,7 +69,7 @@ def run_sift(folder: Path, image_path: Path, names: Sequence[str], *, affine: bo
     times = [time.perf_counter()]
     extract_sift(database_path, image_path, names, MaskOptions(), affine=affine)
     times.append(time.perf_counter())
-    match_sift(database_path, exhaustive_pairs(names))
+    match_sift(database_path, None)
     times.append(time.perf_counter())
     verify(database_path, VERIFICATION)
     times.append(time.perf_counter())

@@ -14,7 +14,7 @@ from colmap_affrect.comparison.sift import (
     extract_sift,
     match_sift,
 )
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import ComparisonError, OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 
 
@@ -74,12 +74,14 @@ def test_sift_looks_at_the_masks_and_matches_the_pairs_of_the_list(tmp_path):
             assert len(keypoints) > 50
             assert keypoints[:, 0].min() >= 160
     first, second, third = names
-    assert second == "b c.png"
-    match_sift(path, [(first, second), (second, third)])
-    assert image_ids(path) == ids
-    assert not (tmp_path / "pairs.txt").exists()
+    match_sift(path, [(first, third)])
+    with open_database(path) as database:
+        assert database.exists_matches(ids[first], ids[third])
+        assert not database.exists_matches(ids[first], ids[second])
+    match_sift(path, None)
     with open_database(path) as database:
         assert len(database.read_matches(ids[first], ids[second])) > 20
-        assert database.exists_matches(ids[second], ids[third])
-        assert not database.exists_matches(ids[first], ids[third])
         assert database.num_verified_image_pairs() == 0
+    assert second == "b c.png"
+    with pytest.raises(ComparisonError, match=r"b c\.png: COLMAP matches no listed names"):
+        match_sift(path, [(first, second)])
