@@ -1,6 +1,5 @@
 """Methods by name: COLMAP's SIFT, and recipes with or without changed options."""
 
-import difflib
 import re
 import zlib
 from collections.abc import Iterable, Sequence
@@ -9,6 +8,7 @@ from pathlib import PurePath
 from typing import Any
 
 from colmap_affrect.errors import OptionError
+from colmap_affrect.options import suggestion
 from colmap_affrect.recipes import Recipe, load_recipe, recipe_names
 
 SIFT_COLMAP, SIFT, SIFT_AFFINE_DSP = "sift-colmap", "sift", "sift-affine-dsp"
@@ -70,14 +70,12 @@ def parse_methods(
         if last:
             methods.append(parse_method(last + colon + settings, depth_settings))
     if not methods:
-        raise OptionError(f"no method given; known are {_known()}")
+        raise OptionError("no method given")
     labels = [method.label for method in methods]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise OptionError(
-                f"two methods are called '{label}'; give one another name, "
-                "as in NAME=RECIPE:section.option=value"
-            )
+    if twice := [label for label in labels if labels.count(label) > 1]:
+        raise OptionError(
+            f"two methods are called '{twice[0]}'; give one another name, as in NAME=RECIPE"
+        )
     return tuple(methods)
 
 
@@ -95,16 +93,11 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     if label in SIFT_SUMMARIES:
         raise OptionError(f"{text}: '{label}' is COLMAP's; choose another name")
     if not name.endswith(".toml") and name not in recipe_names():
-        close = difflib.get_close_matches(name, [*SIFT_SUMMARIES, *recipe_names()], n=1)
-        hint = f"did you mean '{close[0]}'? " if close else ""
-        raise OptionError(f"unknown method '{name}': {hint}known are {_known()}")
+        known = [*SIFT_SUMMARIES, *recipe_names()]
+        raise OptionError(f"unknown method '{name}'{suggestion(name, known)}")
     changes = re.split(r",(?![^\[\]]*\])", settings) if settings else []
     recipe = load_recipe(name, changes)
     if recipe.extraction.uses_depth:
         recipe = load_recipe(name, [*changes, *depth_settings])
     default_label = text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
     return Method(label or default_label, recipe)
-
-
-def _known() -> str:
-    return ", ".join([*SIFT_SUMMARIES, *recipe_names(), "or the path of a recipe in TOML"])
