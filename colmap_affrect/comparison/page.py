@@ -11,7 +11,6 @@ from colmap_affrect.comparison.tables import headline, notes, table
 from colmap_affrect.options import flat
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.report import page
-from colmap_affrect.report.pictures import thumbnails
 from colmap_affrect.report.scene import read_scene
 
 TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
@@ -69,7 +68,6 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
     columns = columns_of(comparison)
     names, folder = comparison.image_names, Path(comparison.image_path)
     cards = cards_of(columns, comparison)
-    index = {name: number for number, name in enumerate(names)}
     shown = {column.method.name: column.method.shown_seed for column in columns}
     views = read_scene({n: output_path / s.model_path if s else None for n, s in shown.items()})
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
@@ -81,19 +79,14 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
         "table": table(comparison),
         "filters": FILTERS,
         "cards": cards,
-        "thumbnails": thumbnails(folder, names, progress),
-        "image_index": index,
         "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
         "settings": flat(comparison.settings),
         "method_options": [flat(column.method.options) for column in columns],
         "views": views,
         "kinds": KINDS,
-        "script_data": {
-            "views": [view.script_data(index, k) for view, k in zip(views, kinds, strict=True)],
-        },
     }
-    folders = [folder, output_path.resolve()]
-    return page.write_page(output_path / "report.html", TEMPLATE, content, folders)
+    drawn, path = zip(views, kinds, strict=True), output_path / "report.html"
+    return page.write_page(path, TEMPLATE, content, names, folder, drawn, progress)
 
 
 def columns_of(comparison: Comparison) -> list[Column]:

@@ -4,14 +4,17 @@ import base64
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
 from colmap_affrect.errors import shown
+from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.report.pictures import thumbnails
+from colmap_affrect.report.scene import View3D
 
 TEMPLATES = Path(__file__).parent / "templates"
 INLIER_COLORS = {
@@ -23,14 +26,22 @@ FOLDERS = re.compile(r"(?<![^\s'\"(=\[])(?:[A-Za-z]:[\\/]|~?/)(?:[^/\\\s'\"]+[/\
 
 
 def write_page(
-    path: Path, template: Path, content: Mapping[str, Any], folders: Iterable[Path] = ()
+    path: Path,
+    template: Path,
+    content: Mapping[str, Any],
+    names: Sequence[str],
+    image_path: Path | None,
+    views: Iterable[tuple[View3D, Mapping[str, str]]],
+    progress: Progress,
 ) -> Path:
     """Fill a template, write it as one file that loads nothing, and return its path.
 
-    The template extends ``base.html`` and may use ``parts.html``; ``script_data`` of the content is
-    for ``page.js``. No folder of this machine is in the page, ``folders`` in particular, since
-    pages are sent to others. Raises WorkspaceError when it cannot be written.
+    The template extends ``base.html`` and may use ``parts.html``. It gets thumbnails of the
+    photographs that are called ``names``, and models with the kind of each camera by its name. No
+    folder of this machine is in the page, since pages are sent to others. Raises WorkspaceError
+    when it cannot be written.
     """
+    folders = [folder.resolve() for folder in (path.parent, image_path) if folder]
     known = [f"{place}{os.sep}" for folder in folders for place in (folder, folder.parent)]
     hidden = sorted(known, key=len, reverse=True)
 
@@ -54,11 +65,17 @@ def write_page(
         "script_digest": base64.b64encode(digest).decode("ascii"),
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
     }
-    classes = {"starts": list(INLIER_COLORS), "colors": list(INLIER_COLORS.values())}
-    names = list(map(shown, content["image_index"]))
-    data = {"names": names, "classes": classes, **content["script_data"]}
+    index = {name: number for number, name in enumerate(names)}
+    data = {
+        "names": list(map(shown, names)),
+        "starts": list(INLIER_COLORS),
+        "colors": list(INLIER_COLORS.values()),
+        "matrix": content.get("matrix", ""),
+        "views": [view.script_data(index, kinds) for view, kinds in views],
+    }
+    pictures = thumbnails(image_path, names, progress) if image_path else {}
     page = environment.get_template(template.name)
-    replace_text(path, page.render({**content, "script_data": data}))
+    replace_text(path, page.render({**content, "thumbnails": pictures, "script_data": data}))
     return path
 
 

@@ -20,7 +20,7 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.page import TEMPLATES, write_page
-from colmap_affrect.report.pictures import base64_text, thumbnails
+from colmap_affrect.report.pictures import base64_text
 from colmap_affrect.report.scene import read_scene
 
 KINDS = {
@@ -66,8 +66,8 @@ def write_run_page(
     """
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
     cards = [_card(number, name, report, model) for number, name in enumerate(names, 1)]
-    index = {name: number for number, name in enumerate(names)}
-    pair_inliers = {pair: n for pair, n in pair_inliers.items() if index.keys() >= set(pair)}
+    known = set(names)
+    pair_inliers = {pair: n for pair, n in pair_inliers.items() if known >= set(pair)}
     (view,) = read_scene({"this run": workspace.sparse / "0" if report.models else None})
     kinds = Counter(card.kind for card in cards)
     content = {
@@ -83,18 +83,13 @@ def write_run_page(
         "kinds": {kind: f"{text} ({kinds[kind]})" for kind, text in KINDS.items() if kinds[kind]},
         "cards": cards,
         "filters": FILTERS,
-        "thumbnails": thumbnails(image_path, names, progress) if image_path else {},
-        "image_index": index,
         "num_pairs": len(pair_inliers),
-        "has_matrix": len(names) <= MAX_NUM_IN_MATRIX,
-        **_cameras(report, index),
-        "script_data": {
-            "matrix": _matrix(names, pair_inliers),
-            "views": [view.script_data(index, {card.name: card.kind for card in cards})],
-        },
+        "matrix": _matrix(names, pair_inliers),
+        **_cameras(report, names),
     }
-    folders = [workspace.path.resolve(), *([image_path.resolve()] if image_path else [])]
-    return write_page(workspace.page, TEMPLATES / "run.html", content, folders)
+    views = [(view, {card.name: card.kind for card in cards})]
+    template = TEMPLATES / "run.html"
+    return write_page(workspace.page, template, content, names, image_path, views, progress)
 
 
 def _about(report: ReconstructionReport) -> str:
@@ -163,14 +158,15 @@ def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
     return tiles | {"seconds": f"{seconds:,.1f}".removesuffix(".0")}
 
 
-def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
+def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, Any]:
+    index = {name: number for number, name in enumerate(names)}
     rows = []
     for camera in report.cameras[:MAX_NUM_CAMERAS]:
         refined, source = camera["refined_px"], camera["source"]
-        names = (f"{index[name] + 1} {name}" for name in camera["names"] if name in index)
+        listed = (f"{index[name] + 1} {name}" for name in camera["names"] if name in index)
         rows.append(
             {
-                "photographs": such_as(names),
+                "photographs": such_as(listed),
                 "focal": f"{camera['focal_px']:,.0f}",
                 "refined": f"{refined:,.0f}" if refined else "-",
                 "source": f"{SOURCES.get(source, source)}{camera['why'] and ': '}{camera['why']}",

@@ -44,7 +44,7 @@ def test_folders_of_methods_differ_and_stay_inside():
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (["sift,defualt"], "unknown method 'defualt': did you mean 'default'"),
+        (["sift,defualt"], r"unknown method 'defualt' .did you mean 'default'"),
         (["sift,sift"], "two methods are called 'sift'"),
         (["sift=default"], "'sift' is COLMAP's"),
         ([","], "no method given"),

@@ -89,8 +89,8 @@
       const count = counts.getUint16(2 * cell, true);
       if (!count) continue;
       const [row, column] = [Math.floor(cell / size), cell % size];
-      const kind = data.classes.starts.filter((start) => count >= start).length - 1;
-      context.fillStyle = data.classes.colors[kind];
+      const kind = data.starts.filter((start) => count >= start).length - 1;
+      context.fillStyle = data.colors[kind];
       context.fillRect(column, row, 1, 1);
       if (size > MAX_NUMBERED) continue;
       const text = document.createElementNS("http" + "://www.w3.org/2000/svg", "text");
