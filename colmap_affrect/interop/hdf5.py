@@ -100,17 +100,16 @@ class _Source:
     def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
         """Read numbers of some of numpy's kinds, of a shape in which None is any size."""
         stored = self.shapes[key]
-        same = [size in (expected, None) for size, expected in zip(shape, stored, strict=False)]
-        if len(stored) != len(shape) or not all(same):
+        expected = tuple(stored[:1]) if shape[0] is None else shape[:1]
+        if stored != expected + shape[1:]:
             wanted = str(shape).replace("None", "N")
             raise StoreError(f"{self.path}: {key} has shape {stored}, expected {wanted}")
         if np.prod([float(size) for size in stored]) > MAX_VALUES:
             raise StoreError(f"{self.path}: {key} of shape {stored} is too large to be true")
         with damage(self.path, MEND):
-            if self.file[key].dtype.kind in kinds:
-                return np.asarray(self.file[key][()])
-        what = "numbers" if "f" in kinds else "integers"
-        raise StoreError(f"{self.path}: {key} does not hold {what}")
+            if self.file[key].dtype.kind not in kinds:
+                raise ValueError(f"{key} does not hold numbers, or no whole ones")
+            return np.asarray(self.file[key][()])
 
 
 @contextmanager

@@ -119,7 +119,6 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
             weights_path: PathLike | None = None,
             progress: Progress = SILENT,
         ) -> Reports:
-            translate.changes(pairing_options, kind, "pairing_options")
             pairing: Any = translate.native(pairing_options, kind, "pairing_options")
             verification = translate.verification_options(verification_options, random_seed)
             matching, asked = translate.matching_options(matching_options)
@@ -214,30 +213,18 @@ def _match(
 
 def verify_matches(
     database_path: PathLike,
-    pairs_path: PathLike,
+    pairs_path: PathLike | None,
     options: GivenVerification = None,
     cancellation_token: Token = None,
 ) -> None:
-    """Verify the matched pairs of a list; the same as :func:`verify` with ``pairs_path``."""
-    verify(database_path, options, pairs_path=pairs_path, cancellation_token=cancellation_token)
+    """Estimate the two-view geometries of the matched pairs of a list that lack one.
 
-
-def verify(
-    database_path: PathLike,
-    options: GivenVerification = None,
-    *,
-    pairs_path: PathLike | None = None,
-    random_seed: int | None = None,
-    cancellation_token: Token = None,
-) -> None:
-    """Estimate the two-view geometries of the matched pairs of any database that lack one.
-
-    As ``pycolmap.geometric_verification``, with the preset for sparse sets (or ``options``, ours or
-    those of pycolmap that have a counterpart). DatabaseError where a match points at no keypoint.
-    ``pairs_path`` lists the pairs to verify, two names per line; all by default.
+    With the preset for sparse sets, or ``options``, ours or those of pycolmap that have a
+    counterpart, in any database; DatabaseError where a match points at no keypoint. ``pairs_path``
+    has two names per line; None stands for all pairs.
     """
     path, pairs = Path(database_path), None
-    verification = translate.verification_options(options, random_seed)
+    verification = translate.verification_options(options, None)
     refuse_unusable(path)
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
         if pairs_path is not None:
@@ -245,6 +232,11 @@ def verify(
             listed = read_pairs(Path(pairs_path), list(ids))
             pairs = {(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in listed}
         verify_database(path, verification, advance=advance, pairs=pairs)
+
+
+def verify(database_path: PathLike, options: GivenVerification = None) -> None:
+    """Do for all matched pairs what :func:`verify_matches` does for listed ones."""
+    verify_matches(database_path, None, options)
 
 
 def _of_different_frames(path: Path, pairs: Sequence[Pair]) -> list[Pair]:

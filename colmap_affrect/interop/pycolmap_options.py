@@ -59,27 +59,35 @@ SET_OTHERWISE = ("random_seed", "image_path", "fix_existing_frames")
 
 
 def native(given: object, kind: type[Native], argument: str) -> Native:
-    """Return pycolmap's options, of a nested dictionary too; OptionError names the field."""
+    """Return pycolmap's options, of a nested dictionary too.
+
+    OptionError names a field that is unknown, or that differs from its default and is not honoured.
+    """
+    options = kind()
     if isinstance(given, kind):
-        return given
-    if given is not None and not isinstance(given, Mapping):
+        options = given
+    elif given is None or isinstance(given, Mapping):
+        usual = flat_values(options)
+        values = {k: v for k, v in flat(given or {}).items() if k not in usual or v != usual[k]}
+        resolve(options, values, f"{argument}:", owned={})
+    else:
         shown = f"{argument}: {type(given).__name__} does not apply here"
         raise OptionError(f"{shown}; give pycolmap.{kind.__name__} or a dictionary of its fields")
-    options, usual = kind(), flat_values(kind())
-    values = {k: v for k, v in flat(given or {}).items() if k not in usual or v != usual[k]}
-    resolve(options, values, f"{argument}:", owned={})
+    for key, value in _differing(options).items():
+        if kind in HONOURED and key not in HONOURED[kind]:
+            shown = getattr(value, "name", value)
+            raise OptionError(f"{argument}: {key}={shown} cannot be carried over")
     return options
+
+
+def _differing(options: Any) -> dict[str, Any]:
+    usual = flat_values(type(options)())
+    return {key: value for key, value in flat_values(options).items() if value != usual[key]}
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
     """Return fields that differ from pycolmap's defaults; OptionError for one we do not have."""
-    usual, values = flat_values(kind()), flat_values(native(given, kind, argument))
-    found = {key: value for key, value in values.items() if value != usual[key]}
-    for key, value in found.items():
-        if key not in HONOURED[kind]:
-            shown = getattr(value, "name", value)
-            raise OptionError(f"{argument}: {key}={shown} cannot be carried over")
-    return found
+    return _differing(native(given, kind, argument))
 
 
 def extraction_recipe(given: object) -> tuple[Recipe, dict[str, Any]]:
@@ -118,7 +126,6 @@ def verification_options(given: object, random_seed: int | None) -> Verification
 
 def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, MaskOptions]:
     """Return what pycolmap's options say of cameras and masks."""
-    changes(given, pycolmap.ImageReaderOptions, "reader_options")
     known = native(given, pycolmap.ImageReaderOptions, "reader_options")
     cameras = CameraOptions.from_mapping(
         {
@@ -142,12 +149,10 @@ def given_path(path: Path | str) -> str:
 
 def mapper_options(given: pycolmap.IncrementalPipelineOptions) -> MapperOptions:
     """Translate what differs from pycolmap's defaults into options of our mapper."""
-    usual = pycolmap.IncrementalPipelineOptions()
-    known = flat_values(usual)
-    for key, value in flat_values(given).items():
-        if isinstance(value, list | set) and value != known[key]:
+    for key, value in _differing(given).items():
+        if isinstance(value, list | set):
             raise OptionError(f"options: {key}={value} cannot be carried over")
-    values = differences(given, usual)
+    values = differences(given, pycolmap.IncrementalPipelineOptions())
     seed = {"random_seed": given.random_seed} if "random_seed" in values else {}
     kept = {k: v for k, v in values.items() if k.rpartition(".")[2] not in SET_OTHERWISE}
     options: MapperOptions = MAPPERS.options(

@@ -196,7 +196,7 @@ ERRORS: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "real matches": (
         change_matches(**{"a.png__sub-b c.png": match_group([0, 1, 2], np.float32)}),
-        "does not hold integers",
+        "does not hold numbers, or no whole ones",
     ),
 }  # fmt: skip
 

@@ -130,7 +130,7 @@ def test_verify_takes_a_list_of_pairs(tmp_path: Path) -> None:
     path, listed = tmp_path / "database.db", tmp_path / "pairs.txt"
     names = synthesize(path, verified=False)
     listed.write_text(f"{names[2]} {names[0]}\n{names[1]} {names[3]}\n")
-    colmap_affrect.verify(path, pairs_path=listed)
+    colmap_affrect.verify_matches(path, listed)
     with open_database(path) as database:
         pair_ids, counts = database.read_two_view_geometry_num_inliers()
         assert database.num_matched_image_pairs() == NUM_IMAGES * (NUM_IMAGES - 1) / 2
@@ -142,7 +142,7 @@ def test_verify_takes_a_list_of_pairs(tmp_path: Path) -> None:
         assert len(database.read_two_view_geometry_num_inliers()[0]) == 15
     listed.write_text("a b\n")
     with pytest.raises(PairListError):
-        colmap_affrect.verify(path, pairs_path=listed)
+        colmap_affrect.verify_matches(path, listed)
     with open_database(path) as database:  # at which the process would end inside COLMAP
         database.delete_matches(1, 2)
         database.write_matches(1, 2, np.array([[0, 0], [1, 10_000]], np.uint32))
