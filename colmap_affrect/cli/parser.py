@@ -91,24 +91,24 @@ def build_parser() -> argparse.ArgumentParser:
         subparser = commands.add_parser(
             name, help=summary, description=summary, epilog=epilog(name), **usual
         )
-        found = {action.dest for word in flags.split() for action in _add(subparser, word)}
-        parser.set_defaults(**dict.fromkeys(found))
+        for word in [*flags.split(), VOLUME]:
+            parser.set_defaults(**dict.fromkeys(_add(subparser, word)))
     return parser
 
 
-def _add(parser: argparse.ArgumentParser, word: str) -> list[argparse.Action]:
-    """Add a flag, or several that exclude each other; see :data:`COMMANDS`."""
+def _add(parser: argparse.ArgumentParser, word: str) -> list[str]:
+    """Add a flag, or several that exclude each other, see :data:`COMMANDS`; return their names."""
     names = word.removesuffix("!").split("|")
     required: dict[str, Any] = {"required": True} if word.endswith("!") else {}
     target = parser.add_mutually_exclusive_group() if len(names) > 1 else parser
     return [
-        target.add_argument(*name.partition("@")[0].split(","), **FLAGS[name], **required)
+        target.add_argument(*name.partition("@")[0].split(","), **FLAGS[name], **required).dest
         for name in names
     ]
 
 
-VOLUME = "-q,--quiet|-v,--verbose"
-RESULTS = f"--output-path! --overwrite {VOLUME}"
+VOLUME = "-q,--quiet|-v,--verbose"  # of all commands
+RESULTS = "--output-path! --overwrite"
 MASKS = "--mask-path --camera-mask-path"
 CAMERAS = """--camera-mode --camera-model --camera-params --cameras-path --focal-length-px
     --principal-point --ignore-exif"""
@@ -126,8 +126,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "extract": ("features into features.h5 and database.db",
         f"{RESULTS} {IMAGES} {RECIPE} --depth-path --database-descriptors {NETWORKS} --scheduler"),
     "pairs": ("which images to match, into pairs.txt", f"{RESULTS} {PAIRS}"),
-    "match": ("matches into matches.h5 and database.db",
-        f"{RESULTS} --set {NETWORKS} --scheduler"),
+    "match": ("matches into matches.h5 and database.db", f"{RESULTS} --set {NETWORKS} --scheduler"),
     "verify": ("two-view geometries into database.db", f"{RESULTS} --preset --random-seed"),
     "escalate": (
         "match pairs that failed again, with more warps (recipes that escalate, as on-demand)",
@@ -146,29 +145,28 @@ COMMANDS: dict[str, tuple[str, str]] = {
         f"--depth-path {NETWORKS} --random-seed --json"),
     "convert": (
         "a folder of photographs in formats that COLMAP reads: JPEG 2000, WebP, HEIC, pages",
-        f"--image-path! --output-path@photographs! {VOLUME}"),
+        "--image-path! --output-path@photographs!"),
     "inspect": (
         "draw what a recipe does to one image: regions, warps, features; the plan as JSON",
-        f"image --output-path! {VOLUME} {MASKS} {RECIPE} --depth-path {NETWORKS}"),
+        f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),
     "import-h5": ("features and matches in hloc's files into a new COLMAP database",
         "--image-path! --features-path! --matches-path! --database-path! "
-        f"{CAMERAS} --random-seed {VOLUME}"),
+        f"{CAMERAS} --random-seed"),
     "export-h5": ("features and matches of any COLMAP database for hloc",
-        f"--database-path@read! --features-path! --matches-path! {VOLUME}"),
+        "--database-path@read! --features-path! --matches-path!"),
     "export-database": (
         "any database for COLMAP 3.8 to 3.13, as Linux distributions have them",
-        f"path database_path --colmap {VOLUME}"),
+        "path database_path --colmap"),
     "export": (
         "a model for other programs: points, text, undistorted photographs, tables",
-        f"--model-path! --output-path@files! --format --image-path@export {VOLUME}"),
+        "--model-path! --output-path@files! --format --image-path@export"),
     "align": ("give a model its scale and place, by GPS, control points or a distance",
-        f"--model-path! --output-path@model! --gps|--positions|--points --distance {VOLUME}"),
+        "--model-path! --output-path@model! --gps|--positions|--points --distance"),
     "doctor": (
         "look for what is wrong with results or the installation, and say what to do about it",
-        f"path@optional --weights --json {VOLUME}"),
+        "path@optional --weights --json"),
     "recipes": ("list the recipes and what they need", "name"),
-    "weights": ("list the files of weights, or fetch them beforehand",
-        f"action keys --weights {VOLUME}"),
+    "weights": ("list the files of weights, or fetch them beforehand", "action keys --weights"),
 }  # fmt: skip
 """What a command does in one line, and its flags of :data:`.flags.FLAGS`.
 
