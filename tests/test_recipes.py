@@ -71,8 +71,7 @@ def test_matcher_must_be_trained_for_the_features() -> None:
     with pytest.raises(OptionError) as error:
         load_recipe("default", ["matching=lightglue"])
     assert str(error.value).endswith(
-        "'aliked' takes features of aliked, not of rootsift; use --recipe aliked-lightglue, or "
-        "--set matching.trained_for=sift"
+        "'aliked' takes features of aliked, not of rootsift; use --recipe aliked-lightglue"
     )
 
 
