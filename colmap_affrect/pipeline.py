@@ -36,7 +36,6 @@ from colmap_affrect.stages.map import (
     advice,
     contradicting_pairs,
     image_names,
-    image_path_of,
     map_images,
     num_verified_inliers,
     unregistered,
@@ -194,7 +193,7 @@ def map_and_report(
         extend.refuse_discarding(workspace.path)
     before = existing_names(extend.model_path, image_names(workspace)) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
-    names, copied = image_names(workspace), workspace.is_copy
+    names, copied = image_names(workspace), workspace.is_foreign
     verification = context.verification
     missing, pair_inliers = unregistered(context, names, models), num_verified_inliers(workspace)
     cameras = read_camera_records(workspace.cameras)
@@ -216,7 +215,7 @@ def map_and_report(
         },
         pair_levels={} if copied else pair_levels(context),
         contradicting_pairs={} if copied else contradicting_pairs(context),
-        guided=guided_counts(context),
+        guided={} if copied else guided_counts(context),
         cameras=tuple(
             record.to_report(camera_id, models[0] if models else None)
             for camera_id, record in cameras.items()
@@ -230,7 +229,7 @@ def map_and_report(
         workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
     replace_text(workspace.report, text)
     if page and not keeps_page:
-        image_path = image_path_of(workspace)
+        image_path = workspace.photographs()
         write_run_page(workspace, result, names, pair_inliers, image_path, context.progress)
     return result
 
@@ -246,7 +245,7 @@ def _says_the_same(path: Path, report: str) -> bool:
 
 def _require_photographs(context: Context) -> None:
     """Refuse to map photographs that are not where they were when they were extracted."""
-    if not context.workspace.is_copy:
+    if not context.workspace.is_foreign:
         path, names = context.inputs.image_path, set(context.inputs.names())
         if gone := sorted(set(context.features.names()) - names):
             raise ImageError(f"{path}: {gone[0]} has features, and is gone; run extract again")

@@ -68,6 +68,7 @@ class Workspace:
         self.config, self.log = path / "config.toml", path / "run.log"  # options; of all runs
         self.report, self.page = path / "report.json", path / "report.html"  # of the last run
         self.cameras = path / "cameras.json"  # what is known of the database's, and from where
+        self.is_changed = False  # the database, by another program, and is to be mapped so
         self._record: dict[str, Any] | None = None
 
     @classmethod
@@ -176,9 +177,9 @@ class Workspace:
         return [name for name in self.begun if STAGES.index(name) < STAGES.index(stage)]
 
     @property
-    def is_copy(self) -> bool:
-        """Whether the folder holds a copy of another program's database."""
-        return "copy" in self.begun
+    def is_foreign(self) -> bool:
+        """Whether the database is a copy of another program's, or was changed by one."""
+        return self.is_changed or "copy" in self.begun
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""

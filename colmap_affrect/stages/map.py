@@ -4,7 +4,6 @@ import logging
 import time
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
@@ -93,10 +92,10 @@ def map_images(
 def _task(context: Context, existing: ExistingModel | None, may_share: bool | None) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace = context.workspace
-    copied = workspace.is_copy
+    copied = workspace.is_foreign
     return MappingTask(
         workspace.database,
-        image_path_of(workspace),
+        workspace.photographs(),
         existing,
         guided={} if copied else inliers_by_guiding(context),
         measured={} if copied else measured_inliers(context),
@@ -107,7 +106,7 @@ def _task(context: Context, existing: ExistingModel | None, may_share: bool | No
 
 def _may_share(context: Context) -> bool:
     """Tell whether nothing is said of which photographs share a camera."""
-    if context.workspace.is_copy:
+    if context.workspace.is_foreign:
         return False
     return context.inputs.cameras.mode == "auto" and not context.inputs.from_database
 
@@ -121,15 +120,9 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
     return f"{geometry} {'own' if own else extend.digest()}"
 
 
-def image_path_of(workspace: Workspace) -> Path | None:
-    """Return the folder of the photographs, None where another program's database names none."""
-    path = workspace.require("copy" if workspace.is_copy else "extract")["image_path"]
-    return Path(path) if path else None
-
-
 def image_names(workspace: Workspace) -> list[str]:
     """Return the names of the images of a run, or of the database that was copied."""
-    if workspace.is_copy:
+    if workspace.is_foreign:
         return sorted(colmap_database.image_ids(workspace.database))
     return Context(workspace).inputs.names()
 
@@ -144,7 +137,7 @@ def num_verified_inliers(workspace: Workspace) -> dict[Pair, int]:
 
 def _min_num_inliers(workspace: Workspace) -> int:
     """Return how many inliers a verified pair has; another program had its own threshold."""
-    return 1 if workspace.is_copy else Context(workspace).verification.min_num_inliers
+    return 1 if workspace.is_foreign else Context(workspace).verification.min_num_inliers
 
 
 def unregistered(
@@ -203,19 +196,19 @@ def advice(
     missing = [name for name in missing if name in num_keypoints]  # nothing helps unreadable ones
     if not missing and not doubts:
         return ()
-    recipes = [] if workspace.is_copy else _other_recipes(context)
+    recipes = [] if workspace.is_foreign else _other_recipes(context)
     texts = []
     if FOCAL_CONTRADICTED in doubts:
         texts.append("run again without the given focal lengths, or with others: they do not fit")
     if missing:
         texts += recipes
-    has_cameras = workspace.is_copy or Context(workspace).inputs.from_database
+    has_cameras = workspace.is_foreign or Context(workspace).inputs.from_database
     if FOCAL_UNKNOWN in doubts and not has_cameras:
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
             "several focal lengths fit"
         )
-    if workspace.is_copy:
+    if workspace.is_foreign:
         texts.append("run --from-database, with --image-path, makes new features for its images")
     else:
         masks = Context(workspace).inputs.masks

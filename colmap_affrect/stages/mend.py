@@ -13,6 +13,7 @@ from itertools import count
 from pathlib import Path
 
 from colmap_affrect.colmap.checks import FATAL, refuse_unusable
+from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.project.atomic_files import replace_text
@@ -52,6 +53,8 @@ def watched(
     if maps and why == CHANGED:
         refuse_unusable(path, UNUSABLE)
         logger.warning("%s: %s, and is mapped as it is", path, CHANGED)
+        workspace.is_changed = True
+        record_cameras(path, workspace.cameras)
         yield  # the seal stays: other commands make the database again
         return
     if why:
@@ -98,7 +101,7 @@ def _why_lost(workspace: Workspace) -> str:
 
 def _make_again(context: Context, why: str, *, follows: bool) -> None:
     workspace, begun = context.workspace, context.workspace.begun
-    original = Path(workspace.require("copy")["database"]) if workspace.is_copy else None
+    original = Path(workspace.require("copy")["database"]) if workspace.is_foreign else None
     kept = _put_aside(workspace.database)
     logger.warning(
         "%s: %s; it is made again from %s%s",

@@ -110,7 +110,7 @@ def test_database_that_was_touched_or_left_by_a_killed_command_is_used(
 
 def test_map_maps_a_changed_database_as_it_is(out: Path, again: Again, call: Call) -> None:
     path = out / "database.db"
-    execute(path, f"DELETE FROM two_view_geometries WHERE {LAST_PAIR}")
+    execute(path, f"DELETE FROM two_view_geometries WHERE {LAST_PAIR}", RENAMED)
     changed = database_content(path)
     for _ in range(2):
         (warning,) = again("map")
