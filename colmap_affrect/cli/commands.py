@@ -238,20 +238,17 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
 
 def _next_steps(report: ReconstructionReport, workspace: Workspace) -> list[str]:
     """Say where the results are, and with which commands to go on."""
-    out, photos, model = workspace.path, workspace.photographs(), workspace.path / "sparse" / "0"
-    commands: list[list[object]] = []
-    if report.models:
-        look = ["colmap", "gui", "--import_path", model, "--database_path", workspace.database]
-        commands.append(look + (["--image_path", photos] if photos else []))
-    if report.status in ("ok", "partial"):
-        export = ["colmap-affrect", "export", "--model-path", model]
-        commands.append([*export, "--output-path", out / "export"])
-    if report.unregistered.keys() - report.failures and report.num_pairs and photos:
-        compare = ["colmap-affrect", "compare", "--image-path", photos]
-        commands.append([*compare, "--output-path", out / "compare"])
+    photos, model = workspace.photographs(), workspace.path / "sparse" / "0"
     page = f", to look at: {workspace.page}" if workspace.page.exists() else ""
-    lines = [f"results     {out}{page}", *(["next"] if commands else [])]
-    return lines + [f"            {shlex.join([str(word) for word in line])}" for line in commands]
+    lines = [f"results     {workspace.path}{page}"]
+    if report.models:
+        look = ["--import_path", str(model), "--database_path", str(workspace.database)]
+        look += ["--image_path", str(photos)] if photos else []
+        lines += ["next", f"            colmap gui {shlex.join(look)}"]
+    if report.status in ("ok", "partial"):
+        places = ["--model-path", str(model), "--output-path", str(workspace.path / "export")]
+        lines.append(f"            colmap-affrect export {shlex.join(places)}")
+    return lines
 
 
 def _refuse_failures(failures: Iterable[str], options: argparse.Namespace) -> None:
