@@ -304,6 +304,6 @@ def united(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matche
         best = np.sort(np.unique(indices[:, column], return_index=True)[1])
         indices, scores = indices[best], scores[best]
     places = keypoints1[indices[:, 0]], keypoints2[indices[:, 1]]
-    kept = without_duplicates(*places, DUPLICATE_RADIUS_PX)
+    kept = np.flatnonzero(without_duplicates(*places, DUPLICATE_RADIUS_PX))
     rising = kept[np.argsort(indices[kept, 0])]
     return Matches(indices[rising], scores[rising])

@@ -19,7 +19,7 @@ from colmap_affrect.geometry.affine import (
     lafs_from_keypoints,
     transform_frames,
 )
-from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
+from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
 from colmap_affrect.matchers.lightglue import (
     TRAININGS,
     LightGlue,
@@ -27,6 +27,7 @@ from colmap_affrect.matchers.lightglue import (
     frames_of_view,
     load_network,
     network_inputs,
+    united,
 )
 
 SIZE = (900, 600)
@@ -146,6 +147,17 @@ def test_views_are_matched_one_by_one_and_united(matcher: LightGlue) -> None:
     assert_array_equal(shown[found.indices[:, 0]], found.indices[:, 1])
     assert_array_equal(np.unique(found.indices[:, 1]), np.arange(60))  # the ten in both views once
     assert (np.diff(found.indices[:, 0]) > 0).all()
+
+
+def test_of_matches_at_one_place_the_best_is_left() -> None:
+    places = np.array([[9.0, 5.0], [30.0, 7.0], [9.2, 5.1], [30.0, 40.0]])
+    views = [
+        Matches(np.array([[1, 1], [0, 0]]), np.array([0.5, 0.9], np.float32)),
+        Matches(np.array([[2, 2], [3, 1]]), np.array([0.8, 0.4], np.float32)),
+    ]
+    found = united(views, places, places + 100.0)
+    assert_array_equal(found.indices, [[0, 0], [1, 1]])
+    assert_array_equal(found.scores, np.float32([0.9, 0.5]))
 
 
 def test_one_place_seen_in_two_views_is_one_match(matcher: LightGlue) -> None:
