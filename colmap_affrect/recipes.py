@@ -95,7 +95,7 @@ class ExtractionOptions(Options):
     def check_depth(self) -> None:
         """Refuse rectifiers that read depth maps where none are given; OptionError says how."""
         needing = [x.rectifier.name for x in self.levels if x.rectifier.uses_depth]
-        if needing and not self.depth.is_given:
+        if needing and isinstance(self.depth, DepthFilesOptions) and not self.depth.path:
             raise OptionError(f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER")
 
     def matchers(self, matching: MatcherOptions) -> tuple[MatcherOptions, ...]:

@@ -13,7 +13,8 @@ from colmap_affrect.colmap.model_files import read_poses
 from colmap_affrect.comparison.pose_scores import pose_scores
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.matchers.nearest import match_features, matchable
+from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
+from colmap_affrect.matchers.nearest import NearestNeighbors, NearestOptions
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.one_image import prepare
@@ -38,12 +39,15 @@ def test_courtyard_registers_every_photograph_where_it_stands(tmp_path):
     assert 1e-4 < scores.median_rotation_error_deg < 0.3
 
 
+MATCHER = NearestNeighbors(NearestOptions(), MatcherContext())
+
+
 @functools.cache
 def facade_view(recipe_name, view):
     recipe = load_recipe(recipe_name)
     path = next((SCENES / "facade" / "images").glob(f"view_{view}_*"))
     features = prepare(recipe.extraction).extract_file(path).features
-    return matchable(features.descriptors, features.keypoints, recipe.matching)
+    return MATCHER.prepare(ImageFeatures(features, (1, 1), "rootsift"))
 
 
 @pytest.mark.long
@@ -53,7 +57,7 @@ def test_facade_matches_follow_the_true_homography(view, low, high):
     correct = {}
     for name in ("default", "unrectified-rootsift"):
         first, second = facade_view(name, 1), facade_view(name, view)
-        matches = match_features(first, second, load_recipe(name).matching).indices
+        matches = MATCHER.match(first, second).indices
         expected = project(homography, first.keypoints[matches[:, 0]])
         errors = np.linalg.norm(expected - second.keypoints[matches[:, 1]], axis=1)
         correct[name] = int((errors < 3.0).sum())

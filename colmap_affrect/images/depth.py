@@ -66,11 +66,6 @@ class DepthOptions(PartOptions):
         """Folder that is read while images are worked on, if there is one."""
         return None
 
-    @property
-    def is_given(self) -> bool:
-        """Whether there is a source of depth at all."""
-        return True
-
     def file(self, name: str) -> Path | None:  # noqa: ARG002
         """Return the file that the depth of an image is read from, if there is one."""
         return None
@@ -88,11 +83,6 @@ class DepthFilesOptions(DepthOptions):
     def folder(self) -> Path | None:
         """The folder of the maps."""
         return Path(self.path) if self.path else None
-
-    @property
-    def is_given(self) -> bool:
-        """Whether a folder is named."""
-        return bool(self.path)
 
     def file(self, name: str) -> Path | None:
         """Return the map of an image, if any: ``a/b.jpg.npy`` and so on, then ``a/b.npy``."""

@@ -65,47 +65,33 @@ class NearestNeighbors:
         self.options, self._is_coarse = options, coarse_pays(context.num_similarities)
 
     def prepare(self, image: ImageFeatures) -> MatchableImage:
-        """Make the features of an image ready for matching."""
-        descriptors, keypoints = image.features.descriptors, image.features.keypoints
-        return matchable(descriptors, keypoints, self.options, is_coarse=self._is_coarse)
+        """Find the rivals of each feature, and round the descriptors where that pays."""
+        descriptors = np.ascontiguousarray(image.features.descriptors, dtype=np.float32)
+        keypoints = image.features.keypoints
+        rivals = neighbors_within(keypoints, self.options.min_contrast_distance_px)
+        coarse = CoarseDescriptors.of(descriptors) if self._is_coarse else None
+        return MatchableImage(descriptors, keypoints, rivals, coarse)
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
-        """Match two images."""
-        return match_features(first, second, self.options)
-
-
-def matchable(
-    descriptors: Floats, keypoints: Floats, options: NearestOptions, *, is_coarse: bool = False
-) -> MatchableImage:
-    """Prepare (N, D) unit descriptors at (N, 2) px; all images are coarse, or none."""
-    descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
-    rivals = neighbors_within(keypoints, options.min_contrast_distance_px)
-    coarse = CoarseDescriptors.of(descriptors) if is_coarse else None
-    return MatchableImage(descriptors, keypoints, rivals, coarse)
-
-
-def match_features(
-    image1: MatchableImage, image2: MatchableImage, options: NearestOptions
-) -> Matches:
-    """Match two images, with or without features; scores are 1 - the larger ratio of distances."""
-    if not len(image1.descriptors) or not len(image2.descriptors):
-        return Matches.none()
-    rows = np.arange(len(image1.descriptors))
-    if image1.coarse and image2.coarse:
-        rows = may_match(image1.coarse, image2.coarse, image2.rivals, options.max_ratio)
-    forward, ratios = _nearest(image1.descriptors[rows], image2)
-    passing = ratios < options.max_ratio
-    rows, worst = rows[passing], ratios[passing]
-    targets, back = np.unique(forward[passing], return_inverse=True)
-    backward, back_ratios = _nearest(image2.descriptors[targets], image1)
-    if options.ratio_both_ways:
-        worst = np.maximum(worst, back_ratios[back])
-    keep = (backward[back] == rows) & (worst < options.max_ratio)
-    rows, columns, worst = rows[keep], targets[back][keep], worst[keep]
-    order = np.argsort(worst, kind="stable")
-    places = image1.keypoints[rows[order]], image2.keypoints[columns[order]]
-    kept = np.sort(order[without_duplicates(*places, options.duplicate_radius_px)])
-    return Matches(np.stack([rows, columns], axis=1)[kept], 1.0 - worst[kept])
+        """Match two images; scores are 1 - the larger ratio of distances."""
+        if not len(first.descriptors) or not len(second.descriptors):
+            return Matches.none()
+        rows = np.arange(len(first.descriptors))
+        if first.coarse and second.coarse:
+            rows = may_match(first.coarse, second.coarse, second.rivals, self.options.max_ratio)
+        forward, ratios = _nearest(first.descriptors[rows], second)
+        passing = ratios < self.options.max_ratio
+        rows, worst = rows[passing], ratios[passing]
+        targets, back = np.unique(forward[passing], return_inverse=True)
+        backward, back_ratios = _nearest(second.descriptors[targets], first)
+        if self.options.ratio_both_ways:
+            worst = np.maximum(worst, back_ratios[back])
+        keep = (backward[back] == rows) & (worst < self.options.max_ratio)
+        rows, columns, worst = rows[keep], targets[back][keep], worst[keep]
+        order = np.argsort(worst, kind="stable")
+        places = first.keypoints[rows[order]], second.keypoints[columns[order]]
+        kept = np.sort(order[without_duplicates(*places, self.options.duplicate_radius_px)])
+        return Matches(np.stack([rows, columns], axis=1)[kept], 1.0 - worst[kept])
 
 
 def _nearest(queries: Singles, image: MatchableImage) -> tuple[Indices, Singles]:

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import cv2
 from threadpoolctl import ThreadpoolController, threadpool_limits
@@ -22,17 +22,6 @@ ASSUMED_MEMORY_BYTES = 8 << 30  # of systems that do not say what they have
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-Result_co = TypeVar("Result_co", covariant=True)
-
-
-class Pending(Protocol[Result_co]):
-    """Work that has been submitted, to a thread or a worker."""
-
-    def result(self) -> Result_co:
-        """Wait for what it returns, or raise what it raises."""
-
-    def cancel(self) -> object:
-        """Do not begin it, if it has not begun."""
 
 
 class Executor(Protocol):
@@ -141,15 +130,15 @@ def map_ordered(
 
 
 def in_order(
-    submit: Callable[[Task], Pending[Result]],
+    submit: Callable[[Task], Any],
     tasks: Iterable[Task],
     limit: Callable[[], int],
-) -> Iterator[Result]:
-    """Yield results in task order; fewer than ``limit()`` tasks are submitted beforehand.
+) -> Iterator[Any]:
+    """Yield results of futures in task order; fewer than ``limit()`` are submitted beforehand.
 
     What has not ended is cancelled when the iteration ends early.
     """
-    pending: deque[Pending[Result]] = deque()
+    pending: deque[Any] = deque()
     try:
         for task in tasks:
             pending.append(submit(task))
