@@ -14,6 +14,7 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.mappers.existing import Extension
+from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.options import Options, flat
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.parallel.executor import Executor
@@ -73,8 +74,10 @@ def changed(known: AnyOptions, options: argparse.Namespace, section: str) -> Any
     values = with_settings({section: known.to_mapping()}, options.set)
     if len(values) > 1:
         raise OptionError(f"--set: only options of {section} can be changed here")
-    found: AnyOptions = getattr(Recipe.from_mapping(values, "--set"), section)
-    return found
+    if isinstance(known, MatcherOptions):  # perhaps another matcher now
+        matching: AnyOptions = MATCHERS.options(values[section], where="--set")
+        return matching
+    return known.from_mapping(values[section], "--set")
 
 
 def verification(
