@@ -1,6 +1,7 @@
 """Layouts of datasets, as docs/own-evaluation-set.md has them: EVD, SVP, IMC, and any pairs."""
 
 import json
+import logging
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -23,6 +24,8 @@ from colmap_affrect.images.reading import IMAGE_SUFFIXES
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.project.outputs import leads_outside
+
+logger = logging.getLogger(__name__)
 
 Names = tuple[str, str]  # of the images of a pair, without suffix
 Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
@@ -57,12 +60,7 @@ class EvaluationPair:
     category: str = ""  # of difficulty, as tables group pairs; empty for none
 
 
-@dataclass(frozen=True)
-class Dataset:
-    """The pairs of a dataset, and what is missing in it, in words."""
-
-    pairs: tuple[EvaluationPair, ...]
-    notes: tuple[str, ...] = ()
+Pairs = list[EvaluationPair]
 
 
 class _Entry(Options):
@@ -75,7 +73,7 @@ class _Entry(Options):
     relative_pose: Any = None
 
 
-def load_evd(folder: Path) -> Dataset:
+def load_evd(folder: Path) -> Pairs:
     """Find pairs with homographies; EvaluationError when the layout is another one."""
     files = [file for part in "12h" for file in (folder / part).glob("*")]
     names = {file.stem for file in files if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES)}
@@ -101,22 +99,24 @@ def load_evd(folder: Path) -> Dataset:
     return _loaded(entries, folder, 0.0)
 
 
-def _scenes(pattern: str, load: Callable[[Path], Dataset], path: Path) -> Dataset:
+def _scenes(pattern: str, load: Callable[[Path], Pairs], path: Path) -> Pairs:
     """Read one or all scenes, by the file that makes a folder one; EvaluationError if none."""
     folders = [path, *sorted(path.glob("*/"))]
-    scenes = [load(each) for folder in folders for each in sorted(folder.glob(pattern))]
-    notes = tuple(note for scene in scenes for note in scene.notes)
-    pairs = tuple(pair for scene in scenes for pair in scene.pairs)
+    files = [file for folder in folders for file in sorted(folder.glob(pattern))]
+    pairs = [pair for file in files for pair in load(file)]
     if not pairs:
-        why = "; ".join(notes) or f"it has no {pattern}, nor has a folder in it"
-        raise EvaluationError(f"{path}: no pair can be evaluated; {why}")
-    return Dataset(pairs, notes)
+        why = f"; it has no {pattern}, nor has a folder in it" if not files else ""
+        raise EvaluationError(f"{path}: no pair can be evaluated{why}")
+    return pairs
 
 
 def _posed_pairs(
     scene: str, folder: Path, views: Views, listed: Collection[Names], category: Callable[..., str]
-) -> Dataset:
-    """Return the listed pairs of images that are there and posed, ordered by their category."""
+) -> Pairs:
+    """Return the listed pairs of images that are there and posed, ordered by their category.
+
+    How many others are listed is a warning.
+    """
     images, pairs, lacking = {}, {}, []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -131,15 +131,15 @@ def _posed_pairs(
         both = images[names[0]], images[names[1]]
         title = f"{both[0].name} {both[1].name}"
         pairs[title] = EvaluationPair(title, both, truth, category(*names))
-    note = (
-        f"{scene}: {len(lacking)} of {len(listed)} listed pairs are left out, without an image or "
-        f"its camera: {such_as(dict.fromkeys(lacking))}"
-    )
-    ordered = sorted(pairs.values(), key=lambda pair: (float(pair.category.rstrip("°")), pair.name))
-    return Dataset(tuple(ordered), (note,) if lacking else ())
+    if lacking:
+        logger.warning(
+            "%s: %d of %d listed pairs are left out, without an image or its camera: %s",
+            scene, len(lacking), len(listed), such_as(dict.fromkeys(lacking)),
+        )  # fmt: skip
+    return sorted(pairs.values(), key=lambda pair: (float(pair.category.rstrip("°")), pair.name))
 
 
-def _svp_scene(list_path: Path) -> Dataset:
+def _svp_scene(list_path: Path) -> Pairs:
     folder, scene = list_path.parent, list_path.name.removesuffix(PAIR_LIST_SUFFIX)
     views, listed = read_views(folder / "0"), []
     for words in map(str.split, _lines(list_path)):
@@ -196,7 +196,7 @@ def _lines(path: Path) -> list[str]:
         return [line for line in lines if line and not line.startswith("#")]
 
 
-def _imc_scene(lists_path: Path) -> Dataset:
+def _imc_scene(lists_path: Path) -> Pairs:
     root, scene = lists_path.parent, lists_path.absolute().parents[1].name
     views = {
         path.stem.removeprefix(CALIBRATION_PREFIX): read_calibration(path)
@@ -253,7 +253,7 @@ def pinhole(matrix: Array, what: str) -> pycolmap.Camera:
     return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, cx, cy])
 
 
-def load_pairs(folder: Path) -> Dataset:
+def load_pairs(folder: Path) -> Pairs:
     """Read ``pairs.json``; EvaluationError says what is wrong."""
     path = folder / "pairs.json"
     with _damaged(path):
@@ -282,9 +282,9 @@ def _entry(values: Any, where: str) -> _Entry:
     return entry.changed(name=entry.name or f"{stem(entry.image1)} {stem(entry.image2)}")
 
 
-def _loaded(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Dataset:
+def _loaded(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Pairs:
     load = partial(_pair, folder=folder, offset_px=offset_px)
-    return Dataset(tuple(map_ordered(load, entries, available_cores())))
+    return list(map_ordered(load, entries, available_cores()))
 
 
 def _pair(entry: _Entry, folder: Path, offset_px: float) -> EvaluationPair:

@@ -12,7 +12,7 @@ from statistics import fmean
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import OptionError
 from colmap_affrect.evaluation import datasets, truths
-from colmap_affrect.evaluation.datasets import Dataset
+from colmap_affrect.evaluation.datasets import Pairs
 from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, published
 from colmap_affrect.evaluation.runner import RecipeRun
 from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
@@ -22,7 +22,7 @@ from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Resources
 
-PROTOCOLS: dict[str, Callable[[Path], Dataset]] = {
+PROTOCOLS: dict[str, Callable[[Path], Pairs]] = {
     "evd": datasets.load_evd,
     "svp": datasets.load_svp,
     "imc": datasets.load_imc,
@@ -40,15 +40,6 @@ class EvaluateOptions:
     random_seed: int = 0  # of the estimators
     scores: ScoreOptions = field(default_factory=ScoreOptions)
     resources: Resources = field(default_factory=Resources)
-
-    def methods(self) -> tuple[Method, ...]:
-        """Return the recipes as methods; OptionError for options that nothing can be made of."""
-        methods = parse_methods(self.recipes)
-        if self.max_num_keypoints is not None and self.max_num_keypoints < 1:
-            raise OptionError(f"--max-num-keypoints {self.max_num_keypoints}: must be at least 1")
-        if self.random_seed < 0:
-            raise OptionError(f"--random-seed {self.random_seed}: must be at least 0")
-        return methods
 
 
 def evaluate(
@@ -69,7 +60,11 @@ def evaluate(
     if protocol not in PROTOCOLS:
         raise OptionError(f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}")
     options = options or EvaluateOptions()
-    methods = options.methods()
+    methods = parse_methods(options.recipes)
+    if options.max_num_keypoints is not None and options.max_num_keypoints < 1:
+        raise OptionError(f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1")
+    if options.random_seed < 0:
+        raise OptionError(f"--random-seed {options.random_seed}: must be at least 0")
     if not dataset_path.is_dir():
         raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
     Workspace(output_path).require_own(dataset_path)
@@ -80,15 +75,14 @@ def evaluate(
     }
     inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
     with Workspace(output_path).locked():
-        dataset = PROTOCOLS[protocol](dataset_path)
-        given = dataset.pairs, output_path, inputs, settings, options.resources
+        pairs = PROTOCOLS[protocol](dataset_path)
+        given = pairs, output_path, inputs, settings, options.resources
         runs = [RecipeRun(method, *given, overwrite=overwrite) for method in methods]
         results = {run.label: run.results(progress) for run in runs}
         evaluation = Evaluation(
             protocol=protocol,
             dataset_path=inputs["dataset_path"],
             settings=settings,
-            notes=dataset.notes,
             recipes=tuple(_summed(run, results[run.label]) for run in runs),
             published=published(protocol),
             versions=installed_versions(),

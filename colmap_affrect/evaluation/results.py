@@ -57,7 +57,6 @@ class Evaluation:
     protocol: str
     dataset_path: str
     settings: Mapping[str, Any]  # everything that decides scores
-    notes: tuple[str, ...]  # what is missing in the dataset
     recipes: tuple[RecipeResult, ...]
     published: list[PublishedRow]  # of the same protocol
     versions: Mapping[str, str]
@@ -69,7 +68,7 @@ class Evaluation:
         return json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
 
     def summary(self) -> str:
-        """Return a table for each kind of truth with the paper's numbers, costs, and notes."""
+        """Return a table for each kind of truth with the paper's numbers, and costs."""
         parts = [f"{self.protocol}: {len(self.recipes[0].pairs)} pairs"]
         for kind, columns in self.recipes[0].summary.items():
             rows: list[tuple[str, Mapping[str, float]]] = [
@@ -82,8 +81,7 @@ class Evaluation:
             ]
             parts.append(_table(kind, [*columns, SECONDS], rows))
         costs = [(recipe.name, recipe.costs) for recipe in self.recipes]
-        parts += [_table("recipe", costs[0][1], costs), "\n".join(self.notes)]
-        return "\n\n".join(filter(None, parts))
+        return "\n\n".join([*parts, _table("recipe", costs[0][1], costs)])
 
 
 def _table(

@@ -64,7 +64,7 @@ class PairScore:
     error: Number  # of the protocol, px or degrees; infinite where no model was found
     num_inliers: int  # of the model that was estimated
     num_correct: int | None = None  # matches that agree with the truth; None where it cannot say
-    details: Mapping[str, Number] = field(default_factory=dict)  # beside the error
+    direction_error_deg: Number = math.inf  # of poses, beside the error of the rotation
     solved: float = 0.0  # how far it counts as matched: 1 or 0 where there is a threshold
     kind: str = ""  # of the truth, as tables name it; empty without one
 
@@ -220,8 +220,8 @@ class TruePose:
         distances_px = focal_px * sampson_errors(essential_matrix(*self.pose), *both)
         has_baseline = self.pose[1].any()  # without, distances are not defined
         num_correct = int((distances_px < CORRECT_PX).sum()) if has_baseline else 0
-        details, solved = {"direction_error_deg": direction}, float(error < MAX_ERROR_DEG)
-        return PairScore(error, num_inliers, num_correct, details, solved, "poses")
+        solved = float(error < MAX_ERROR_DEG)
+        return PairScore(error, num_inliers, num_correct, direction, solved, "poses")
 
 
 def rays(camera: pycolmap.Camera, points: Points) -> Points:
@@ -303,6 +303,6 @@ def pose_columns(results: Results) -> dict[str, float]:
             groups.setdefault(result.category, []).append(result.error < MAX_ERROR_DEG)
     groups["all"] = [result.error < MAX_ERROR_DEG for result in results]
     shares = {title: sum(below) / len(below) for title, below in groups.items()}
-    largest = [max(r.error, r.details.get("direction_error_deg", math.inf)) for r in results]
+    largest = [max(result.error, result.direction_error_deg) for result in results]
     area = fmean(max(0.0, 1.0 - error / MAX_AUC_ERROR_DEG) for error in largest)
     return {**shares, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": area}

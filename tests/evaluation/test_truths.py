@@ -115,7 +115,7 @@ def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 def test_exact_matches_give_the_pose() -> None:
     score = pose_score(matches(60))
-    errors = [score.error, score.details["direction_error_deg"]]
+    errors = [score.error, score.direction_error_deg]
     assert errors == pytest.approx([0.0] * 2, abs=1e-4)
     assert (score.num_inliers, score.num_correct) == (60, 60)
 
@@ -136,7 +136,7 @@ def test_wrong_true_position_is_the_direction_error() -> None:
     moved = POSE2[1] - baseline + math.cos(0.2) * baseline + math.sin(0.2) * across
     score = pose_score(matches(60), (POSE2[0], moved))
     assert score.error == pytest.approx(0, abs=1e-4)
-    assert score.details["direction_error_deg"] == pytest.approx(math.degrees(0.2), abs=1e-4)
+    assert score.direction_error_deg == pytest.approx(math.degrees(0.2), abs=1e-4)
     assert score.num_correct < 60
 
 
@@ -150,8 +150,7 @@ def test_points_that_give_no_pose() -> None:
 
 
 def pose_result(category: str, error: float, direction_error: float) -> PairResult:
-    details = {"direction_error_deg": direction_error}
-    return PairResult(error, 50, None, details, kind="poses", name="p", category=category)
+    return PairResult(error, 50, None, direction_error, kind="poses", name="p", category=category)
 
 
 def test_pose_columns_are_shares_by_category_and_count_failures() -> None:
