@@ -126,9 +126,8 @@ def _same_for_all(
 def _settings(same: Mapping[str, Any], options: CompareOptions) -> dict[str, Any]:
     places = ("image_list_path", "from_database", "ground_truth_path")
     return {
-        **{key: same[key] for key in ("camera", "verification", "mapping")},
+        **{key: value for key, value in same.items() if key != "photographs"},
         **{key: str(getattr(options, key) or "") for key in places},
-        "masks": options.masks.to_mapping(),
         "match_list_path": options.pairs.match_list_path,
         "preset": options.mapping.preset_name,
     }

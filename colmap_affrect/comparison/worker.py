@@ -18,8 +18,6 @@ from colmap_affrect.parallel.subprocesses import end_with
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import replace_text
 
-logger = logging.getLogger("colmap_affrect")
-
 
 def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
     """Run a method in another process; return why it failed, empty if it did not.
@@ -57,9 +55,7 @@ def main() -> None:
     end_with(int(sys.argv[2]))
     shown = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what others print
-    handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    logger.addHandler(handler)
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s")
     run, title = pickle.loads(b64decode(sys.argv[1]))  # noqa: S301 (of our parent)
     run.progress = Progress(shown, 1).titled(title)
     try:
@@ -68,7 +64,7 @@ def main() -> None:
     except AffrectError as error:
         replace_text(run.failure, str(error))
     except Exception as error:
-        logger.exception("failed")
+        logging.exception("failed")
         replace_text(run.failure, f"{type(error).__name__}: {error}")
 
 

@@ -16,23 +16,14 @@ DATA = Path(__file__).with_name("published.toml")
 SECONDS = "seconds"  # the column of all time that a recipe took
 
 
-@dataclass(frozen=True)
-class PublishedRow:
-    """What the paper says of one method; columns that we have too are called the same."""
-
-    method: str
-    values: Mapping[str, float]  # by column
-    table: str  # its number and subject
-
-
-def published(protocol: str) -> list[PublishedRow]:
-    """Return the published rows of a protocol, table by table; none if there are none."""
-    return [
-        PublishedRow(method, dict(zip(table["columns"], row, strict=True)), table["label"])
+def published(protocol: str) -> dict[str, dict[str, float]]:
+    """Return what the paper says of methods by a protocol: columns, called as ours, by row."""
+    return {
+        f"paper: {method} ({table['label']})": dict(zip(table["columns"], row, strict=True))
         for table in tomllib.loads(DATA.read_text(encoding="utf-8"))["tables"]
         if table["protocol"] == protocol
         for method, row in table["values"].items()
-    ]
+    }
 
 
 @dataclass(frozen=True)
@@ -58,7 +49,7 @@ class Evaluation:
     dataset_path: str
     settings: Mapping[str, Any]  # everything that decides scores
     recipes: tuple[RecipeResult, ...]
-    published: list[PublishedRow]  # of the same protocol
+    published: Mapping[str, Mapping[str, float]]  # rows of the paper's tables for the protocol
     versions: Mapping[str, str]
 
     def to_json(self) -> str:
@@ -74,11 +65,7 @@ class Evaluation:
             rows: list[tuple[str, Mapping[str, float]]] = [
                 (r.name, {**r.summary[kind], SECONDS: r.costs[SECONDS]}) for r in self.recipes
             ]
-            rows += [
-                (f"paper: {row.method} ({row.table})", row.values)
-                for row in self.published
-                if row.values.keys() & columns.keys()
-            ]
+            rows += [row for row in self.published.items() if row[1].keys() & columns.keys()]
             parts.append(_table(kind, [*columns, SECONDS], rows))
         costs = [(recipe.name, recipe.costs) for recipe in self.recipes]
         return "\n\n".join([*parts, _table("recipe", costs[0][1], costs)])

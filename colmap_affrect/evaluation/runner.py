@@ -23,7 +23,7 @@ from colmap_affrect.colmap.verification import Side, VerificationOptions, estima
 from colmap_affrect.comparison.methods import Method
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.evaluation.datasets import EvaluationImage, EvaluationPair
-from colmap_affrect.evaluation.truths import PairResult, PairScore, ScoreOptions
+from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
@@ -40,7 +40,6 @@ from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 logger = logging.getLogger(__name__)
 
 RESULT = TypeAdapter(PairResult)  # from and to JSON; infinite errors are null
-NO_SCORE = PairScore(math.inf, 0)
 NOTHING = np.zeros((0, 2)), np.zeros((0, 2))  # points of a pair that could not be matched
 
 
@@ -166,7 +165,8 @@ class RecipeRun:
             if count > most or not most:
                 most, points = count, (frames[0][:, :, 2], frames[1][:, :, 2])
                 best = PairResult(
-                    **vars(NO_SCORE),
+                    math.inf,
+                    0,
                     name=pair.name,
                     category=pair.category,
                     num_matches=len(rows1),

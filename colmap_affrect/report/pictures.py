@@ -2,11 +2,9 @@
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple
 
-from colmap_affrect.data import ColorImage, GrayImage
 from colmap_affrect.errors import ImageError
 from colmap_affrect.images.reading import encode_jpeg, read_color
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -22,20 +20,12 @@ def thumbnail_size_px(count: int) -> int:
     return int(min(MAX_SIDE_PX, (4 / 3 * MAX_TOTAL_PX / max(1, count)) ** 0.5))
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """An image of some px as text: a ``data:`` address with the whole file."""
 
     uri: str
     width: int
     height: int
-
-    @classmethod
-    def jpeg(cls, image: GrayImage | ColorImage) -> Self:
-        """Make one of an (H, W) or (H, W, 3) uint8 image, with loss."""
-        data = encode_jpeg(image, JPEG_QUALITY)
-        height, width = image.shape[:2]
-        return cls(f"data:image/jpeg;base64,{base64_text(data)}", width, height)
 
 
 def base64_text(data: bytes) -> str:
@@ -51,9 +41,11 @@ def thumbnails(
 
     def picture(name: str) -> Picture | None:
         try:
-            return Picture.jpeg(read_color(folder / name, size_px))
+            image = read_color(folder / name, size_px)
         except ImageError:
             return None
+        data = encode_jpeg(image, JPEG_QUALITY)
+        return Picture(f"data:image/jpeg;base64,{base64_text(data)}", image.shape[1], len(image))
 
     found = {}
     with progress.stage("pictures", len(shown), "images") as advance:
