@@ -60,11 +60,6 @@ class InputOptions:
     from_database: Path | None = None
     resources: Resources = field(default_factory=Resources)  # weights and device of networks
 
-    @property
-    def may_share(self) -> bool:
-        """Whether images of one size may turn out to share a camera that nobody knows."""
-        return self.cameras.mode == "auto" and not self.from_database
-
     def inputs(self, image_path: Path) -> Inputs:
         """Return the photographs of a folder, with their cameras and masks."""
         return Inputs.of(

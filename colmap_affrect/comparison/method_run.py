@@ -240,7 +240,8 @@ class MethodRun:
         with watch.step("verify"), progress.stage("verify", num_pairs, "pairs") as advance:
             verify(path, options, advance=advance)
         shutil.copy(self.workspace.cameras, folder)
-        cameras, may_share = read_camera_records(self.workspace.cameras), self.options.may_share
+        cameras = read_camera_records(self.workspace.cameras)
+        may_share = self.options.inputs(self.image_path).may_share
         mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))
         task = MappingTask(path, self.image_path, cameras=cameras, may_share=may_share)
         with watch.step("map"), progress.stage("map", num_images, "images") as advance:

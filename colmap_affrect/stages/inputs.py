@@ -105,6 +105,11 @@ class Inputs(Options):
             self.initial_cameras.check(names)
 
     @property
+    def may_share(self) -> bool:
+        """Whether images of one size may turn out to share a camera that nobody knows."""
+        return self.cameras.mode == "auto" and not self.from_database
+
+    @property
     def initial_cameras(self) -> InitialCameras:
         """What decides on cameras."""
         return InitialCameras(Path(self.image_path), self.cameras)

@@ -42,7 +42,6 @@ def map_images(
     mapper: Mapper,
     extend: Extension | None = None,
     *,
-    may_share: bool | None = None,
     overwrite: bool = False,
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
@@ -66,7 +65,7 @@ def map_images(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
         )
-    task = _task(context, existing, may_share)
+    task = _task(context, existing)
     if known == inputs:
         models = read_models(workspace.sparse, task)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
@@ -89,7 +88,7 @@ def map_images(
     return StageReport("map", wall_s, len(models), warnings=warnings), models
 
 
-def _task(context: Context, existing: ExistingModel | None, may_share: bool | None) -> MappingTask:
+def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace = context.workspace
     copied = workspace.is_foreign
@@ -100,15 +99,8 @@ def _task(context: Context, existing: ExistingModel | None, may_share: bool | No
         guided={} if copied else inliers_by_guiding(context),
         measured={} if copied else measured_inliers(context),
         cameras=read_camera_records(workspace.cameras),
-        may_share=_may_share(context) if may_share is None else may_share,
+        may_share=not copied and context.inputs.may_share,
     )
-
-
-def _may_share(context: Context) -> bool:
-    """Tell whether nothing is said of which photographs share a camera."""
-    if context.workspace.is_foreign:
-        return False
-    return context.inputs.cameras.mode == "auto" and not context.inputs.from_database
 
 
 def _inputs(workspace: Workspace, extend: Extension | None) -> str:
