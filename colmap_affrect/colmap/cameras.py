@@ -6,6 +6,7 @@ COLMAP's database only has a flag that somebody does; ``cameras.json`` beside it
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -89,6 +90,7 @@ def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> Non
     replace_text(path, with_checksum(content.decode()))
 
 
+@cache
 def _known_model(name: str) -> str:
     """Refuse what is no camera model of COLMAP with a focal length."""
     models = [
@@ -132,7 +134,7 @@ class GivenCamera(Options):
     where: str = ""
     """File and line."""
 
-    @property
+    @cached_property
     def said(self) -> Self:
         """The same of any image: equal where the same is said."""
         return self.changed(name="", camera="", where="")
