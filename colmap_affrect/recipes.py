@@ -20,9 +20,8 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.options import Options, suggestion, within
+from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions, IdentityOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
-from colmap_affrect.rectifiers.dense import DenseShapesOptions
-from colmap_affrect.rectifiers.whole_image import IdentityOptions
 
 AnyRectifier = Annotated[SerializeAsAny[RectifierOptions], BeforeValidator(RECTIFIERS.options)]
 AnyFeatures = Annotated[SerializeAsAny[FeatureOptions], BeforeValidator(EXTRACTORS.options)]

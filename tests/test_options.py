@@ -14,7 +14,7 @@ from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.options import Options, Registry
 from colmap_affrect.recipes import ExtractionOptions
-from colmap_affrect.rectifiers.dense import DenseShapesOptions
+from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions
 
 
 @pytest.mark.parametrize("cls", [ExtractionOptions, IncrementalOptions, VerificationOptions])

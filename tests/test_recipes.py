@@ -12,9 +12,8 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.features.second_moment import SecondMomentOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe, recipe_names
+from colmap_affrect.rectifiers.affine_warps import AffNetShapesOptions, DenseShapesOptions
 from colmap_affrect.rectifiers.base import CoverOptions
-from colmap_affrect.rectifiers.dense import DenseShapesOptions
-from colmap_affrect.rectifiers.whole_image import AffNetShapesOptions
 
 NAMES = [
     "affnet-shapes", "aliked-lightglue", "asift", "asift-recommended", "default", "dense-affnet",

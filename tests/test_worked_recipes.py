@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from small_scene import IMAGE_SIZE, write_photographs
 
-from colmap_affrect.images.masks import read_mask
+from colmap_affrect.images.reading import read_mask
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"

@@ -19,8 +19,8 @@ from colmap_affrect.geometry.epipolar import (
     Rows,
     common_sign,
 )
-from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
 from colmap_affrect.geometry.significance import log10_bayes_factor, log10_false_alarms, shuffled
+from colmap_affrect.geometry.tilts import of_unit_area, vary_singly
 
 Cameras = tuple[pycolmap.Camera, pycolmap.Camera]  # of the two images
 Keypoints = tuple[Floats, Floats]  # (N, 2, 4 or 6) of each image, as in the database

@@ -17,7 +17,7 @@ from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.geometry.shapes import frames_from_affnet
+from colmap_affrect.geometry.tilts import frames_from_affnet
 
 if TYPE_CHECKING:
     import torch

@@ -27,7 +27,7 @@ from colmap_affrect.geometry.conventions import (
     grid_origin,
     resized_from_original,
 )
-from colmap_affrect.geometry.shapes import (
+from colmap_affrect.geometry.tilts import (
     STEP_PX,
     frames_from_affnet,
     log_metrics,

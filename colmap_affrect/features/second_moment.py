@@ -14,7 +14,7 @@ from colmap_affrect.data import GrayImage, ShapeGrid, ShapeSamples
 from colmap_affrect.features.base import FeatureOptions, NetworkContext, ShapeOptions
 from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.geometry.conventions import grid_origin
-from colmap_affrect.geometry.shapes import STEP_PX, log_metrics, metrics_from_log
+from colmap_affrect.geometry.tilts import STEP_PX, log_metrics, metrics_from_log
 from colmap_affrect.options import within
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags
 
-from colmap_affrect.data import ColorImage, GrayImage
+from colmap_affrect.data import ColorImage, GrayImage, Mask
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images.headers import header_size, require_possible
@@ -163,3 +163,20 @@ def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
         return image
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def read_mask(path: Path) -> Mask:
+    """Read a mask, black pixels False (COLMAP's convention); ImageError when that fails."""
+    return np.asarray(decode(path) != 0)
+
+
+def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
+    """Resize an (H, W) mask to (width, height) px, each pixel from the nearest one."""
+    values = mask.astype(np.uint8)
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0)
+
+
+def grown(mask: Mask, num_px: int) -> Mask:
+    """Add the pixels of an (H, W) mask's surroundings, so many in each direction."""
+    kernel = np.ones((2 * num_px + 1, 2 * num_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)

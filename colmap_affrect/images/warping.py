@@ -11,7 +11,6 @@ from colmap_affrect.data import ColorImage, GrayImage, Mask, Rectification
 from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.geometry.conventions import is_inside
-from colmap_affrect.images.masks import mask_values
 
 ANTI_ALIASING_SIGMA = 0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
 
@@ -128,6 +127,11 @@ def _source_points(
     width, height = image_size
     x, y = np.clip(x / third, -width, 2 * width), np.clip(y / third, -height, 2 * height)
     return x.astype(np.float32), y.astype(np.float32), ahead
+
+
+def mask_values(mask: Mask) -> Bytes:
+    """Return an (H, W) mask as uint8, 255 inside and 0 outside."""
+    return mask.astype(np.uint8) * 255
 
 
 def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Bytes:

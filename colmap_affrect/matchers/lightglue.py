@@ -24,7 +24,7 @@ from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.neighbors import without_duplicates
-from colmap_affrect.geometry.shapes import of_unit_area
+from colmap_affrect.geometry.tilts import of_unit_area
 from colmap_affrect.matchers.base import (
     ImageFeatures,
     MatcherContext,

@@ -89,12 +89,12 @@ RECTIFIERS: Registry[Rectifier] = Registry(
     kind="rectifier",
     group="colmap_affrect.rectifiers",
     built_in={
-        "identity": "colmap_affrect.rectifiers.whole_image:Identity",
-        "asift": "colmap_affrect.rectifiers.whole_image:Asift",
-        "affnet-shapes": "colmap_affrect.rectifiers.whole_image:AffNetShapes",
+        "identity": "colmap_affrect.rectifiers.affine_warps:Identity",
+        "asift": "colmap_affrect.rectifiers.affine_warps:Asift",
+        "affnet-shapes": "colmap_affrect.rectifiers.affine_warps:AffNetShapes",
         "depth-planes": "colmap_affrect.rectifiers.depth_planes:DepthPlanes",
         "depth-affnet": "colmap_affrect.rectifiers.depth_planes:DepthAffNet",
-        "dense-shapes": "colmap_affrect.rectifiers.dense:DenseShapes",
+        "dense-shapes": "colmap_affrect.rectifiers.affine_warps:DenseShapes",
     },
     default="dense-shapes",
 )

@@ -8,6 +8,7 @@ paper's DepthAffNet warps each as ``affnet-shapes`` does, by a cover of the shap
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,6 @@ from colmap_affrect.geometry.planes import (
     shrink_depth,
     viewing_cosines,
 )
-from colmap_affrect.images.masks import connected_regions
 from colmap_affrect.options import Options, within
 from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, WithInputs
 from colmap_affrect.rectifiers.regions import Region, affine_rectification, homography_rectification
@@ -117,9 +117,20 @@ def planar_segments(
     segments = []
     for label, normal in enumerate(planes.normals):
         cosines = viewing_cosines(normal, photograph.camera_matrix, photograph.size)
-        found = connected_regions((labels == label) & (cosines >= min_cos), min_area_px)
+        found = _connected_regions((labels == label) & (cosines >= min_cos), min_area_px)
         segments += [PlanarSegment(Region(*region), normal) for region in found]
     return segments
+
+
+def _connected_regions(mask: Mask, min_area_px: float) -> list[tuple[Mask, tuple[int, int]]]:
+    """Crop the 4-connected regions that have enough pixels; return each with its first (x, y)."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    regions = []
+    for label, (left, top, width, height, area) in enumerate(stats.tolist()):
+        if label > 0 and area >= min_area_px:
+            crop = labels[top : top + height, left : left + width] == label
+            regions.append((crop, (left, top)))
+    return regions
 
 
 def _resampled(

@@ -20,8 +20,7 @@ from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
 from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.geometry.neighbors import neighbors_within
-from colmap_affrect.images.masks import mask_values
-from colmap_affrect.images.warping import warp, warp_mask
+from colmap_affrect.images.warping import mask_values, warp, warp_mask
 
 DUPLICATE_RADIUS_SIGMAS = 0.5
 MAX_DUPLICATE_RADIUS_PX = 4.0

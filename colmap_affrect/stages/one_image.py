@@ -25,9 +25,15 @@ from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import camera_matrix, resized_from_original
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
-from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.photographs import Photographs
-from colmap_affrect.images.reading import decode, in_eight_bits, read_color, shrink_to, tones
+from colmap_affrect.images.reading import (
+    decode,
+    in_eight_bits,
+    read_color,
+    shrink_mask,
+    shrink_to,
+    tones,
+)
 from colmap_affrect.parallel.executor import (
     available_cores,
     available_memory_bytes,

@@ -22,7 +22,7 @@ from machine import describe_machine, parser_of, span, table
 from colmap_affrect.comparison.methods import parse_method
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.recipes import ExtractionOptions
-from colmap_affrect.rectifiers.whole_image import IdentityOptions
+from colmap_affrect.rectifiers.affine_warps import IdentityOptions
 from colmap_affrect.report.inspection import inspect_level
 from colmap_affrect.stages.context import Resources
 from colmap_affrect.stages.one_image import ImageExtractor, prepare

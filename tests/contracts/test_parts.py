@@ -15,11 +15,11 @@ from random_weights import write_comparing_lightglue, write_random_weights
 from colmap_affrect.data import Photograph
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
-from colmap_affrect.geometry.shapes import STEP_PX
+from colmap_affrect.geometry.tilts import STEP_PX
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
+from colmap_affrect.rectifiers.affine_warps import AsiftOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, Rectifier, RectifierInputs, RectifierOptions
 from colmap_affrect.rectifiers.depth_planes import DepthPlanesOptions
-from colmap_affrect.rectifiers.whole_image import AsiftOptions
 
 FEATURES = {
     **{name: {"name": name} for name in EXTRACTORS.names()},

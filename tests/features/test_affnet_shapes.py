@@ -20,8 +20,12 @@ from colmap_affrect.data import GrayImage, LocalFeatures
 from colmap_affrect.features import affnet_shapes as affnet
 from colmap_affrect.features.affnet_shapes import AffNet, AffNetOptions
 from colmap_affrect.features.base import NetworkContext
-from colmap_affrect.geometry.shapes import log_metrics, metrics_from_log
-from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
+from colmap_affrect.geometry.tilts import (
+    log_metrics,
+    metrics_from_log,
+    tilts_from_metrics,
+    unit_metrics,
+)
 from colmap_affrect.images.reading import shrink_to
 
 SINGLE = 2e-4

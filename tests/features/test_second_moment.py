@@ -12,8 +12,7 @@ from synthetic import texture
 from colmap_affrect.data import GrayImage, ShapeGrid
 from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.affine import rotation
-from colmap_affrect.geometry.shapes import STEP_PX
-from colmap_affrect.geometry.tilts import tilts_from_metrics
+from colmap_affrect.geometry.tilts import STEP_PX, tilts_from_metrics
 
 TILT_BAND = 0.25
 """Relative: isotropic noise in a window of 32 px is isotropic to about a tenth, and the

@@ -17,7 +17,6 @@ from strategies import (
     turns,
 )
 
-from colmap_affrect.geometry.shapes import log_metrics, metrics_from_log, rectifying_metrics
 from colmap_affrect.geometry.tilts import (
     IDENTITY_LABEL,
     UNCOVERED_LABEL,
@@ -25,8 +24,11 @@ from colmap_affrect.geometry.tilts import (
     cosh_distances,
     cover_shapes,
     covering_grid,
+    log_metrics,
+    metrics_from_log,
     metrics_from_tilts,
     nearest_centers,
+    rectifying_metrics,
     tilts_from_metrics,
     unit_metrics,
 )

@@ -19,8 +19,8 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError
-from colmap_affrect.images.masks import read_mask, shrink_mask
 from colmap_affrect.images.photographs import MaskOptions, Photographs, list_images
+from colmap_affrect.images.reading import read_mask, shrink_mask
 from colmap_affrect.project.stores import FeatureStore
 
 

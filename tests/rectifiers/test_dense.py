@@ -13,7 +13,7 @@ from colmap_affrect.geometry.tilts import (
     metrics_from_tilts,
     nearest_centers,
 )
-from colmap_affrect.rectifiers.dense import DenseShapesOptions, plan_dense_shapes
+from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions, plan_dense_shapes
 
 STEP_PX = 4
 

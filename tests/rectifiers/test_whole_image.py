@@ -19,13 +19,13 @@ from colmap_affrect.geometry.tilts import (
     tilts_from_metrics,
     unit_metrics,
 )
-from colmap_affrect.rectifiers.base import RectifierInputs
-from colmap_affrect.rectifiers.whole_image import (
+from colmap_affrect.rectifiers.affine_warps import (
     AffNetShapes,
     AffNetShapesOptions,
     Asift,
     AsiftOptions,
 )
+from colmap_affrect.rectifiers.base import RectifierInputs
 
 SIZE = (163, 117)
 
