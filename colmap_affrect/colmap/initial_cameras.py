@@ -108,22 +108,18 @@ class InitialCameras:
             given = self.given(unknown[0])
             raise OptionError(f"{given.where}: {unknown[0]} is not in {self.image_path}")
         for group, same in self.groups(names).items():
-            self._given_of(same)
+            given = self._given_of(same)
             sizes = {name: size for name in same if (size := self.size(name))}
+            first, expected = next(iter(sizes.items()), ("", given.size))
+            if given.size:
+                first, expected = "its camera", given.size
             for name, size in sizes.items():
-                first, expected = next(iter(sizes.items()))
                 if size != expected:
                     by_mode = group[0] in ("single", "per-folder")
                     who = f"--camera-mode {group[0]}" if by_mode else self.given(name).where
                     raise OptionError(
                         f"{who}: {first} is {expected[0]} x {expected[1]} px, {name} is {size[0]} "
-                        f"x {size[1]} px; images that share a camera must have one size"
-                    )
-                given = self.given(name)
-                if given.size and size != given.size:
-                    raise OptionError(
-                        f"{given.where}: its camera is of {given.size[0]} x {given.size[1]} px, "
-                        f"and {name} has {size[0]} x {size[1]} px; give cameras of these images"
+                        f"x {size[1]} px; images that share a camera must have its size"
                     )
 
     def _given_of(self, names: Sequence[str]) -> GivenCamera:

@@ -189,7 +189,7 @@ def test_model_must_be_of_these_images(photos: Path, tmp_path: Path) -> None:
         initial.check(NAMES[:2])
     (tmp_path / "images.txt").write_text(images.format("side/d.jpg"))
     initial = InitialCameras(photos, CameraOptions(cameras_path=str(tmp_path)))
-    with pytest.raises(OptionError, match=r"its camera is of 90 x 60 px, and side/d\.jpg has 60 x"):
+    with pytest.raises(OptionError, match=r"its camera is 90 x 60 px, side/d\.jpg is 60 x"):
         initial.check(NAMES)
 
 
