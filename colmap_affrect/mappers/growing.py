@@ -135,14 +135,10 @@ class Grower:
         mapper.filter_points(self.options)
 
     def _register_next(self, mapper: pycolmap.IncrementalMapper) -> int | None:
-        """Register one more image, by points or else by matches alone; return its id."""
-        for register, by_matches in (
-            (mapper.register_next_image, False),
-            (mapper.register_next_structure_less_image, True),
-        ):
-            for image_id in mapper.find_next_images(self.options, by_matches):
-                if register(self.options, image_id):
-                    return image_id
+        """Register one more image by points that it sees; return its id."""
+        for image_id in mapper.find_next_images(self.options, False):
+            if mapper.register_next_image(self.options, image_id):
+                return image_id
         return None
 
 
