@@ -17,7 +17,6 @@ from colmap_affrect.options import flat
 
 Stage = Literal["copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"]
 STAGES: tuple[str, ...] = get_args(Stage)
-COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
 FORMAT_VERSION = 7  # counts up when a stage records other options than before
 MADE_FROM = "made_from"  # digests of given files, and of the verified pairs that were mapped
 KEYS = ("recipe", "begun", *STAGES, MADE_FROM)

@@ -284,7 +284,7 @@ class ReconstructionReport:
                 for name, registration in largest.registrations.items()
             },
             "num_models": len(self.models),
-            "models": [model.registered_names for model in self.models],
+            "models": [list(model.registered_names) for model in self.models],
             "added": self.added,
             "preset": self.preset,
             "mapper": options.pop("name"),
