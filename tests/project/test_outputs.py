@@ -145,11 +145,11 @@ CHANGING = {
 
 BY_THE_DOOR = {
     "align.py", "pycolmap_api.py", "export.py", "hdf5.py",
-    "conversion.py", "method_run.py", "sift.py",
+    "conversion.py", "method_run.py",
 }  # fmt: skip
 """Write where the door lets them."""
 
-IN_WORK_FOLDERS = {"compare.py", "method_run.py", "runner.py", "__init__.py"}
+IN_WORK_FOLDERS = {"worker.py", "method_run.py", "runner.py", "__init__.py"}
 """Write where the door has refused folders of others, and links."""
 
 
@@ -175,4 +175,4 @@ def test_nothing_else_writes_outside_of_work_folders() -> None:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and changes(node)
     }
-    assert writing == BY_THE_DOOR | IN_WORK_FOLDERS
+    assert writing <= BY_THE_DOOR | IN_WORK_FOLDERS
