@@ -14,7 +14,6 @@ from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.atomic_files import replace_lines
 
-MAX_NAMES_IN_MESSAGE = 5
 CANDIDATES_PER_NEIGHBOR = 5  # times as many may an image have as images have on average
 
 
@@ -120,13 +119,11 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
     except UnicodeDecodeError as error:
         raise PairListError(f"{path}: cannot be read ({error})") from error
     if problems:
-        more = len(problems) - MAX_NAMES_IN_MESSAGE
-        shown = (
-            f"line {count}: {line!r}{_suggestion(line, ordered)}"
-            for count, line in problems[:MAX_NAMES_IN_MESSAGE]
+        (count, line), more = problems[0], len(problems) - 1
+        raise PairListError(
+            f"{path}: line {count}: {line!r} is not two names of images"
+            f"{_suggestion(line, ordered)}" + f", nor are {more} more lines" * (more > 0)
         )
-        listed = "; ".join(shown) + (f"; and {more} more" * (more > 0))
-        raise PairListError(f"{path}: names that are not among the images: {listed}")
     found.sort()  # np.unique takes seven times as much memory
     found = found[np.flatnonzero(np.diff(found, prepend=-1))]
     if not len(found):

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -38,18 +39,18 @@ class Executor(Protocol):
         """
 
 
+@dataclass(frozen=True)
 class Threads:
     """Work in threads of this process."""
 
-    def __init__(self, num_threads: int) -> None:
-        self._num_threads = num_threads
+    num_threads: int
 
     def map(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
         """See :func:`map_ordered`."""
         del files
-        return map_ordered(function, tasks, self._num_threads)
+        return map_ordered(function, tasks, self.num_threads)
 
 
 def available_cores() -> int:

@@ -112,7 +112,7 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
     ),
     "pair list": (
         lambda f: (f.out / "pairs.txt").write_text("a.png nothing.png\n"),
-        Finding("error", "{out}/pairs.txt", "names that are not among the images",
+        Finding("error", "{out}/pairs.txt", "is not two names of images",
                 "run 'colmap-affrect pairs --output-path {out} --overwrite'"),
     ),
     "model damaged": (
