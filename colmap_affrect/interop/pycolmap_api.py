@@ -7,7 +7,6 @@ functions go on where an earlier call stopped.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain, islice, repeat
 from pathlib import Path
 from typing import Any
 
@@ -308,18 +307,18 @@ def _written(found: Path, output: Path, *, extends: bool) -> dict[int, pycolmap.
 def _calling(begun: Callback, following: Callback, *, extends: bool) -> Callable[[int], None]:
     """Return what calls pycolmap's callbacks for a number of newly registered images.
 
-    The first are a pair, or all images of the model that is extended.
+    The first are a pair, or all images of the model that is extended: that is one call.
     """
-    calls = chain((begun,), repeat(following))
-    num_shown = 0
+    is_first = True
 
     def show(number: int) -> None:
-        nonlocal num_shown
-        first = 1 if extends else max(1, number - 1)
-        for call in islice(calls, number if num_shown else first):
-            if call:
-                call()
-        num_shown += number
+        nonlocal is_first
+        calls = [following] * number
+        if is_first:
+            calls = [begun] if extends else [begun, *calls[2:]]
+        is_first = False
+        for call in filter(None, calls):
+            call()
 
     return show
 
