@@ -48,7 +48,7 @@ from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
 
 METHODS = "methods"  # folder of all methods
-RESULT, SEED_RESULT = TypeAdapter(MethodResult), TypeAdapter(SeedResult)  # from and to JSON
+RESULT = TypeAdapter(MethodResult)  # from and to JSON
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ class MethodRun:
         self.result = self._read_result()
 
     def _read_result(self) -> MethodResult:
-        """Return what is done of the method; without seeds before the last of them has ended."""
+        """Return what is done of the method."""
         with suppress(FileNotFoundError, ValidationError):  # of a version before: features stay
             return RESULT.validate_json((self.workspace.path / "result.json").read_bytes())
         return MethodResult(
@@ -138,7 +138,12 @@ class MethodRun:
         else:
             self._stage("extract", self._extract_sift)
             self._stage("match", self._match_sift)
-        self._keep(seeds=tuple(map(self._run_seed, self.options.seeds)))
+        done = {result.seed: result for result in self.result.seeds}
+        for seed in self.options.seeds:
+            if seed not in done:
+                done[seed] = self._run_seed(seed)
+                self._keep(seeds=tuple(done.values()))
+        self._keep(seeds=tuple(done[seed] for seed in self.options.seeds))
 
     def _keep(self, **values: Any) -> None:
         peak = max(self.result.peak_memory_bytes, peak_memory_bytes())
@@ -188,17 +193,12 @@ class MethodRun:
             self._stage("escalate", lambda: escalate(context))
 
     def _run_seed(self, seed: int) -> SeedResult:
-        """Verify and map a copy of the database of the method, unless that is done."""
+        """Verify and map a copy of the database of the method, in a folder of the seed."""
         folder = self.workspace.path / f"seed-{seed}"
-        result_path = folder / "result.json"
-        if result_path.exists():
-            with suppress(ValidationError):
-                return SEED_RESULT.validate_json(result_path.read_bytes())
+        remove_own([folder])
         with new_results(folder) as (new,):
             new.mkdir()
-            result = self._seed_result(seed, new, f"{self.result.folder}/{folder.name}/sparse/0")
-            replace_bytes(new / result_path.name, SEED_RESULT.dump_json(result))
-        return result
+            return self._seed_result(seed, new, f"{self.result.folder}/{folder.name}/sparse/0")
 
     def _seed_result(self, seed: int, folder: Path, model_path: str) -> SeedResult:
         """Verify and map in a folder that is called after the seed when all is done."""
