@@ -95,21 +95,6 @@ def test_files_of_a_run_and_of_its_database_give_the_same_database(
         assert_allclose(new_keypoints[name], columns, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize(("count", "dtype"), [(32_767, np.int16), (40_000, np.int32)])
-def test_indices_beyond_16_bits_are_written_in_32(
-    tmp_path: Path, targets: tuple[Path, Path], count: int, dtype: type
-) -> None:
-    many = np.column_stack([np.linspace(0.0, 60.0, count), np.zeros(count)])
-    pairs = {("a.png", "b.png"): [[0, count - 1], [1, 5]]}
-    make_database(tmp_path / "x.db", {"a.png": many[:2], "b.png": many}, pairs).close()
-    export_h5(tmp_path / "x.db", *targets)
-    with h5py.File(targets[1], "r") as file:
-        assert file["a.png/b.png/matches0"].dtype == dtype
-        assert file["a.png/b.png/matches0"][()].tolist() == [count - 1, 5]
-        assert file["a.png/b.png/matching_scores0"].dtype == np.float16
-        assert file["a.png/b.png/matching_scores0"][()].tolist() == [1.0, 1.0]
-
-
 def test_descriptors_of_a_database_become_real_ones(
     tmp_path: Path, targets: tuple[Path, Path]
 ) -> None:
