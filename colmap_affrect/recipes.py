@@ -194,15 +194,12 @@ class Recipe(ExtractionOptions):
         ``name`` is by default that of the recipe, or of the preset.
         """
         own = dict(self.mapping)
-        usual = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))
+        usual = str(own.pop("name", "incremental" if preset == "colmap" else MAPPERS.default))
         if name and name != usual:
             own = {}  # they are those of another mapper
         part = MAPPERS.part(name or usual)
         options: MapperOptions = part.Options.preset(preset, **{**own, **values})
         return options
-
-
-DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}  # by preset
 
 
 def recipe_folder() -> Path:
