@@ -53,7 +53,7 @@ def export(
             raise OptionError(f"--format {name}: unknown{suggestion(name, FORMATS)}")
     if image_path is not None and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
-    photographs = image_path or Workspace.of_model(model_path).photographs()
+    photographs = image_path or Workspace(model_path.resolve().parent.parent).photographs()
     source = Source(model_path, read_given_model(model_path), photographs)
     chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
     names = dict.fromkeys(made for _, made in chosen.values())

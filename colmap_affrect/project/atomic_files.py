@@ -9,6 +9,7 @@ import secrets
 import shutil
 import signal
 import struct
+import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -142,6 +143,8 @@ def uninterrupted() -> Iterator[None]:
 class FileTransaction(io.RawIOBase):
     """A binary file for h5py, whose changes stay in memory until :meth:`commit` makes them all.
 
+    One that is not there is made by the first commit.
+
     Changed pages go into a journal beside the file; once that is complete, the changes count, and
     :func:`apply_journal` puts them in place, now or when the file is next opened.
     """
@@ -150,8 +153,8 @@ class FileTransaction(io.RawIOBase):
         super().__init__()
         apply_journal(path)
         self._path = path
-        self._stored = path.open("rb")
-        self._kept_size = self._size = path.stat().st_size
+        self._stored = path.open("rb") if path.exists() else io.BytesIO()
+        self._kept_size = self._size = self._stored.seek(0, os.SEEK_END)
         self._position = 0
         self._pages: dict[int, bytearray] = {}
 
@@ -233,14 +236,17 @@ def journal_of(path: Path) -> Path:
 def apply_journal(path: Path) -> None:
     """Put the changes of an interrupted :meth:`FileTransaction.commit` in place, if any.
 
-    A journal that is not complete never counted: it is removed, and the file is as it was before.
+    A journal that is not complete, or of a file that is gone, does not count: it is removed.
     """
     journal = journal_of(path)
     if not journal.exists():
         return
     content, digest = (whole := journal.read_bytes())[:-SHA256_BYTES], whole[-SHA256_BYTES:]
+    kept_size = size = sys.maxsize
     if hashlib.sha256(content).digest() == digest and content.startswith(JOURNAL_MARK):
         _, kept_size, size = JOURNAL_HEADER.unpack_from(content)
+    if kept_size <= (path.stat().st_size if path.exists() else 0):
+        path.touch()
         with path.open("r+b") as file:
             file.truncate(kept_size)
             for start in range(JOURNAL_HEADER.size, len(content), 8 + PAGE_BYTES):
@@ -250,5 +256,5 @@ def apply_journal(path: Path) -> None:
             file.truncate(size)
             _sync(file)
     else:
-        logger.warning("%s: is not complete; the changes in it are left out", journal)
+        logger.warning("%s: does not count; the changes in it are left out", journal)
     journal.unlink()

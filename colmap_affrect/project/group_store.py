@@ -1,6 +1,5 @@
 """A HDF5 file of groups that are complete or do not count, which changes as a whole."""
 
-import io
 import json
 import zlib
 from collections.abc import Iterator
@@ -17,8 +16,6 @@ from colmap_affrect.project.atomic_files import (
     FileTransaction,
     apply_journal,
     cannot_write,
-    journal_of,
-    replace_bytes,
     uninterrupted,
 )
 
@@ -45,16 +42,13 @@ class GroupStore:
             with self._opened(self.path, "r") as file:
                 yield file
             return
-        with uninterrupted():
-            if not self.path.exists():
-                self._create()
-            with FileTransaction(self.path) as changes:
-                with self._opened(changes, "r+") as file:
-                    yield file
-                try:
-                    changes.commit()
-                except OSError as error:
-                    raise cannot_write(self.path, error) from error
+        with uninterrupted(), FileTransaction(self.path) as changes:
+            with self._opened(changes, "r+" if self.path.exists() else "w") as file:
+                yield file
+            try:
+                changes.commit()
+            except OSError as error:
+                raise cannot_write(self.path, error) from error
 
     @contextmanager
     def _opened(self, where: Path | FileTransaction, mode: str) -> Iterator[h5py.File]:
@@ -62,19 +56,14 @@ class GroupStore:
         with damage(self.path, mend):
             apply_journal(self.path)
             with h5py.File(where, mode) as file:
+                if mode == "w":
+                    file.attrs.update(format=self.format, pixel_origin="center")
                 if (found := file.attrs.get("format")) != self.format:
                     raise StoreError(
                         f"{self.path}: expected the format {self.format}, found {found}; use "
                         "another --output-path"
                     )
                 yield file
-
-    def _create(self) -> None:
-        content = io.BytesIO()
-        with h5py.File(content, "w") as file:
-            file.attrs.update(format=self.format, pixel_origin="center")
-        journal_of(self.path).unlink(missing_ok=True)
-        replace_bytes(self.path, content.getvalue())
 
     def note(self, key: str) -> Any:
         """Return what is kept with the whole file, as JSON has it; None where nothing is."""

@@ -76,11 +76,6 @@ class Workspace:
         """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
         return cls(database_path.with_suffix(".affrect"), database_path)
 
-    @classmethod
-    def of_model(cls, model_path: Path) -> Self:
-        """Return the workspace that a model in ``sparse/0`` belongs to, if it is one of ours."""
-        return cls(model_path.resolve().parent.parent)
-
     def branch(self, path: Path) -> "Workspace":
         """Make another folder with the same features, pairs, raw matches and records of cameras.
 

@@ -207,7 +207,7 @@ def test_journal_that_is_torn_or_damaged_is_left_out(
         apply_journal(path)
         assert path.read_bytes() == before
         assert not journal_of(path).exists()
-    assert "is not complete; the changes in it are left out" in caplog.text
+    assert "does not count; the changes in it are left out" in caplog.text
     journal_of(path).write_bytes(whole)
     apply_journal(path)
     assert path.read_bytes()[:6] == b"NEWold"
