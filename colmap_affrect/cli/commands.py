@@ -19,6 +19,7 @@ from colmap_affrect.comparison.method_run import CompareOptions
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.errors import ComparisonError, ImageError, NoModelError, OptionError, such_as
 from colmap_affrect.evaluation import evaluate as evaluating
+from colmap_affrect.evaluation.truths import ScoreOptions
 from colmap_affrect.features import weights as files
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs
@@ -151,7 +152,7 @@ def evaluate(options: argparse.Namespace) -> None:
         evaluating.EvaluateOptions(
             recipes=parse_methods(options.recipes, given.depth_settings(options)),
             max_num_keypoints=options.max_num_keypoints,
-            random_seed=options.random_seed or 0,
+            scores=ScoreOptions(random_seed=options.random_seed or 0),
             resources=given.resources(options),
         ),
         overwrite=options.overwrite,

@@ -5,7 +5,7 @@ what changed is made again.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean
 
@@ -37,7 +37,6 @@ class EvaluateOptions:
 
     recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")  # also by name
     max_num_keypoints: int | None = None  # of each image the strongest are matched; None: all
-    random_seed: int = 0  # of the estimators
     scores: ScoreOptions = field(default_factory=ScoreOptions)
     resources: Resources = field(default_factory=Resources)
 
@@ -63,14 +62,13 @@ def evaluate(
     methods = parse_methods(options.recipes)
     if options.max_num_keypoints is not None and options.max_num_keypoints < 1:
         raise OptionError(f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1")
-    if options.random_seed < 0:
-        raise OptionError(f"--random-seed {options.random_seed}: must be at least 0")
+    if options.scores.random_seed < 0:
+        raise OptionError(f"--random-seed {options.scores.random_seed}: must be at least 0")
     if not dataset_path.is_dir():
         raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
     Workspace(output_path).require_own(dataset_path)
     settings = {
-        "scores": options.scores.to_mapping(),
-        "random_seed": options.random_seed,
+        "scores": asdict(options.scores),
         "max_num_keypoints": options.max_num_keypoints,
     }
     inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}

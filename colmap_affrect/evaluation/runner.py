@@ -82,7 +82,7 @@ class RecipeRun:
         if method.recipe is None:
             raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
         self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
-        self._options = ScoreOptions(**settings["scores"]), settings["random_seed"]
+        self._options = ScoreOptions(**settings["scores"])
         extraction, matching = self.recipe.extraction, self.recipe.matching
         images = {image.name for pair in pairs for image in pair.images}
         self._extractor = prepare(extraction, resources, sorted(images))
@@ -130,7 +130,7 @@ class RecipeRun:
             return result
         try:
             with watch.step("estimate"):
-                score = pair.truth.score(*points, *self._options)
+                score = pair.truth.score(*points, self._options)
         except Exception as error:
             logger.exception("%s: %s cannot be scored", self.label, pair.name)
             return self._failed(pair, f"{type(error).__name__}: {error}")
@@ -138,7 +138,7 @@ class RecipeRun:
         return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
 
     def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
-        score = pair.truth.score(*NOTHING, *self._options)
+        score = pair.truth.score(*NOTHING, self._options)
         return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
 
     def _matched(

@@ -6,7 +6,7 @@ all that it knows. Results of failed pairs have infinite errors.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from statistics import fmean, median_low
@@ -25,7 +25,6 @@ from colmap_affrect.geometry.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
 from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 from colmap_affrect.images.reading import read_gray
-from colmap_affrect.options import Options, within
 
 Points = Floats
 Sides = tuple[Floats, Floats]  # points or rays of both images
@@ -48,13 +47,13 @@ Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value 
 """Infinite where JSON has null."""
 
 
-class ScoreOptions(Options):
-    """How models are estimated from matches."""
+@dataclass(frozen=True)
+class ScoreOptions:
+    """How models are estimated from matches; the seed is of the order that these are taken in."""
 
-    threshold_px: Annotated[float, within(1e-6, 1e9)] = 0.5
-    """Of an inlier of plain RANSAC, for homographies and poses (the paper: 0.5)."""
-    max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
-    """Of estimators, as the paper says; its numbers of relative poses are those of 1000."""
+    threshold_px: float = 0.5  # of an inlier of plain RANSAC, for homographies and poses
+    max_num_iterations: int = 100_000  # as the paper says; its numbers of poses are those of 1000
+    random_seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ Results = Sequence[PairResult]
 
 
 def estimate_matrix(
-    find: Any, points: Sides, method: int, threshold_px: float, options: ScoreOptions, seed: int
+    find: Any, points: Sides, method: int, threshold_px: float, options: ScoreOptions
 ) -> tuple[Array | None, int]:
     """Estimate a (3, 3) homography or fundamental matrix, x2 ~ H x1, x2' F x1 = 0, and its inliers.
 
@@ -98,7 +97,7 @@ def estimate_matrix(
     count = len(points[0])
     if count < (4 if find is cv2.findHomography else 8):
         return None, 0
-    order = np.random.default_rng(seed).permutation(count)
+    order = np.random.default_rng(options.random_seed).permutation(count)
     first, second = (np.asarray(side, dtype=np.float64)[order] for side in points)
     limits = dict(confidence=CONFIDENCE, maxIters=options.max_num_iterations)
     matrix, inliers = find(first, second, method, threshold_px, **limits)
@@ -107,9 +106,7 @@ def estimate_matrix(
     return np.asarray(matrix, dtype=np.float64), int(np.count_nonzero(inliers))
 
 
-def estimate_pose(
-    rays: Sides, threshold: float, options: ScoreOptions, seed: int
-) -> tuple[Pose | None, int]:
+def estimate_pose(rays: Sides, threshold: float, options: ScoreOptions) -> tuple[Pose | None, int]:
     """Estimate camera2_from_camera1, |t| = 1, from five-point samples, and count its inliers.
 
     ``rays`` are (M, 2) x/z, y/z in front of each camera, the threshold in focal lengths; rays that
@@ -118,7 +115,7 @@ def estimate_pose(
     usable = np.flatnonzero(np.isfinite(np.hstack(rays)).all(axis=1))
     if len(usable) < MIN_POSE_MATCHES:
         return None, 0
-    order = np.random.default_rng(seed).permutation(usable)
+    order = np.random.default_rng(options.random_seed).permutation(usable)
     first, second = (np.ascontiguousarray(side[order]) for side in rays)
     limits = CONFIDENCE, threshold, options.max_num_iterations
     essential, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, *limits)
@@ -171,12 +168,10 @@ class TrueHomography:
         target = project(self.matrix, self.visible)
         return float(transfer_errors(signed, self.visible, target).mean())
 
-    def score(
-        self, points1: Points, points2: Points, options: ScoreOptions, seed: int
-    ) -> PairScore:
+    def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
         """Score by the paper's RANSAC, in px."""
         matrix, num_inliers = estimate_matrix(
-            cv2.findHomography, (points1, points2), cv2.RANSAC, options.threshold_px, options, seed
+            cv2.findHomography, (points1, points2), cv2.RANSAC, options.threshold_px, options
         )
         error = self.error_px(matrix)
         num_correct = int((transfer_errors(self.matrix, points1, points2) < CORRECT_PX).sum())
@@ -204,9 +199,7 @@ class TruePose:
     cameras: tuple[pycolmap.Camera, pycolmap.Camera]
     pose: Pose
 
-    def score(
-        self, points1: Points, points2: Points, options: ScoreOptions, seed: int
-    ) -> PairScore:
+    def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
         """Score by the paper's RANSAC: the error is that of the rotation, in degrees.
 
         ``direction_error_deg`` is the angle between the directions of the translations. Matches
@@ -215,7 +208,7 @@ class TruePose:
         """
         both = rays(self.cameras[0], points1), rays(self.cameras[1], points2)
         focal_px = float(np.mean([camera.mean_focal_length() for camera in self.cameras]))
-        pose, num_inliers = estimate_pose(both, options.threshold_px / focal_px, options, seed)
+        pose, num_inliers = estimate_pose(both, options.threshold_px / focal_px, options)
         error, direction = (math.inf, math.inf) if pose is None else pose_errors(pose, self.pose)
         distances_px = focal_px * sampson_errors(essential_matrix(*self.pose), *both)
         has_baseline = self.pose[1].any()  # without, distances are not defined
@@ -236,9 +229,7 @@ class Correspondences:
 
     points: Points
 
-    def score(
-        self, points1: Points, points2: Points, options: ScoreOptions, seed: int
-    ) -> PairScore:
+    def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
         """Score by the fundamental matrix of OpenCV's USAC_MAGSAC, as WxBS does.
 
         ``error`` is the median of the symmetric epipolar distances of the correspondences, in px.
@@ -246,10 +237,11 @@ class Correspondences:
         """
         estimate = partial(estimate_matrix, cv2.findFundamentalMat, (points1, points2))
         found = []
-        for other in range(seed, seed + NUM_ESTIMATES):
-            matrix, count = estimate(cv2.USAC_MAGSAC, MAX_EPIPOLAR_NOISE_PX, options, other)
+        for seed in range(options.random_seed, options.random_seed + NUM_ESTIMATES):
+            seeded = replace(options, random_seed=seed)
+            matrix, count = estimate(cv2.USAC_MAGSAC, MAX_EPIPOLAR_NOISE_PX, seeded)
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
-            found.append((float(np.median(distances)), count, other, distances))
+            found.append((float(np.median(distances)), count, seed, distances))
         error, num_inliers, _, distances = median_low(found)
         score = wxbs_score(distances)
         return PairScore(error, num_inliers, solved=score, kind="correspondences")

@@ -65,7 +65,7 @@ def test_pairs_are_counted_below_each_limit() -> None:
 
 
 def homography_score(points1: np.ndarray, points2: np.ndarray) -> PairScore:
-    return TrueHomography(TRUTH, SIZE1, SIZE2).score(points1, points2, OPTIONS, 3)
+    return TrueHomography(TRUTH, SIZE1, SIZE2).score(points1, points2, OPTIONS)
 
 
 def test_matches_of_which_half_are_wrong_give_the_homography() -> None:
@@ -95,11 +95,9 @@ CAMERA1 = pycolmap.Camera(
 CAMERA2 = pycolmap.Camera(model="PINHOLE", width=640, height=800, params=[600.0, 650, 300, 420])
 
 
-def pose_score(
-    points: tuple[np.ndarray, np.ndarray], pose2: Pose = POSE2, seed: int = 0, **options: float
-) -> PairScore:
+def pose_score(points: tuple[np.ndarray, np.ndarray], pose2: Pose = POSE2) -> PairScore:
     truth = TruePose((CAMERA1, CAMERA2), relative_pose(POSE1, pose2))
-    return truth.score(*points, OPTIONS.changed(**options), seed)
+    return truth.score(*points, OPTIONS)
 
 
 def project(camera: pycolmap.Camera, pose: Pose, points: np.ndarray) -> np.ndarray:
@@ -192,17 +190,17 @@ def test_score_of_wxbs_is_the_mean_recall_over_thresholds() -> None:
 def test_matches_of_another_geometry_score_worse() -> None:
     points1, points2 = matches(200)
     truth = Correspondences(np.hstack([points1[:30], points2[:30]]))
-    right = truth.score(points1[30:], points2[30:], OPTIONS, 0)
-    assert right.error < truth.score(points2[30:], points1[30:], OPTIONS, 0).error
+    right = truth.score(points1[30:], points2[30:], OPTIONS)
+    assert right.error < truth.score(points2[30:], points1[30:], OPTIONS).error
     assert right.solved > 0.5  # the lens of image 1 distorts
-    none = truth.score(points1[:7], points2[:7], OPTIONS, 0)
+    none = truth.score(points1[:7], points2[:7], OPTIONS)
     assert (none.error, none.solved) == (math.inf, 0.0)
 
 
 def test_tables_are_by_kind_of_truth() -> None:
     nothing = np.zeros((0, 2))
     truths = TrueHomography(TRUTH, SIZE1, SIZE2), Correspondences(np.ones((2, 4)))
-    scores = [truth.score(nothing, nothing, OPTIONS, 0) for truth in truths]
+    scores = [truth.score(nothing, nothing, OPTIONS) for truth in truths]
     results = [PairResult(**vars(score), name="p") for score in scores]
     results += [PairResult(math.inf, 0, name="bad"), pose_result("indoors", 4.0, 1.0)]
     found = columns(results)
