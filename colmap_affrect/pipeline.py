@@ -201,7 +201,7 @@ def map_and_report(
         stages=(*earlier, report),
         recipe="" if copied else workspace.recipe(),
         versions=installed_versions(),
-        presets=(verification.preset_name, options.preset_name),
+        preset=options.preset_name,
         verification=verification.to_mapping(),
         mapping=options.to_mapping(),
         differs_from_colmap={

@@ -54,7 +54,7 @@ def small_report(folder: Path) -> ReconstructionReport:
         ),
         recipe="default",
         versions={"colmap-affrect": "1.2.3"},
-        presets=("sparse", "sparse"),
+        preset="sparse",
         verification={"max_error_px": 3.0},
         mapping={"name": "sparse", "mapper_options": {}},
         differs_from_colmap={},

@@ -182,7 +182,7 @@ class ReconstructionReport:
         unregistered: image name to reason: unreadable, no features, no verified pair, not
             registered (with its best pairs), taken out, or in another model.
         models: all models, largest first, as written to sparse/0, sparse/1, ...
-        presets: of verification and of mapping: ``sparse``, ``colmap`` or ``custom``.
+        preset: of mapping: ``sparse``, ``colmap`` or ``custom``.
         verification: options of two-view geometry.
         mapping: the mapper and its options.
         differs_from_colmap: for verification and mapping, what pycolmap was given that is not
@@ -205,7 +205,7 @@ class ReconstructionReport:
     stages: tuple[StageReport, ...]
     recipe: str
     versions: dict[str, str]
-    presets: tuple[str, str]
+    preset: str
     verification: dict[str, Any]
     mapping: dict[str, Any]
     differs_from_colmap: dict[str, dict[str, Any]]
@@ -239,14 +239,6 @@ class ReconstructionReport:
         return f"no model was found: {self.num_verified_pairs} verified pairs do not make one"
 
     @property
-    def preset(self) -> str:
-        """``sparse``, ``colmap`` or ``custom``; both names where verification's is another one."""
-        verification, mapping = self.presets
-        if verification == mapping:
-            return mapping
-        return f"{verification} for verification, {mapping} for mapping"
-
-    @property
     def registered_names(self) -> tuple[str, ...]:
         """Names of the images in the largest model."""
         return self.models[0].registered_names if self.models else ()
@@ -271,7 +263,7 @@ class ReconstructionReport:
         """Return the content of ``report.json``."""
         largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
         found = asdict(self)
-        del found["presets"], found["verification"]["random_seed"]
+        del found["verification"]["random_seed"]
         options = found["mapping"]
         return {
             "status": self.status,
@@ -286,7 +278,6 @@ class ReconstructionReport:
             "num_models": len(self.models),
             "models": [list(model.registered_names) for model in self.models],
             "added": self.added,
-            "preset": self.preset,
             "mapper": options.pop("name"),
             "mapper_options": options.pop("mapper_options"),
             "random_seed": options.pop("random_seed"),

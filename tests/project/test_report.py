@@ -38,7 +38,7 @@ REPORT = ReconstructionReport(
     ),
     recipe="default",
     versions={"pycolmap": "4.2.1"},
-    presets=("sparse", "sparse"),
+    preset="sparse",
     verification={"min_num_inliers": 20, "random_seed": 7},
     mapping={
         "name": "incremental",
@@ -144,22 +144,6 @@ def test_long_lists_end_where_the_screen_does() -> None:
     assert "        not 0.png, 1.png," in report.summary()
     assert "10.png, 11.png and 88 more: no features\n" in report.summary()
     assert len(report.to_mapping()["unregistered"]) == 100
-
-
-@pytest.mark.parametrize(
-    ("presets", "preset"),
-    [
-        (("sparse", "sparse"), "sparse"),
-        (("custom", "custom"), "custom"),
-        (("colmap", "sparse"), "colmap for verification, sparse for mapping"),
-    ],
-)
-def test_preset_names_that_of_verification_where_it_is_another_one(
-    presets: tuple[str, str], preset: str
-) -> None:
-    report = replace(REPORT, presets=presets)
-    assert report.preset == report.to_mapping()["preset"] == preset
-    assert f"preset      {preset}, incremental mapper" in report.summary()
 
 
 @pytest.mark.parametrize(
