@@ -92,7 +92,6 @@ def evaluate(
 def _summed(run: RecipeRun, results: Sequence[PairResult]) -> RecipeResult:
     return RecipeResult(
         name=run.label,
-        description=run.recipe.summary,
         summary=truths.columns(results),
         costs={
             "solved": fmean(result.solved for result in results),
@@ -103,6 +102,5 @@ def _summed(run: RecipeRun, results: Sequence[PairResult]) -> RecipeResult:
             SECONDS: sum(result.seconds for result in results),
         },
         failures=run.failures,
-        warnings=run.warnings,
         pairs=tuple(results),
     )

@@ -31,13 +31,11 @@ class RecipeResult:
     """What one recipe reached."""
 
     name: str  # its label
-    description: str
     summary: Mapping[str, Mapping[str, Number]]  # columns of tables, by the kind of truth
     # number of failed pairs, seconds in all, and means over the pairs: ``solved`` from 0 to 1,
     # ``keypoints`` of an image, ``matches``, ``inliers``
     costs: Mapping[str, float]
     failures: Mapping[str, str]  # images that cannot be used, with the reason
-    warnings: Mapping[str, str]  # images that were not rectified now though they were to be
     pairs: tuple[PairResult, ...]  # in the order of the dataset; failed ones among them
 
 

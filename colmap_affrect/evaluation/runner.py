@@ -57,12 +57,7 @@ class _StrongestFeatures(FeatureStore):
 
 
 class RecipeRun:
-    """One recipe on the pairs of a dataset.
-
-    Attributes:
-        failures: images that could not be used in this run, with the reason.
-        warnings: images that this run did not rectify though they were to be.
-    """
+    """One recipe on the pairs of a dataset."""
 
     def __init__(
         self,
@@ -102,8 +97,7 @@ class RecipeRun:
             of, kind = chosen.matching or matching, chosen.features.kind
             task = Matching(self._store, of, level, chosen.base, kind, resources)
             self._matchings.append(task)
-        self.failures: dict[str, str] = {}
-        self.warnings: dict[str, str] = {}
+        self.failures: dict[str, str] = {}  # images that could not be used in this run: why
         self._lock = Lock()  # of extraction and of the store
 
     def results(self, progress: Progress) -> list[PairResult]:
@@ -192,7 +186,7 @@ class RecipeRun:
                 self.failures[name] = str(error)
                 return False
             if found.warning:
-                self.warnings[name] = found.warning
+                logger.warning("%s: %s", name, found.warning)
             if missing:
                 store.extend(name, found.features)
             else:
