@@ -110,7 +110,8 @@ def connected(address: str) -> Iterator[Cluster]:
     if not re.fullmatch(r"(tcp|tls)://.+:\d+", address):
         raise ClusterError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
     security = Security()  # as dask's configuration has it
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors that matter are raised
+    for name in ("distributed", "distributed.client"):  # errors that matter are raised
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     # Tasks may contain large images: dask need not warn of that.
     with config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
         _require_scheduler(address, security)
