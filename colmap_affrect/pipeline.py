@@ -10,11 +10,11 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.model_files import read_given_model
-from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DAMAGE, ImageError, MappingError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
-from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
+from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.base import PairOptions
@@ -204,10 +204,6 @@ def map_and_report(
         preset=options.preset_name,
         verification=verification.to_mapping(),
         mapping=options.to_mapping(),
-        differs_from_colmap={
-            "verification": verification_differences(verification),
-            "mapping": mapper.differences(MappingTask(workspace.database, None, cameras=cameras)),
-        },
         pair_levels={} if copied else pair_levels(context),
         contradicting_pairs={} if copied else contradicting_pairs(context),
         guided={} if copied else guided_counts(context),

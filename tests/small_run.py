@@ -57,7 +57,6 @@ def small_report(folder: Path) -> ReconstructionReport:
         preset="sparse",
         verification={"max_error_px": 3.0},
         mapping={"name": "sparse", "mapper_options": {}},
-        differs_from_colmap={},
         advice=("--camera-mode single", "more photographs"),
         guided={"pairs": 2, "matches_before": 20, "matches_after": 1050},
         cameras=(camera,),

@@ -21,7 +21,6 @@ from colmap_affrect.colmap.database import (
     require_database_space,
     unverified_pairs,
 )
-from colmap_affrect.colmap.native_options import Plain, differences
 from colmap_affrect.colmap.two_views import pair_model, significance
 from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
@@ -85,11 +84,6 @@ def two_view_options(options: VerificationOptions) -> pycolmap.TwoViewGeometryOp
             random_seed=options.random_seed,
         ),
     )
-
-
-def verification_differences(options: VerificationOptions) -> dict[str, Plain]:
-    """Return where verification differs from COLMAP's defaults, by pycolmap's dotted keys."""
-    return differences(two_view_options(options), pycolmap.TwoViewGeometryOptions())
 
 
 @dataclass(frozen=True)

@@ -158,9 +158,6 @@ class Mapper(Protocol):
             KeyboardInterrupt: after mapping has been stopped.
         """
 
-    def differences(self, task: MappingTask) -> dict[str, Any]:
-        """Return where mapping differs from COLMAP's defaults, by pycolmap's dotted keys."""
-
 
 MAPPERS: Registry[Mapper] = Registry(
     kind="mapper",

@@ -10,7 +10,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import registered_names
-from colmap_affrect.colmap.native_options import Plain, differences, resolve, set_values
+from colmap_affrect.colmap.native_options import resolve, set_values
 from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel
@@ -114,11 +114,6 @@ class IncrementalMapper:
         )
         set_values(native, options.mapper_options)
         return native
-
-    def differences(self, task: MappingTask) -> dict[str, Plain]:
-        """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        native = self.native(task, self.options.random_seed)
-        return differences(native, pycolmap.IncrementalPipelineOptions())
 
 
 @dataclass

@@ -185,8 +185,6 @@ class ReconstructionReport:
         preset: of mapping: ``sparse``, ``colmap`` or ``custom``.
         verification: options of two-view geometry.
         mapping: the mapper and its options.
-        differs_from_colmap: for verification and mapping, what pycolmap was given that is not
-            COLMAP's default, by pycolmap's dotted keys.
         pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
             and ``none``; empty for other recipes.
         contradicting_pairs: of these the verified ones that do not fit the largest model.
@@ -208,7 +206,6 @@ class ReconstructionReport:
     preset: str
     verification: dict[str, Any]
     mapping: dict[str, Any]
-    differs_from_colmap: dict[str, dict[str, Any]]
     pair_levels: dict[str, int] = field(default_factory=dict)
     contradicting_pairs: dict[str, int] = field(default_factory=dict)
     extended: tuple[str, ...] = ()

@@ -10,15 +10,15 @@ from mapping_tasks import ALL_GIVEN, NOTHING_KNOWN
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.native_options import flat_values
+from colmap_affrect.colmap.native_options import differences, flat_values
 from colmap_affrect.colmap.verification import (
     VerificationOptions,
-    verification_differences,
+    two_view_options,
     verify,
 )
 from colmap_affrect.comparison.pose_scores import pair_errors
 from colmap_affrect.errors import OptionError
-from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions
 
 SEED = 3
@@ -30,6 +30,15 @@ ROTATION_ERROR_DEG = 0.05
 def mapper_of(name: str, preset: str = "sparse", **values: Any) -> Any:
     options = MAPPERS.part(name).Options.preset(preset, random_seed=SEED, **values)
     return MAPPERS.make(options)
+
+
+def of_verification(options: VerificationOptions) -> dict[str, Any]:
+    """What differs from COLMAP's defaults."""
+    return differences(two_view_options(options), pycolmap.TwoViewGeometryOptions())
+
+
+def of_mapping(mapper: Any, task: MappingTask = NOTHING_KNOWN) -> dict[str, Any]:
+    return differences(mapper.native(task, SEED), pycolmap.IncrementalPipelineOptions())
 
 
 def reconstruct(
@@ -74,7 +83,7 @@ def test_options_are_passed_on_to_pycolmap() -> None:
     verification = VerificationOptions.preset(
         "colmap", max_error_px=3.0, min_num_inliers=21, min_inlier_ratio=0.17, random_seed=5
     )
-    assert verification_differences(verification) == {
+    assert of_verification(verification) == {
         "ransac.max_error": 3.0, "min_num_inliers": 21, "min_inlier_ratio": 0.17,
         "ransac.random_seed": 5,
     }  # fmt: skip
@@ -82,7 +91,7 @@ def test_options_are_passed_on_to_pycolmap() -> None:
         "incremental", "colmap", ignore_two_view_tracks=False, init_min_tri_angle_deg=7.0,
         init_min_num_inliers=44, abs_pose_min_num_inliers=17, min_model_size=6,
     )  # fmt: skip
-    assert mapper.differences(NOTHING_KNOWN) == repeatable("incremental") | {
+    assert of_mapping(mapper) == repeatable("incremental") | {
         "triangulation.ignore_two_view_tracks": False, "mapper.init_min_tri_angle": 7.0,
         "mapper.init_min_num_inliers": 44, "mapper.abs_pose_min_num_inliers": 17,
         "min_model_size": 6,
@@ -106,9 +115,9 @@ def repeatable(mapper: str) -> dict[str, int]:
 @pytest.mark.parametrize("mapper", NATIVE)
 def test_colmap_preset_is_what_pycolmap_has_by_default(mapper: str, given: bool) -> None:
     verification = VerificationOptions.preset("colmap", random_seed=SEED)
-    assert verification_differences(verification) == {"ransac.random_seed": SEED}
+    assert of_verification(verification) == {"ransac.random_seed": SEED}
     made = mapper_of(mapper, "colmap")
-    differs = made.differences(ALL_GIVEN if given else NOTHING_KNOWN)
+    differs = of_mapping(made, ALL_GIVEN if given else NOTHING_KNOWN)
     assert differs == repeatable(mapper)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
+from mapping_tasks import task_with_given_cameras
 from small_scene import INTRINSICS, NAMES
 
 import colmap_affrect
@@ -41,9 +41,8 @@ def test_mapper_registers_tells_of_it_and_keeps_given_cameras(
 
 
 @pytest.mark.parametrize("name", MAPPERS.names())
-def test_mapper_says_where_it_differs_and_takes_native_options(name: str) -> None:
+def test_mapper_has_presets_and_refuses_unknown_options(name: str) -> None:
     options = MAPPERS.options({"name": name, "random_seed": 5, "mapper_options": {}})
-    assert MAPPERS.make(options).differences(NOTHING_KNOWN)["random_seed"] == 5
     colmap = type(options).preset("colmap")
     assert (colmap.preset_name, options.preset_name) == ("colmap", "sparse")
     with pytest.raises(OptionError, match="no such option"):

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-from mapping_tasks import ALL_GIVEN, NOTHING_KNOWN, task_with_given_cameras
+from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
 from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.native_options import differences, set_values
 from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper
@@ -37,18 +35,6 @@ TIMEOUT_S = 60
 
 ROTATION_ERROR_DEG = 0.05
 """Keypoints are exact; what is left are float32 coordinates and the optimiser's tolerance."""
-
-
-@pytest.mark.parametrize("mapper", MAPPERS.names())
-def test_differences_say_all_that_another_process_must_know(mapper: str) -> None:
-    values = {"min_num_matches": 16, "ignore_watermarks": True}
-    made = mapper_of(mapper, mapper_options=values)
-    told = made.differences(ALL_GIVEN)
-    native = pycolmap.IncrementalPipelineOptions()
-    set_values(native, json.loads(json.dumps(told)))
-    ours = made.native(ALL_GIVEN, SEED)
-    assert differences(native, ours) == {}
-    assert (told["min_num_matches"], told["ignore_watermarks"]) == (16, True)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -46,7 +46,6 @@ REPORT = ReconstructionReport(
         "random_seed": 7,
         "mapper_options": {"mapper.init_max_error": 3.0},
     },
-    differs_from_colmap={"verification": {"min_num_inliers": 20}, "mapping": {}},
     pair_levels={"identity": 2, "asift": 1, "none": 7},
     advice=("--recipe on-demand",),
     cameras=(
@@ -83,7 +82,6 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "recipe": "default", "preset": "sparse", "mapper": "incremental",
         "mapper_options": {"mapper.init_max_error": 3.0}, "verification": {"min_num_inliers": 20},
         "mapping": {"min_model_size": 2}, "random_seed": 7, "versions": {"pycolmap": "4.2.1"},
-        "differs_from_colmap": {"verification": {"min_num_inliers": 20}, "mapping": {}},
     }  # fmt: skip
     assert [(stage["name"], stage["wall_s"]) for stage in stages] == [
         ("extract", 1.25),
