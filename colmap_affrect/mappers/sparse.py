@@ -11,7 +11,7 @@ from colmap_affrect.mappers.adjustment import EXIF_SIGMA, FAST, NOISE_PX, Adjust
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
-from colmap_affrect.mappers.moves import MOVES, State
+from colmap_affrect.mappers.moves import MOVES
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.options import within
@@ -128,10 +128,9 @@ class SparseMapper(IncrementalMapper):
             start = best[0].reconstruction if best else None
             if start and search.is_certain(start, graph):
                 break
-            reduction = move(State(graph, measured, native.random_seed, start))
-            if not reduction:
+            reduced = move(graph, measured)
+            if reduced is None:
                 continue
-            reduced = reduction(graph)
             pairs = frozenset((pair.ids, len(pair.matches)) for pair in reduced.pairs)
             if pairs in tried or (start and reduced.is_explained_by(start)):
                 continue
@@ -144,7 +143,9 @@ class SparseMapper(IncrementalMapper):
             moves = (*(best[0].moves if best else ()), name, *models[0].moves)
             best, most = [replace(model, moves=moves) for model in models], evidence
             if is_sharing:
-                model = own[1].with_own_cameras(reduction(own[0]), best[0].reconstruction)
+                model = own[1].with_own_cameras(
+                    move(own[0], measured) or own[0], best[0].reconstruction
+                )
                 if own[1].evidence.of(model) > most + MIN_GAIN:
                     is_sharing, (graph, search) = False, own
                     first = replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))

@@ -139,7 +139,7 @@ def test_two_places_make_two_models_the_largest_first(two_places: Workspace, map
     assert report.status == "partial"
     assert report.unregistered == dict.fromkeys(small, "in another model, sparse/1")
     assert "models      2, of 3, 2 images" in report.summary()
-    assert report.to_mapping()["models"] == [large, small]
+    assert [*map(tuple, report.to_mapping()["models"])] == [large, small]
     folders = sorted(path for path in two_places.sparse.iterdir() if path.is_dir())
     assert [folder.name for folder in folders] == ["0", "1"]
     for folder, names in zip(folders, (large, small), strict=True):
