@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from mapping_tasks import WHOLE, task_with_given_cameras
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.mappers import adjustment
 from colmap_affrect.mappers.adjustment import (
     EXIF_SIGMA,
@@ -26,7 +29,8 @@ from colmap_affrect.mappers.adjustment import (
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence, pair_evidence
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
+from colmap_affrect.mappers.sparse import OWN_CAMERAS
 
 TRUE_FOCAL, SIZE, NUM_IMAGES = 1280.0, (1024, 768), 4
 NOISE_PX = 0.5
@@ -279,3 +283,45 @@ def test_a_token_stops_the_search(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         map_database(mapper_of(), task, tmp_path / "sparse", show)
     assert shown == [2]
+
+
+def two_places(path: Path) -> dict[int, CameraRecord]:
+    """A verified database of four photographs of one place, one enlarged, and two of another."""
+    parts = []
+    for seed, count in ((3, 4), (8, 2)):
+        parts.append(path.with_name(f"{count}.db"))
+        options = pycolmap.SyntheticDatasetOptions(
+            num_rigs=count, num_frames_per_rig=1, num_points3D=200
+        )
+        pycolmap.set_random_seed(seed)
+        with open_database(parts[-1]) as database:
+            truth = pycolmap.synthesize_dataset(options, database)
+            noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=NOISE_PX)
+            pycolmap.synthesize_noise(noise, truth, database)
+        with closing(sqlite3.connect(parts[-1])) as connection, connection:
+            connection.execute("UPDATE images SET name = ? || name", (f"{count}/",))
+    with open_database(path) as both:
+        with open_database(parts[0]) as one, open_database(parts[1]) as other:
+            pycolmap.Database.merge(one, other, both)
+        images, middle = both.read_all_images(), np.array(SIZE) / 2
+        enlarged = min(image.image_id for image in images if image.name.startswith("4/"))
+        keypoints = both.read_keypoints(enlarged)
+        keypoints[:, :2] = (keypoints[:, :2] - middle) * 1.7 + middle
+        both.update_keypoints(enlarged, keypoints)
+        both.clear_two_view_geometries()
+    verify(path, VerificationOptions())
+    return {i.camera_id: replace(UNKNOWN, names=(i.name,)) for i in images}
+
+
+def test_photographs_get_cameras_of_their_own_and_models_of_other_places_stay(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    task = MappingTask(path, None, cameras=two_places(path), may_share=True)
+    large, small = mapper_of().map(task, tmp_path, 0, lambda _: None)
+    assert (large.moves[-1], small.moves) == (OWN_CAMERAS, ("with all pairs",))
+    found = sorted(
+        camera.mean_focal_length() for camera in cameras_of(large.reconstruction).values()
+    )
+    assert found == pytest.approx([TRUE_FOCAL, TRUE_FOCAL, TRUE_FOCAL, 1.7 * TRUE_FOCAL], rel=0.03)
+    assert small.reconstruction.num_reg_images() == 2
