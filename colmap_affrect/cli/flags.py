@@ -123,8 +123,8 @@ FLAGS: dict[str, Settings] = {
     "--image-path@map": _path("PATH",
         "folder of its photographs, for the colours of the points (with --from-database)"),
     # comparison and evaluation
-    "--methods": _value("A,B,...", "sift-colmap (all as COLMAP does it by default), sift, "
-        "sift-affine-dsp (with our preset), recipes by name or path; "
+    "--methods": _value("A,B,...", "sift-colmap (all as COLMAP does it by default), sift "
+        "(with our preset), recipes by name or path; "
         "NAME=RECIPE:section.option=value changes options "
         f"(default: {','.join(DEFAULT_METHODS)})", nargs="+", default=DEFAULT_METHODS),
     "--seeds": _value("N,...", "seeds of verification and mapping, which run once for each "

@@ -147,7 +147,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "a folder of photographs in formats that COLMAP reads: JPEG 2000, WebP, HEIC, pages",
         "--image-path! --output-path@photographs!"),
     "inspect": (
-        "draw what a recipe does to one image: regions, warps, features; the plan as JSON",
+        "draw what a recipe does to one image: regions, warps, features",
         f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),
     "import-h5": ("features and matches in hloc's files into a new COLMAP database",
         "--image-path! --features-path! --matches-path! --database-path! "

@@ -21,7 +21,7 @@ from colmap_affrect.colmap.database import image_ids, open_database, unverified_
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.comparison import DEFAULT_METHODS
-from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP, SIFT_COLMAP, Method
+from colmap_affrect.comparison.methods import SIFT_COLMAP, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.errors import ComparisonError, StaleStoreError
@@ -159,14 +159,14 @@ class MethodRun:
 
     def _extract_sift(self) -> None:
         inputs = self.options.inputs(self.image_path)
-        names, affine = inputs.names(), self.method.label == SIFT_AFFINE_DSP
+        names = inputs.names()
         with self.progress.stage("extract", len(names), "images") as advance:
             failures = add_images(self.workspace, inputs, names)
             taken = [name for name in names if name not in failures]
             if not taken:
                 raise ComparisonError(f"COLMAP cannot use any of the {len(names)} images")
             images = self.image_path, taken, self.options.masks
-            self._keep(failures=failures | extract_sift(self.database, *images, affine=affine))
+            self._keep(failures=failures | extract_sift(self.database, *images))
             advance(len(names))
 
     def _match_sift(self) -> None:

@@ -11,11 +11,10 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.options import suggestion
 from colmap_affrect.recipes import Recipe, load_recipe, recipe_names
 
-SIFT_COLMAP, SIFT, SIFT_AFFINE_DSP = "sift-colmap", "sift", "sift-affine-dsp"
+SIFT_COLMAP, SIFT = "sift-colmap", "sift"
 SIFT_SUMMARIES = {
     SIFT_COLMAP: "SIFT, verification and mapping as COLMAP does them by default",
     SIFT: "COLMAP's SIFT with its default options",
-    SIFT_AFFINE_DSP: "COLMAP's SIFT with affine shapes and domain-size pooling",
 }
 
 
@@ -34,9 +33,7 @@ class Method:
     @property
     def options(self) -> dict[str, Any]:
         """Options of features and matching."""
-        if self.recipe is None:
-            return {"affine": self.label == SIFT_AFFINE_DSP}
-        return self.recipe.to_mapping()
+        return self.recipe.to_mapping() if self.recipe else {}
 
     @property
     def escalates(self) -> bool:
@@ -80,7 +77,7 @@ def parse_methods(
 
 
 def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
-    """Read ``sift-colmap``, ``sift``, ``sift-affine-dsp`` or ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
+    """Read ``sift-colmap``, ``sift`` or ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
 
     Commas inside of brackets belong to a value. The recipe is a name or the path of a TOML file;
     one that uses depth gets the ``depth_settings`` too. Raises OptionError for an unknown method or

@@ -17,20 +17,17 @@ def extract_sift(
     image_path: Path,
     image_names: Sequence[str],
     masks: MaskOptions,
-    *,
-    affine: bool,
 ) -> dict[str, str]:
     """Extract SIFT features of images of a database; those that have some are kept.
 
     Images and masks that claim more pixels than photographs have are passed over: COLMAP takes
-    memory for whatever a header claims. Options are COLMAP's defaults, if ``affine`` with affine
-    shapes and domain-size pooling. Returns the images without features, with the reason.
+    memory for whatever a header claims. Options are COLMAP's defaults. Returns the images without
+    features, with the reason.
     """
     photographs = Photographs(image_path, masks)
     impossible = {name: why for name in image_names if (why := photographs.why_impossible(name))}
     usable = [name for name in image_names if name not in impossible]
-    options, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
-    options.sift.estimate_affine_shape = options.sift.domain_size_pooling = affine
+    reader = pycolmap.ImageReaderOptions()
     if masks.path:
         reader.mask_path = Path(masks.path)
     if masks.camera_path:
@@ -41,7 +38,6 @@ def extract_sift(
             image_path,
             image_names=usable,
             reader_options=reader,
-            extraction_options=options,
         )
     ids = image_ids(database_path)
     with open_database(database_path) as database:

@@ -1,9 +1,8 @@
 """How many photographs of hard real scenes register, and register correctly.
 
-Runs ``colmap-affrect compare`` on subsets of the scenes: every method (COLMAP's SIFT, COLMAP's
-SIFT with affine shapes and domain-size pooling, recipes, with changed options as
-``[LABEL=]RECIPE[:KEY=VALUE[,...]]``) computes features and raw matches once, verification and
-mapping run once per seed. Usage:
+Runs ``colmap-affrect compare`` on subsets of the scenes: every method (COLMAP's SIFT, recipes,
+with changed options as ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``) computes features and raw matches
+once, verification and mapping run once per seed. Usage:
 
     python tests/benchmarks/registration.py --methods sift default --work-path out/cache \
         --output-path out/registration.json
@@ -157,7 +156,7 @@ def main() -> None:
     """Run all methods on all subsets."""
     root = Path(__file__).resolve().parents[2]
     parser = parser_of(__doc__)
-    parser.add_argument("--methods", nargs="+", default=["sift", "sift-affine-dsp", "default"])
+    parser.add_argument("--methods", nargs="+", default=["sift", "default"])
     parser.add_argument("--subsets", nargs="+", choices=SUBSETS, default=SUBSETS, metavar="NAME")
     parser.add_argument("--seeds", type=int, default=5, help="run the seeds 0 to SEEDS - 1")
     parser.add_argument("--scenes-path", type=Path, default=root.parent / "shared" / "scenes")

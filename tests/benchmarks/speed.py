@@ -23,7 +23,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
-from colmap_affrect.comparison.methods import SIFT, SIFT_AFFINE_DSP, Method, parse_method
+from colmap_affrect.comparison.methods import SIFT, Method, parse_method
 from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.pipeline import RunOptions, run
@@ -32,7 +32,7 @@ from colmap_affrect.stages.context import Resources
 
 Row = dict[str, float]
 
-DEFAULT_METHODS = [SIFT, SIFT_AFFINE_DSP, "unrectified-rootsift", "default"]
+DEFAULT_METHODS = [SIFT, "unrectified-rootsift", "default"]
 VERIFICATION = VerificationOptions(random_seed=0)
 HEADER = (
     "method", "extraction per image", "ratio", "matching per pair", "ratio", "features per image",
@@ -52,7 +52,7 @@ def run_commands(method: Method, paths: Sequence[Path], resources: Resources) ->
         folder = Path(scratch) / "out"
         folder.mkdir()
         if method.recipe is None:
-            row = run_sift(folder, image_path, names, affine=method.label == SIFT_AFFINE_DSP)
+            row = run_sift(folder, image_path, names)
         else:
             row = run_recipe(folder, image_path, names, method.recipe, resources)
         inliers = verified_pairs(folder / "database.db", VERIFICATION.min_num_inliers)
@@ -62,12 +62,12 @@ def run_commands(method: Method, paths: Sequence[Path], resources: Resources) ->
     return {**row, "images": len(names), "pairs": pairs, "inliers": sum(inliers.values())}
 
 
-def run_sift(folder: Path, image_path: Path, names: Sequence[str], *, affine: bool) -> Row:
+def run_sift(folder: Path, image_path: Path, names: Sequence[str]) -> Row:
     """Run COLMAP's SIFT up to verification; return seconds."""
     database_path = folder / "database.db"
     import_images(database_path, image_path, list(names), CameraOptions())
     times = [time.perf_counter()]
-    extract_sift(database_path, image_path, names, MaskOptions(), affine=affine)
+    extract_sift(database_path, image_path, names, MaskOptions())
     times.append(time.perf_counter())
     match_sift(database_path, None)
     times.append(time.perf_counter())
@@ -121,8 +121,7 @@ def main() -> None:
     parser.add_argument("--num-rounds", type=int, default=3)
     parser.add_argument(
         "--methods", nargs="+", default=DEFAULT_METHODS, metavar="METHOD",
-        help=f"{SIFT}, {SIFT_AFFINE_DSP} or [LABEL=]RECIPE[:KEY=VALUE[,...]]; the first is the "
-        "reference",
+        help=f"{SIFT} or [LABEL=]RECIPE[:KEY=VALUE[,...]]; the first is the reference",
     )  # fmt: skip
     parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
     parser.add_argument("--output-path", type=Path, required=True, help="JSON file")

@@ -67,7 +67,7 @@ def test_sift_looks_at_the_masks_and_matches_the_pairs_of_the_list(tmp_path):
     import_images(path, tmp_path / "images", names, CameraOptions())
     ids = image_ids(path)
     options = MaskOptions(path=str(tmp_path / "masks"))
-    assert extract_sift(path, tmp_path / "images", names, options, affine=False) == {}
+    assert extract_sift(path, tmp_path / "images", names, options) == {}
     with open_database(path) as database:
         for name in names:
             keypoints = database.read_keypoints(ids[name])
