@@ -19,6 +19,7 @@ from colmap_affrect.comparison.method_run import CompareOptions
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.errors import ComparisonError, ImageError, NoModelError, OptionError, such_as
 from colmap_affrect.evaluation import evaluate as evaluating
+from colmap_affrect.evaluation.runner import EvaluateOptions
 from colmap_affrect.evaluation.truths import ScoreOptions
 from colmap_affrect.features import weights as files
 from colmap_affrect.images.conversion import convert_images
@@ -149,7 +150,7 @@ def evaluate(options: argparse.Namespace) -> None:
         options.protocol,
         options.dataset_path,
         options.output_path,
-        evaluating.EvaluateOptions(
+        EvaluateOptions(
             recipes=parse_methods(options.recipes, given.depth_settings(options)),
             max_num_keypoints=options.max_num_keypoints,
             scores=ScoreOptions(random_seed=options.random_seed or 0),

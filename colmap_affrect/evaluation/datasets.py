@@ -27,7 +27,7 @@ from colmap_affrect.project.outputs import leads_outside
 
 logger = logging.getLogger(__name__)
 
-Names = tuple[str, str]  # of the images of a pair, without suffix
+Names = tuple[str, str]  # of the images of a pair
 Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 """Cameras and cam_from_world poses by the name of the image without suffix."""
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
@@ -37,27 +37,20 @@ ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
 
 
 @dataclass(frozen=True)
-class EvaluationImage:
-    """An image of a dataset; its name is the key of its features and depth map."""
-
-    name: str
-    path: Path
-    camera: pycolmap.Camera | None = None  # None where it is not known
-
-    @property
-    def intrinsics(self) -> Array | None:
-        """(3, 3) camera matrix in pixel-centre px, without distortion; None without a camera."""
-        return camera_matrix(self.camera) if self.camera else None
-
-
-@dataclass(frozen=True)
 class EvaluationPair:
     """Two images whose matches are scored."""
 
     name: str
-    images: tuple[EvaluationImage, EvaluationImage]
+    images: Names  # the keys of their features and depth maps
+    paths: tuple[Path, Path]
     truth: TrueHomography | TruePose | Correspondences
     category: str = ""  # of difficulty, as tables group pairs; empty for none
+
+    @property
+    def intrinsics(self) -> list[Array | None]:
+        """(3, 3) camera matrices in pixel-centre px, without distortion; None if not known."""
+        cameras = self.truth.cameras if isinstance(self.truth, TruePose) else (None, None)
+        return [camera_matrix(camera) if camera else None for camera in cameras]
 
 
 Pairs = list[EvaluationPair]
@@ -121,16 +114,16 @@ def _posed_pairs(
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.suffix.lower() in IMAGE_SUFFIXES and stem(name) in views:
-            images[stem(name)] = EvaluationImage(f"{scene}/{name}", path, views[stem(name)][0])
+            images[stem(name)] = f"{scene}/{name}", path
     for names in listed:
         if gone := [name for name in names if name not in images]:
             lacking.append(gone[0])
             continue
         (camera1, pose1), (camera2, pose2) = (views[name] for name in names)
         truth = TruePose((camera1, camera2), relative_pose(pose1, pose2))
-        both = images[names[0]], images[names[1]]
-        title = f"{both[0].name} {both[1].name}"
-        pairs[title] = EvaluationPair(title, both, truth, category(*names))
+        (key1, path1), (key2, path2) = (images[name] for name in names)
+        paths, title = (path1, path2), f"{key1} {key2}"
+        pairs[title] = EvaluationPair(title, (key1, key2), paths, truth, category(*names))
     if lacking:
         logger.warning(
             "%s: %d of %d listed pairs are left out, without an image or its camera: %s",
@@ -288,11 +281,9 @@ def _loaded(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Pairs:
 
 
 def _pair(entry: _Entry, folder: Path, offset_px: float) -> EvaluationPair:
-    truth, names = _truth(entry, folder, offset_px), (entry.image1, entry.image2)
-    cameras = truth.cameras if isinstance(truth, TruePose) else (None, None)
-    both = zip(names, cameras, strict=True)
-    first, second = (EvaluationImage(name, folder / name, camera) for name, camera in both)
-    return EvaluationPair(entry.name, (first, second), truth, entry.category)
+    images, paths = (entry.image1, entry.image2), (folder / entry.image1, folder / entry.image2)
+    truth = _truth(entry, folder, offset_px)
+    return EvaluationPair(entry.name, images, paths, truth, entry.category)
 
 
 def _truth(

@@ -1,26 +1,24 @@
 """Evaluate recipes on a dataset by a protocol: features, matches, scores, tables.
 
-``features/`` and ``pairs/`` (scores of pairs) are by recipe and a digest of what decides them: only
-what changed is made again.
+``features/`` are by recipe and a digest of what decides them: only what changed is made again.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 
-from colmap_affrect.comparison.methods import Method, parse_methods
+from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.errors import OptionError
 from colmap_affrect.evaluation import datasets, truths
 from colmap_affrect.evaluation.datasets import Pairs
 from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, published
-from colmap_affrect.evaluation.runner import RecipeRun
-from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
+from colmap_affrect.evaluation.runner import EvaluateOptions, RecipeRun
+from colmap_affrect.evaluation.truths import PairResult
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Resources
 
 PROTOCOLS: dict[str, Callable[[Path], Pairs]] = {
     "evd": datasets.load_evd,
@@ -29,16 +27,6 @@ PROTOCOLS: dict[str, Callable[[Path], Pairs]] = {
     "pairs": datasets.load_pairs,
 }
 """How datasets are read."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
-    """Everything an evaluation depends on beside protocol, dataset and output folder."""
-
-    recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")  # also by name
-    max_num_keypoints: int | None = None  # of each image the strongest are matched; None: all
-    scores: ScoreOptions = field(default_factory=ScoreOptions)
-    resources: Resources = field(default_factory=Resources)
 
 
 def evaluate(
@@ -52,8 +40,8 @@ def evaluate(
 ) -> Evaluation:
     """Score recipes on a dataset by one of ``PROTOCOLS``.
 
-    A pair with an image that cannot be used counts as failed. One that was stopped goes on, unless
-    ``overwrite`` discards features and scores of these recipes. Writes ``evaluation.json``, too.
+    A pair with an image that cannot be used counts as failed. Features that are there are used
+    again, unless ``overwrite`` discards those of these recipes. Writes ``evaluation.json``, too.
     AffrectError for what the caller can mend, before any image is worked on.
     """
     if protocol not in PROTOCOLS:
@@ -67,20 +55,17 @@ def evaluate(
     if not dataset_path.is_dir():
         raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
     Workspace(output_path).require_own(dataset_path)
-    settings = {
-        "scores": asdict(options.scores),
-        "max_num_keypoints": options.max_num_keypoints,
-    }
+    scores, budget = asdict(options.scores), options.max_num_keypoints
     inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
     with Workspace(output_path).locked():
         pairs = PROTOCOLS[protocol](dataset_path)
-        given = pairs, output_path, inputs, settings, options.resources
+        given = pairs, output_path, inputs, options
         runs = [RecipeRun(method, *given, overwrite=overwrite) for method in methods]
         results = {run.label: run.results(progress) for run in runs}
         evaluation = Evaluation(
             protocol=protocol,
             dataset_path=inputs["dataset_path"],
-            settings=settings,
+            settings={"scores": scores, "max_num_keypoints": budget},
             recipes=tuple(_summed(run, results[run.label]) for run in runs),
             published=published(protocol),
             versions=installed_versions(),

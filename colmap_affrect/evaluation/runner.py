@@ -1,4 +1,4 @@
-"""One recipe on the pairs of a dataset: features, matches and scores, kept for the next run.
+"""One recipe on the pairs of a dataset: features, kept for the next run, matches and scores.
 
 A pair is matched as a run of its two images alone would match it, with cameras unknown. Of levels
 of escalation the one with most inliers of COLMAP's verification counts.
@@ -6,23 +6,21 @@ of escalation the one with most inliers of COLMAP's verification counts.
 
 import logging
 import math
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
 from colmap_affrect.comparison.methods import Method
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.evaluation.datasets import EvaluationImage, EvaluationPair
+from colmap_affrect.evaluation.datasets import EvaluationPair
 from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
@@ -30,7 +28,6 @@ from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.options import digest_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress, Stopwatch
-from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.stages.context import Resources
@@ -39,8 +36,17 @@ from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)
 
-RESULT = TypeAdapter(PairResult)  # from and to JSON; infinite errors are null
 NOTHING = np.zeros((0, 2)), np.zeros((0, 2))  # points of a pair that could not be matched
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Everything an evaluation depends on beside protocol, dataset and output folder."""
+
+    recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")  # also by name
+    max_num_keypoints: int | None = None  # of each image the strongest are matched; None: all
+    scores: ScoreOptions = field(default_factory=ScoreOptions)
+    resources: Resources = field(default_factory=Resources)
 
 
 class _StrongestFeatures(FeatureStore):
@@ -65,33 +71,28 @@ class RecipeRun:
         pairs: Sequence[EvaluationPair],
         output_path: Path,
         inputs: Mapping[str, Any],
-        settings: Mapping[str, Any],
-        resources: Resources,
+        options: EvaluateOptions,
         *,
         overwrite: bool,
     ) -> None:
         """Find everything that the recipe needs before any image is worked on.
 
-        Features depend on recipe and ``inputs``, scores on ``settings`` too.
+        Features depend on recipe and ``inputs``.
         """
         if method.recipe is None:
             raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
         self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
-        self._options = ScoreOptions(**settings["scores"])
+        self._options, resources = options.scores, options.resources
         extraction, matching = self.recipe.extraction, self.recipe.matching
-        images = {image.name for pair in pairs for image in pair.images}
+        images = {name for pair in pairs for name in pair.images}
         self._extractor = prepare(extraction, resources, sorted(images))
         if overwrite:
-            names = [f"*/{method.folder_name}-????????{end}" for end in ("", ".h5")]
-            remove_own(path for name in names for path in output_path.glob(name))
+            remove_own(output_path.glob(f"features/{method.folder_name}-????????.h5"))
         made = digest_of([inputs, extraction.to_mapping(), digests(self._extractor.weights)])
-        scored = digest_of([made, matching.to_mapping(), settings])
-        self._scores = output_path / "pairs" / f"{method.folder_name}-{scored[:8]}"
         features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
-        for folder in (features.parent, self._scores):
-            folder.mkdir(parents=True, exist_ok=True)
+        features.parent.mkdir(parents=True, exist_ok=True)
         self._store = _StrongestFeatures(features)
-        self._store.budget = settings["max_num_keypoints"]
+        self._store.budget = options.max_num_keypoints
         self._matchings = []
         for level, chosen in enumerate(extraction.levels):
             of, kind = chosen.matching or matching, chosen.features.kind
@@ -101,20 +102,14 @@ class RecipeRun:
         self._lock = Lock()  # of extraction and of the store
 
     def results(self, progress: Progress) -> list[PairResult]:
-        """Match and score all pairs that have not been; what fails is tried again next time."""
-        with np.printoptions(floatmode="unique", threshold=sys.maxsize):  # all numbers, in words
-            keys = {p.name: digest_of([p.name, repr(p.truth)]) for p in self._pairs}
-        paths = {name: self._scores / f"{key}.json" for name, key in keys.items()}
-        done = {n: RESULT.validate_json(p.read_bytes()) for n, p in paths.items() if p.exists()}
-        todo = [pair for pair in self._pairs if pair.name not in done]
-        with progress.stage(self.label, len(todo), "pairs") as advance:
+        """Match and score all pairs; images whose features are there are not read again."""
+        results = []
+        with progress.stage(self.label, len(self._pairs), "pairs") as advance:
             work = partial(self._result, [CachedMatcher(task) for task in self._matchings])
-            for result in map_ordered(work, todo, available_cores()):
-                if not result.failure:
-                    replace_bytes(paths[result.name], RESULT.dump_json(result))
-                done[result.name] = result
+            for result in map_ordered(work, self._pairs, available_cores()):
+                results.append(result)
                 advance(1)
-        return [done[pair.name] for pair in self._pairs]
+        return results
 
     def _result(self, matchers: Sequence[CachedMatcher], pair: EvaluationPair) -> PairResult:
         """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
@@ -145,10 +140,9 @@ class RecipeRun:
         best, points, most = None, NOTHING, 0
         for level, matcher in enumerate(matchers):
             with self._lock, watch.step("extract"):
-                usable = [self._extract(image, level) for image in pair.images]
-                if not all(usable):
+                if not self._extract(pair, level):
                     break
-                first, second = (matcher.prepared(image.name) for image in pair.images)
+                first, second = map(matcher.prepared, pair.images)
             with watch.step("match"):
                 rows1, rows2 = matcher.match(first, second).indices.T
                 frames = first.frames[rows1], second.frames[rows2]
@@ -169,18 +163,23 @@ class RecipeRun:
                 )
             if most >= max(1, self.recipe.escalate.strong_num_inliers):
                 break
-        failures = (self.failures.get(image.name, "") for image in pair.images)
+        failures = (self.failures.get(name, "") for name in pair.images)
         return best or self._failed(pair, "; ".join(filter(None, failures))), points
 
-    def _extract(self, image: EvaluationImage, level: int) -> bool:
-        """Extract what an image lacks up to a level; tell whether it can be used."""
-        name, store = image.name, self._store
+    def _extract(self, pair: EvaluationPair, level: int) -> bool:
+        """Extract what the images lack up to a level; tell whether both can be used."""
+        images = zip(pair.images, pair.paths, pair.intrinsics, strict=True)
+        usable = [self._extract_image(*image, level) for image in images]
+        return all(usable)
+
+    def _extract_image(self, name: str, path: Path, intrinsics: Array | None, level: int) -> bool:
+        store = self._store
         num_levels = len(store.level_ends(name)) if name in store.names() else 0
         for missing in range(num_levels, level + 1):
             if name in self.failures:
                 return False
             try:
-                found = self._extractor.extract_file(image.path, name, image.intrinsics, missing)
+                found = self._extractor.extract_file(path, name, intrinsics, missing)
             except AffrectError as error:
                 logger.warning("%s", error)
                 self.failures[name] = str(error)
@@ -196,7 +195,7 @@ class RecipeRun:
     def _verified_inliers(self, pair: EvaluationPair, frames: Sequence[Floats], level: int) -> int:
         """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it."""
         with self._lock:
-            sizes = [self._store.image_size(image.name) for image in pair.images]
+            sizes = [self._store.image_size(name) for name in pair.images]
         # What COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus.
         # The id matters: two images of one camera are verified in another way.
         model, make = "SIMPLE_RADIAL", pycolmap.Camera.create_from_model_name

@@ -107,20 +107,13 @@ def test_files_and_tables_say_the_same(done: Done) -> None:
     assert line.split()[-7:] == ["0", "2", "5", "8", "9", "10", "185.47"]
 
 
-def test_stopped_work_goes_on(dataset: Path, copied: Path, done: Done, calls: Calls) -> None:
-    assert run(dataset, copied).to_json() == done[1].to_json()
-    assert (calls["extract_file"], calls["score"]) == (0, 0)
-    next(copied.glob(f"pairs/{PLAIN}-*/*.json")).unlink()
-    again = run(dataset, copied)
-    assert (calls["extract_file"], calls["score"]) == (0, 1)
-    assert [errors(recipe) for recipe in again.recipes] == [errors(r) for r in done[1].recipes]
-
-
-def test_a_changed_truth_is_scored_again(changed: Path, tmp_path: Path, calls: Calls) -> None:
-    for truth in (TRUTH, TRUTH * (1 + 1e-15), np.diag([1, 1, 0.5]) @ TRUTH):
+def test_features_are_kept_and_truths_read_again(
+    changed: Path, tmp_path: Path, calls: Calls
+) -> None:
+    for truth in (TRUTH, np.diag([1, 1, 0.5]) @ TRUTH):
         np.savetxt(changed / "h" / "dance.txt", truth)
         (recipe,) = run(changed, tmp_path / "out", RECIPES[:1]).recipes
-    assert (calls["extract_file"], calls["score"]) == (6, 5)
+    assert calls["extract_file"] == 6
     cafe, dance, _ = errors(recipe)
     assert dance > 20.0 > cafe
 
