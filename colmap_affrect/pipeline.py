@@ -1,8 +1,6 @@
 """From a folder of photographs to a COLMAP model: the stages one after the other."""
 
-import json
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +9,7 @@ from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.errors import DAMAGE, ImageError, MappingError
+from colmap_affrect.errors import ImageError, MappingError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
@@ -27,8 +25,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.run_page import write_run_page
 from colmap_affrect.stages.context import Context, Resources
-from colmap_affrect.stages.copy import copy_verified
-from colmap_affrect.stages.escalate import escalate, pair_levels
+from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_descriptors
 from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.inputs import Inputs
@@ -37,13 +34,12 @@ from colmap_affrect.stages.map import (
     contradicting_pairs,
     image_names,
     map_images,
-    num_verified_inliers,
     unregistered,
 )
 from colmap_affrect.stages.match import load_matchers, match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed_pairs
-from colmap_affrect.stages.verify import verify_matches
+from colmap_affrect.stages.verify import copy_verified, num_verified_inliers, verify_matches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,11 +182,11 @@ def map_and_report(
     _require_photographs(context)
     if extend and overwrite:
         extend.refuse_discarding(workspace.path)
-    before = existing_names(extend.model_path, image_names(workspace)) if extend else []
+    before = existing_names(extend.model_path, image_names(context)) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
-    names, copied = image_names(workspace), workspace.is_foreign
-    verification = context.verification
-    missing, pair_inliers = unregistered(context, names, models), num_verified_inliers(workspace)
+    names, copied = image_names(context), workspace.is_foreign
+    pair_inliers = num_verified_inliers(context)
+    missing = unregistered(context, names, models, pair_inliers)
     cameras = read_camera_records(workspace.cameras)
     result = ReconstructionReport(
         images_total=len(names),
@@ -202,9 +198,8 @@ def map_and_report(
         recipe="" if copied else workspace.recipe(),
         versions=installed_versions(),
         preset=options.preset_name,
-        verification=verification.to_mapping(),
+        verification=context.verification.to_mapping(),
         mapping=options.to_mapping(),
-        pair_levels={} if copied else pair_levels(context),
         contradicting_pairs={} if copied else contradicting_pairs(context),
         guided={} if copied else guided_counts(context),
         cameras=tuple(
@@ -214,24 +209,12 @@ def map_and_report(
         extended=tuple(before),
         advice=advice(context, missing, models),
     )
-    text = result.to_json()
-    keeps_page = page and workspace.page.exists() and _says_the_same(workspace.report, text)
-    if not keeps_page:
-        workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
-    replace_text(workspace.report, text)
-    if page and not keeps_page:
+    workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
+    replace_text(workspace.report, result.to_json())
+    if page:
         image_path = workspace.photographs()
         write_run_page(workspace, result, names, pair_inliers, image_path, context.progress)
     return result
-
-
-def _says_the_same(path: Path, report: str) -> bool:
-    """Tell whether a run had nothing to do and a report of before differs only in its stages."""
-    with suppress(*DAMAGE):
-        known, new = json.loads(path.read_text(encoding="utf-8")), json.loads(report)
-        done = [stage["num_done"] for stage in new["stages"] if stage["name"] != "pairs"]
-        return not any(done) and {**known, "stages": ()} == {**new, "stages": ()}
-    return False
 
 
 def _require_photographs(context: Context) -> None:

@@ -62,13 +62,6 @@ def by_story(stories: Mapping[str, str]) -> list[str]:
     return [f"{such_as(same, MAX_LINES)}: {story}" for story, same in names.items()]
 
 
-def by_level(level: str, count: int) -> str:
-    """Say how many pairs a level of a recipe decided, by the name of its rectifier."""
-    if level in ("identity", "none"):
-        return f"{count} {'without warps' if level == 'identity' else 'not verified'}"
-    return f"{count} with warps ({level})"
-
-
 @dataclass(frozen=True)
 class StageReport:
     """One stage of a run.
@@ -185,9 +178,8 @@ class ReconstructionReport:
         preset: of mapping: ``sparse``, ``colmap`` or ``custom``.
         verification: options of two-view geometry.
         mapping: the mapper and its options.
-        pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
-            and ``none``; empty for other recipes.
-        contradicting_pairs: of these the verified ones that do not fit the largest model.
+        contradicting_pairs: verified pairs that do not fit the largest model, by the level of an
+            escalating recipe that decided them; empty for other recipes.
         extended: names of the images of the model that was extended; empty where none was.
         advice: what to try for the images that are missing.
         guided: ``pairs`` that guided matching gave more inliers, and these inliers
@@ -206,7 +198,6 @@ class ReconstructionReport:
     preset: str
     verification: dict[str, Any]
     mapping: dict[str, Any]
-    pair_levels: dict[str, int] = field(default_factory=dict)
     contradicting_pairs: dict[str, int] = field(default_factory=dict)
     extended: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
@@ -293,12 +284,9 @@ class ReconstructionReport:
             lines += [f"            new {name}" for name in self.added]
         lines += _some(f"        not {line}" for line in by_story(self.unregistered))
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
-        decided = {level: count for level, count in self.pair_levels.items() if count}
-        if counts := [by_level(*item) for item in decided.items() if item[0] != "none"]:
-            lines += [f"            {', '.join(counts)}"]
         if self.contradicting_pairs:
-            counts = [by_level(*item) for item in self.contradicting_pairs.items()]
-            lines += [f"            the model contradicts {', '.join(counts)}"]
+            total = sum(self.contradicting_pairs.values())
+            lines += [f"            the model contradicts {total} of the verified ones"]
         if self.guided:
             before, after = self.guided["matches_before"], self.guided["matches_after"]
             pairs = f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import PairVerifier, connected_parts, verified_pairs
+from colmap_affrect.colmap.verification import PairVerifier, connected_parts
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches
@@ -53,7 +53,7 @@ from colmap_affrect.stages.guide import restore_exact
 from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, matched_at_level
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.pairs import listed_pairs
-from colmap_affrect.stages.verify import verified_inliers, verify_new
+from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers, verify_new
 
 MIN_SHARE_KEPT = 0.9
 """Of the inliers of measured frames in one geometry with others. Right ones keep 95 per cent and
@@ -96,23 +96,6 @@ def escalate(
         escalated |= set(todo)
     escalation.write()
     return StageReport("escalate", time.perf_counter() - start, len(escalated))
-
-
-def pair_levels(context: Context) -> dict[str, int]:
-    """Return how many pairs each level of a recipe with escalation decided, and how many none.
-
-    Keys are the names of the levels, in order, and ``none``; empty without escalation.
-    """
-    extraction = context.extraction
-    if not extraction.escalation:
-        return {}
-    names = [level.name for level in extraction.levels]
-    escalation = Escalation(context, EscalateOptions())
-    num_inliers, levels = escalation.num_inliers(), context.matches.levels(escalation.pairs)
-    counts = dict.fromkeys([*names, "none"], 0)
-    for pair in escalation.pairs:
-        counts[names[levels[pair]] if num_inliers.get(pair) else "none"] += 1
-    return counts
 
 
 def measured_inliers(context: Context) -> dict[Pair, Indices]:
@@ -168,13 +151,12 @@ class Escalation:
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of each pair that is in the database, 0 where it is not verified."""
         ids = colmap_database.image_ids(self.path)
-        verified = verified_pairs(self.path, self.verification.min_num_inliers)
-        counts = {}
-        for first, second in self.pairs:
-            if first in ids and second in ids:
-                low, high = sorted((ids[first], ids[second]))
-                counts[first, second] = verified.get((low, high), 0)
-        return counts
+        verified = num_verified_inliers(self.context)
+        return {
+            (first, second): verified.get((first, second)) or verified.get((second, first), 0)
+            for first, second in self.pairs
+            if first in ids and second in ids
+        }
 
     def graph(self) -> EscalationGraph:
         """Return the pairs as the database has them; tracks count where there are three images."""

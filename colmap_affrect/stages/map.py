@@ -9,10 +9,8 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.tables import rows_digest
-from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
-from colmap_affrect.features.weights import install_hint
-from colmap_affrect.features.weights import missing as missing_weights
+from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.mapping import map_database, read_models
@@ -22,7 +20,6 @@ from colmap_affrect.mappers.summaries import refuse_edited
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import measured_inliers
 from colmap_affrect.stages.guide import inliers_by_guiding
@@ -31,7 +28,6 @@ from colmap_affrect.stages.pairs import listed_pairs
 logger = logging.getLogger(__name__)
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
-STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"  # advised; one needs weights
 
 TOO_FEW = "more photographs: two that can be read and show the same from two places make a model"
 """Advised where nothing else would help."""
@@ -75,15 +71,15 @@ def map_images(
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
-    warnings = {}
     workspace.record_made_from(map=inputs)
+    warnings = {}
     if extend and existing and existing.num_other_keypoints:
-        warnings[str(extend.model_path)] = (
+        warning = (
             f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "
             "not those of the database: poses and cameras kept, points triangulated anew"
         )
-    for where, what in warnings.items():
-        logger.warning("%s: %s", where, what)
+        warnings[str(extend.model_path)] = warning
+        logger.warning("%s: %s", extend.model_path, warning)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models), warnings=warnings), models
 
@@ -112,34 +108,27 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
     return f"{geometry} {'own' if own else extend.digest()}"
 
 
-def image_names(workspace: Workspace) -> list[str]:
+def image_names(context: Context) -> list[str]:
     """Return the names of the images of a run, or of the database that was copied."""
-    if workspace.is_foreign:
-        return sorted(colmap_database.image_ids(workspace.database))
-    return Context(workspace).inputs.names()
-
-
-def num_verified_inliers(workspace: Workspace) -> dict[Pair, int]:
-    """Return the number of inliers of each verified pair, by the names of its images."""
-    ids = colmap_database.image_ids(workspace.database)
-    names = {image_id: name for name, image_id in ids.items()}
-    pairs = verified_pairs(workspace.database, _min_num_inliers(workspace))
-    return {(names[first], names[second]): count for (first, second), count in pairs.items()}
-
-
-def _min_num_inliers(workspace: Workspace) -> int:
-    """Return how many inliers a verified pair has; another program had its own threshold."""
-    return 1 if workspace.is_foreign else Context(workspace).verification.min_num_inliers
+    if context.workspace.is_foreign:
+        return sorted(colmap_database.image_ids(context.workspace.database))
+    return context.inputs.names()
 
 
 def unregistered(
-    context: Context, names: Sequence[str], models: Sequence[ModelSummary]
+    context: Context,
+    names: Sequence[str],
+    models: Sequence[ModelSummary],
+    pair_inliers: Mapping[Pair, int],
 ) -> dict[str, str]:
-    """Tell for each image outside the largest model why it is not in it."""
-    workspace = context.workspace
-    num_keypoints = colmap_database.keypoint_counts(workspace.database)
-    ids = colmap_database.image_ids(workspace.database)
-    verified = _verified_by_name(workspace)
+    """Tell for each image outside the largest model why it is not in it.
+
+    ``pair_inliers`` are the numbers of inliers of the verified pairs.
+    """
+    num_keypoints = colmap_database.keypoint_counts(context.workspace.database)
+    partners: defaultdict[str, dict[str, int]] = defaultdict(dict)
+    for (first, second), count in pair_inliers.items():
+        partners[first][second] = partners[second][first] = count
     elsewhere = {
         name: f"in another model, sparse/{index}"
         for index, model in reversed(list(enumerate(models)))
@@ -151,26 +140,18 @@ def unregistered(
     for name in [name for name in names if name not in registered]:
         if name in elsewhere:
             reasons[name] = elsewhere[name]
-        elif name not in num_keypoints or name not in ids:
+        elif name not in num_keypoints:
             reasons[name] = "unreadable"
         elif not num_keypoints[name]:
             reasons[name] = "no features"
-        elif name not in verified:
+        elif name not in partners:
             reasons[name] = "no verified pair"
         else:
-            best = sorted(verified[name].items(), key=lambda item: -item[1])[:NUM_BEST_PAIRS]
+            best = sorted(partners[name].items(), key=lambda item: -item[1])[:NUM_BEST_PAIRS]
             pairs = ", ".join(f"{other} ({count} inliers)" for other, count in best)
             why = f"taken out, {taken_out[name]}" if name in taken_out else "not registered"
             reasons[name] = f"{why}; verified with {pairs}"
     return reasons
-
-
-def _verified_by_name(workspace: Workspace) -> Mapping[str, dict[str, int]]:
-    """Return for each image of a verified pair its partners, and how many inliers they share."""
-    found: defaultdict[str, dict[str, int]] = defaultdict(dict)
-    for (first, second), count in num_verified_inliers(workspace).items():
-        found[first][second] = found[second][first] = count
-    return found
 
 
 def advice(
@@ -179,68 +160,50 @@ def advice(
     """Say what may help when images are missing or the largest model is doubtful, best first."""
     against = [models[0].doubtful, models[0].taken_out] if models else []
     doubts = "; ".join(why for reasons in against for why in reasons.values())
-    if not missing and not doubts:
-        return ()
     workspace = context.workspace
     num_keypoints = colmap_database.keypoint_counts(workspace.database)
-    if sum(map(bool, num_keypoints.values())) < 2:
+    if (missing or doubts) and sum(map(bool, num_keypoints.values())) < 2:
         return (TOO_FEW,)
     missing = [name for name in missing if name in num_keypoints]  # nothing helps unreadable ones
-    if not missing and not doubts:
+    if not (missing or doubts):
         return ()
-    recipes = [] if workspace.is_foreign else _other_recipes(context)
+    is_foreign = workspace.is_foreign
+    recipes = [] if is_foreign else _other_recipes(workspace.recipe())
     texts = []
     if FOCAL_CONTRADICTED in doubts:
         texts.append("run again without the given focal lengths, or with others: they do not fit")
     if missing:
         texts += recipes
-    has_cameras = workspace.is_foreign or Context(workspace).inputs.from_database
-    if FOCAL_UNKNOWN in doubts and not has_cameras:
+    if FOCAL_UNKNOWN in doubts and not (is_foreign or context.inputs.from_database):
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
             "several focal lengths fit"
         )
-    if workspace.is_foreign:
+    if is_foreign:
         texts.append("run --from-database, with --image-path, makes new features for its images")
-    else:
-        masks = Context(workspace).inputs.masks
-        if not (masks.path or masks.camera_path):
-            texts.append(
-                "run again with --mask-path, if things move, repeat or are written on the "
-                "photographs"
-            )
-    if doubts and not missing:
-        texts += recipes
+    elif context.inputs.masks == MaskOptions():
+        texts.append(
+            "run again with --mask-path, if things move, repeat or are written on the photographs"
+        )
     if missing:
-        texts.append(f"more photographs {_missing_places(workspace, missing)}")
+        texts.append("more photographs that show the missing places")
+    else:
+        texts += recipes
     return tuple(texts)
 
 
-def _other_recipes(context: Context) -> list[str]:
-    recipe, texts = context.workspace.recipe(), []
-    if recipe not in (STRONGER_RECIPE, LEARNED_RECIPE):
+def _other_recipes(recipe: str) -> list[str]:
+    """Return what to try in the place of a recipe; the second needs weights."""
+    stronger, learned = "on-demand", "on-demand-learned"
+    texts = []
+    if recipe not in (stronger, learned):
         texts.append(
-            f"run again with --recipe {STRONGER_RECIPE}, which tries more warps where photographs "
+            f"run again with --recipe {stronger}, which tries more warps where photographs "
             "are missing or weakly connected"
         )
-    if recipe != LEARNED_RECIPE:
-        weights = load_recipe(LEARNED_RECIPE).weights
-        gone = missing_weights(weights, context.resources.weights_path)
-        get = f"{install_hint(gone)}colmap-affrect weights fetch {' '.join(weights)}"
-        first = f" (first: {get})" if gone else ""
-        texts.append(f"run again with --recipe {LEARNED_RECIPE}, if light or age differ{first}")
+    if recipe != learned:
+        texts.append(f"run again with --recipe {learned}, if light or age differ")
     return texts
-
-
-def _missing_places(workspace: Workspace, missing: Collection[str]) -> str:
-    """Name what lies beside missing images: the best partners that they have in the model."""
-    verified = _verified_by_name(workspace)
-    between = [
-        f"between {name} and {max(inside, key=lambda other: partners[other])}"
-        for name, partners in verified.items()
-        if name in missing and (inside := partners.keys() - set(missing))
-    ][:NUM_BEST_PAIRS]
-    return ", ".join(between) or "that show the missing places"
 
 
 def contradicting_pairs(context: Context) -> dict[str, int]:

@@ -21,10 +21,9 @@ from colmap_affrect.project.contents import stamp_of
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.verify import verify_matches
+from colmap_affrect.stages.verify import copy_verified, verify_matches
 
 logger = logging.getLogger(__name__)
 

@@ -109,7 +109,8 @@ def same_state(first: Workspace, second: Workspace) -> None:
         one, other = (FeatureStore(item.features).read(name) for item in (first, second))
         assert_array_equal(one.lafs, other.lafs)
         assert_array_equal(one.rectification_ids, other.rectification_ids)
-    assert escalation.pair_levels(Context(first)) == escalation.pair_levels(Context(second))
+    levels = [MatchStore(item.matches).levels([EASY, HARD]) for item in (first, second)]
+    assert levels[0] == levels[1]
 
 
 def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path, call: Call) -> None:
@@ -328,13 +329,6 @@ def test_features_of_levels_follow_one_another(
             assert database.num_keypoints_for_image(ids[name]) == len(store.read(name))
 
 
-def test_count_of_pairs_by_level_adds_up(escalated: tuple[Workspace, StageReport]) -> None:
-    counts = escalation.pair_levels(Context(escalated[0]))
-    assert list(counts) == ["identity", "dense-shapes", "affnet-shapes", "asift", "none"]
-    assert sum(counts.values()) == 3
-    assert counts["none"] <= 1
-
-
 def test_again_does_nothing(
     escalated: tuple[Workspace, StageReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -415,5 +409,4 @@ def test_photographs_without_a_feature_escalate_nowhere(tmp_path: Path) -> None:
 def test_recipe_without_levels_has_nothing_to_escalate(plain: Workspace, tmp_path: Path) -> None:
     workspace = copy(plain, tmp_path / "plain")
     assert escalate(workspace).num_done == 0
-    assert escalation.pair_levels(Context(workspace)) == {}
     assert_array_equal(geometry(workspace, EASY), geometry(plain, EASY))

