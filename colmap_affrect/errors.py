@@ -50,16 +50,8 @@ class ImageError(AffrectError):
     """An image cannot be read or used."""
 
 
-class PairListError(AffrectError):
-    """A pair list is unreadable or names images that are not there."""
-
-
 class StoreError(AffrectError):
     """A file of features or matches is foreign, incomplete, or of another format version."""
-
-
-class StaleStoreError(StoreError):
-    """Results of other options or inputs are in the way of the ones asked for."""
 
 
 class DatabaseError(AffrectError):
@@ -70,32 +62,8 @@ class WorkspaceError(AffrectError):
     """The output folder cannot be used: not writable, or in use by another run."""
 
 
-class MappingError(AffrectError):
-    """COLMAP's mapper ended with an error."""
-
-
 class DepthError(AffrectError):
     """The depth map of a photograph is missing or cannot be used."""
-
-
-class WeightsError(AffrectError):
-    """The weights of a network are missing, damaged, or those of another network."""
-
-
-class DeviceError(AffrectError):
-    """The device asked for is not there."""
-
-
-class ClusterError(AffrectError):
-    """The cluster is not there, has no workers, or ones that would give other results."""
-
-
-class ComparisonError(AffrectError):
-    """Methods cannot be compared as asked."""
-
-
-class EvaluationError(AffrectError):
-    """A dataset cannot be evaluated as asked."""
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.errors import ImageError, MappingError
+from colmap_affrect.errors import ImageError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
@@ -160,7 +160,7 @@ def map_from_database(
     if extend:
         if overwrite:
             extend.refuse_discarding(output_path)
-        read_given_model(extend.model_path, "--extend ", MappingError)
+        read_given_model(extend.model_path, "--extend ")
     context = Context(Workspace(output_path), progress=progress)
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()

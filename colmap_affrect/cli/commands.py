@@ -17,7 +17,7 @@ from colmap_affrect.comparison import compare as comparing
 from colmap_affrect.comparison import tables
 from colmap_affrect.comparison.method_run import CompareOptions
 from colmap_affrect.comparison.methods import parse_methods
-from colmap_affrect.errors import ComparisonError, ImageError, NoModelError, OptionError, such_as
+from colmap_affrect.errors import AffrectError, ImageError, NoModelError, OptionError, such_as
 from colmap_affrect.evaluation import evaluate as evaluating
 from colmap_affrect.evaluation.runner import EvaluateOptions
 from colmap_affrect.evaluation.truths import ScoreOptions
@@ -139,7 +139,7 @@ def compare(options: argparse.Namespace) -> None:
     failed = [method.name for method in comparison.methods if method.failed]
     if failed:
         where = options.output_path / "comparison.json"
-        raise ComparisonError(f"failed: {', '.join(failed)}; {where} says why")
+        raise AffrectError(f"failed: {', '.join(failed)}; {where} says why")
     if not any(seed.models for method in comparison.methods for seed in method.seeds):
         raise NoModelError("no method found a model")
     _refuse_failures((name for method in comparison.methods for name in method.failures), options)

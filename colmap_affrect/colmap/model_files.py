@@ -21,7 +21,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import (
     DAMAGE,
     AffrectError,
-    ComparisonError,
     OptionError,
     StoreError,
     damage,
@@ -196,10 +195,8 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
         raise cannot_write(folder, error) from error
 
 
-def read_given_model(
-    folder: Path, option: str = "", error_class: type[AffrectError] = OptionError
-) -> pycolmap.Reconstruction:
-    """Read a model, text or binary; an error names the option it came by.
+def read_given_model(folder: Path, option: str = "") -> pycolmap.Reconstruction:
+    """Read a model, text or binary; OptionError names the option it came by.
 
     Raises StoreError if it is damaged, or of ours and not as it was written.
     """
@@ -220,7 +217,7 @@ def read_given_model(
         if lacks_memory(error):
             raise
         why = f"not a COLMAP model; {wanted} ({reason(error)})"
-        raise error_class(f"{option}{folder}: {why}") from error
+        raise OptionError(f"{option}{folder}: {why}") from error
 
 
 def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
@@ -238,10 +235,10 @@ def seen_points(image: pycolmap.Image) -> Indices:
 
 
 def read_poses(model_path: Path) -> Poses:
-    """Read the poses of a COLMAP model, text or binary; ComparisonError when it has none."""
-    poses = model_poses(read_given_model(model_path, error_class=ComparisonError))
+    """Read the poses of a COLMAP model, text or binary; AffrectError when it has none."""
+    poses = model_poses(read_given_model(model_path))
     if not poses:
-        raise ComparisonError(f"{model_path}: the model has no images with poses")
+        raise AffrectError(f"{model_path}: the model has no images with poses")
     return poses
 
 

@@ -17,7 +17,7 @@ from colmap_affrect.comparison.pose_scores import pose_scores
 from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.tables import to_json
 from colmap_affrect.comparison.worker import run_alone
-from colmap_affrect.errors import ComparisonError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import digest_of
@@ -96,7 +96,7 @@ def _checked(image_path: Path, options: CompareOptions) -> tuple[Inputs, list[st
     inputs.check()
     names = inputs.names()
     if len(names) < 2:
-        raise ComparisonError(
+        raise AffrectError(
             f"{image_path}: only {names[0] if names else 'no image'} to use; a comparison "
             "needs at least two images"
         )
@@ -138,7 +138,7 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
         return None
     truth = read_poses(path)
     if not truth.keys() & set(names):
-        raise ComparisonError(
+        raise AffrectError(
             f"{path}: shares no image name with the photographs (it has {min(truth)}, they have "
             f"{min(names)}); rename the images of one of them"
         )

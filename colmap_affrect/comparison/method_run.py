@@ -24,7 +24,7 @@ from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.comparison.sift import extract_sift, match_sift
-from colmap_affrect.errors import ComparisonError, StaleStoreError
+from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.pairs.base import Pair, PairList
@@ -112,7 +112,7 @@ class MethodRun:
         return self.result if seeds == list(self.options.seeds) else None
 
     def begin(self, *, overwrite: bool) -> None:
-        """Make the folder; StaleStoreError where the method was run there on something else."""
+        """Make the folder; StoreError where the method was run there on something else."""
         folder, record = self.workspace.path, self.workspace.path / "inputs.json"
         if overwrite:
             remove_own([folder])
@@ -122,7 +122,7 @@ class MethodRun:
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
         known = json.loads(record.read_bytes()) if record.exists() else {}
         if folder.exists() and (difference := first_difference(known, asked)):
-            raise StaleStoreError(
+            raise StoreError(
                 f"{folder}: {self.method.label} was run there with {difference}; use "
                 "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
                 "or another --output-path"
@@ -164,7 +164,7 @@ class MethodRun:
             failures = add_images(self.workspace, inputs, names)
             taken = [name for name in names if name not in failures]
             if not taken:
-                raise ComparisonError(f"COLMAP cannot use any of the {len(names)} images")
+                raise AffrectError(f"COLMAP cannot use any of the {len(names)} images")
             images = self.image_path, taken, self.options.masks
             self._keep(failures=failures | extract_sift(self.database, *images))
             advance(len(names))

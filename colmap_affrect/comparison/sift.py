@@ -5,7 +5,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.errors import ComparisonError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
@@ -48,14 +48,14 @@ def extract_sift(
 def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
     """Match pairs of images, or all, by COLMAP's defaults, without verification.
 
-    ComparisonError for listed names with spaces, which COLMAP's lists of pairs cannot hold.
+    AffrectError for listed names with spaces, which COLMAP's lists of pairs cannot hold.
     """
     options = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True)
     if pairs is None:
         pycolmap.match_exhaustive(database_path, matching_options=options)
         return
     if spaced := [name for pair in pairs for name in pair if " " in name]:
-        raise ComparisonError(f"{spaced[0]}: COLMAP matches no listed names with spaces; rename it")
+        raise AffrectError(f"{spaced[0]}: COLMAP matches no listed names with spaces; rename it")
     with temporary_folder(database_path.parent) as folder:
         list_path = folder / "pairs.txt"
         replace_text(list_path, "".join(f"{first} {second}\n" for first, second in pairs))

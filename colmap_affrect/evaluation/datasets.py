@@ -16,7 +16,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import camera_matrix
 from colmap_affrect.colmap.model_files import Pose, relative_pose
-from colmap_affrect.errors import EvaluationError, OptionError, damage, such_as
+from colmap_affrect.errors import AffrectError, OptionError, damage, such_as
 from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import colmap_from_pixel, pixel_from_colmap
@@ -67,7 +67,7 @@ class _Entry(Options):
 
 
 def load_evd(folder: Path) -> Pairs:
-    """Find pairs with homographies; EvaluationError when the layout is another one."""
+    """Find pairs with homographies; AffrectError when the layout is another one."""
     files = [file for part in "12h" for file in (folder / part).glob("*")]
     names = {file.stem for file in files if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES)}
     found = [(name, f"1/{name}", f"2/{name}", f"h/{name}.txt") for name in sorted(names)]
@@ -76,7 +76,7 @@ def load_evd(folder: Path) -> Pairs:
             name, one, two = parts.groups()
             found.append((f"{name} {one}-{two}", f"{name}_{one}", f"{name}_{two}", file.name))
     if not found:
-        raise EvaluationError(
+        raise AffrectError(
             f"{folder}: holds neither 1/NAME.png, 2/NAME.png, h/NAME.txt nor "
             "NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
         )
@@ -93,13 +93,13 @@ def load_evd(folder: Path) -> Pairs:
 
 
 def _scenes(pattern: str, load: Callable[[Path], Pairs], path: Path) -> Pairs:
-    """Read one or all scenes, by the file that makes a folder one; EvaluationError if none."""
+    """Read one or all scenes, by the file that makes a folder one; AffrectError if none."""
     folders = [path, *sorted(path.glob("*/"))]
     files = [file for folder in folders for file in sorted(folder.glob(pattern))]
     pairs = [pair for file in files for pair in load(file)]
     if not pairs:
         why = f"; it has no {pattern}, nor has a folder in it" if not files else ""
-        raise EvaluationError(f"{path}: no pair can be evaluated{why}")
+        raise AffrectError(f"{path}: no pair can be evaluated{why}")
     return pairs
 
 
@@ -137,7 +137,7 @@ def _svp_scene(list_path: Path) -> Pairs:
     views, listed = read_views(folder / "0"), []
     for words in map(str.split, _lines(list_path)):
         if len(words) not in (2, 3):
-            raise EvaluationError(f"{list_path}: '{' '.join(words)}' is no pair of images")
+            raise AffrectError(f"{list_path}: '{' '.join(words)}' is no pair of images")
         listed.append((stem(words[0]), stem(words[1])))
 
     def category(name1: str, name2: str) -> str:  # tens of degrees of rotation
@@ -152,7 +152,7 @@ load_svp = partial(_scenes, f"*{PAIR_LIST_SUFFIX}", _svp_scene)
 
 
 def read_views(folder: Path) -> Views:
-    """Read ``images.txt`` and ``cameras.txt``; EvaluationError when that cannot be done."""
+    """Read ``images.txt`` and ``cameras.txt``; AffrectError when that cannot be done."""
     cameras, views = {}, {}
     posed = [line for line in _lines(folder / "images.txt") if stem(line) != line]  # not points
     with _damaged(folder):
@@ -180,7 +180,7 @@ def stem(name: str) -> str:
 
 
 def _damaged(path: Path) -> AbstractContextManager[None]:
-    return damage(path, "see docs/own-evaluation-set.md for the format", EvaluationError)
+    return damage(path, "see docs/own-evaluation-set.md for the format")
 
 
 def _lines(path: Path) -> list[str]:
@@ -216,7 +216,7 @@ def _split(key: str, known: Views) -> Names:
 
 
 def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
-    """Read the camera and cam_from_world of an image; EvaluationError says what is wrong."""
+    """Read the camera and cam_from_world of an image; AffrectError says what is wrong."""
     with _damaged(path), h5py.File(path) as file:
         given = {key: np.squeeze(file[key][()]) for key in ("K", "R", "T")}
     camera = pinhole(finite_numbers(given["K"], (3, 3), f"{path}: K"), f"{path}: K")
@@ -225,29 +225,29 @@ def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
 
 
 def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
-    """Return an array; a shape that begins with -1 has any number of rows. EvaluationError."""
+    """Return an array; a shape that begins with -1 has any number of rows. AffrectError."""
     try:
         values = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise EvaluationError(f"{what} is not numbers ({error})") from error
+        raise AffrectError(f"{what} is not numbers ({error})") from error
     if values.shape != (values.shape[:1] if shape[0] == -1 else shape[:1]) + shape[1:]:
-        raise EvaluationError(f"{what} has shape {values.shape}, expected {shape}")
+        raise AffrectError(f"{what} has shape {values.shape}, expected {shape}")
     if not np.isfinite(values).all() or not values.size:
-        raise EvaluationError(f"{what} is empty or has values that are not finite")
+        raise AffrectError(f"{what} is empty or has values that are not finite")
     return values
 
 
 def pinhole(matrix: Array, what: str) -> pycolmap.Camera:
-    """Return the camera of a (3, 3) matrix of COLMAP's px; EvaluationError when it is none."""
+    """Return the camera of a (3, 3) matrix of COLMAP's px; AffrectError when it is none."""
     (fx, skew, cx), (zero, fy, cy), last = matrix.tolist()
     if min(fx, fy, cx, cy) <= 0 or (skew, zero, *last) != (0, 0, 0, 0, 1):
-        raise EvaluationError(f"{what} is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        raise AffrectError(f"{what} is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     width, height = round(2 * cx), round(2 * cy)
     return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, cx, cy])
 
 
 def load_pairs(folder: Path) -> Pairs:
-    """Read ``pairs.json``; EvaluationError says what is wrong."""
+    """Read ``pairs.json``; AffrectError says what is wrong."""
     path = folder / "pairs.json"
     with _damaged(path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -255,9 +255,9 @@ def load_pairs(folder: Path) -> Pairs:
         offset_px = ORIGIN_PX[content.get("pixel_origin", "center")]
     names = [entry.name for entry in entries]
     if not names:
-        raise EvaluationError(f"{path}: has no pairs")
+        raise AffrectError(f"{path}: has no pairs")
     if twice := [name for name in names if names.count(name) > 1]:
-        raise EvaluationError(f"{path}: two pairs are called '{twice[0]}'; give them names")
+        raise AffrectError(f"{path}: two pairs are called '{twice[0]}'; give them names")
     return _loaded(entries, folder, offset_px)
 
 
@@ -265,13 +265,11 @@ def _entry(values: Any, where: str) -> _Entry:
     try:
         entry = _Entry.from_mapping(values, where)
     except OptionError as error:
-        raise EvaluationError(str(error)) from error
+        raise AffrectError(str(error)) from error
     if leads_outside(entry.image1) or leads_outside(entry.image2):
-        raise EvaluationError(f"{where}: images must be paths of images in the folder")
+        raise AffrectError(f"{where}: images must be paths of images in the folder")
     if (entry.homography, entry.correspondences, entry.relative_pose).count(None) != 2:
-        raise EvaluationError(
-            f"{where}: needs homography, correspondences or relative_pose, and one"
-        )
+        raise AffrectError(f"{where}: needs homography, correspondences or relative_pose, and one")
     return entry.changed(name=entry.name or f"{stem(entry.image1)} {stem(entry.image2)}")
 
 
@@ -293,7 +291,7 @@ def _truth(
     name, numbers = entry.name, entry.homography or entry.correspondences
     if isinstance(numbers, str):
         if leads_outside(numbers):
-            raise EvaluationError(f"{numbers}: must be a file in the folder of the pairs")
+            raise AffrectError(f"{numbers}: must be a file in the folder of the pairs")
         with _damaged(folder / numbers):
             numbers = np.loadtxt(folder / numbers, ndmin=2)
     if entry.homography is not None:
@@ -307,7 +305,7 @@ def _truth(
     shapes = {"rotation": (3, 3), "translation": (3,), "intrinsics1": (3, 3), "intrinsics2": (3, 3)}
     given = entry.relative_pose
     if not isinstance(given, Mapping) or given.keys() != shapes.keys():
-        raise EvaluationError(f"{name}: relative_pose needs {', '.join(shapes)}")
+        raise AffrectError(f"{name}: relative_pose needs {', '.join(shapes)}")
     values = {k: finite_numbers(given[k], shape, f"{name}: {k}") for k, shape in shapes.items()}
     cameras = []
     for key in ("intrinsics1", "intrinsics2"):

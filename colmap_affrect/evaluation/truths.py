@@ -18,7 +18,7 @@ from pydantic import BeforeValidator
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose, pose_errors
-from colmap_affrect.errors import EvaluationError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import colmap_from_pixel, is_inside
@@ -140,13 +140,13 @@ class TrueHomography:
     def of(cls, matrix: Array, paths: Sequence[Path], what: str) -> "TrueHomography":
         """Return the truth of two image files, of a (3, 3) matrix of any scale and sign.
 
-        ImageError when one cannot be read, EvaluationError when image 2 shows no part of image 1.
+        ImageError when one cannot be read, AffrectError when image 2 shows no part of image 1.
         """
         size1, size2 = ((gray.shape[1], gray.shape[0]) for gray in map(read_gray, paths))
         both = [cls(sign * matrix, size1, size2) for sign in (1.0, -1.0)]
         found = max(both, key=lambda truth: len(truth.visible))
         if not len(found.visible):
-            raise EvaluationError(f"{what} shows no part of image 1 in image 2")
+            raise AffrectError(f"{what} shows no part of image 1 in image 2")
         return found
 
     @cached_property

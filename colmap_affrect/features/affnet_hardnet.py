@@ -55,7 +55,7 @@ class AffNetHardNet:
     descriptor_size = 128
 
     def __init__(self, options: AffNetHardNetOptions, network: NetworkContext) -> None:
-        """Load the networks; WeightsError and DeviceError as :mod:`.networks` raises them."""
+        """Load the networks; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features import networks
 
         weights, device = network.weights, network.device

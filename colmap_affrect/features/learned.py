@@ -83,7 +83,7 @@ class LearnedFeatures(FeatureExtractor):
     def __init__(
         self, options: AlikedOptions | DiskOptions | XFeatOptions, context: NetworkContext
     ) -> None:
-        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
+        """Load the network; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import load_extractor, resolve_device
 
         self.options, self.device = options, resolve_device(context.device)

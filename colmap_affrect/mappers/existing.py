@@ -16,7 +16,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import read_given_model
-from colmap_affrect.errors import MappingError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 
 SAME_KEYPOINTS_PX = 1e-3
@@ -152,10 +152,10 @@ def existing_names(model_path: Path, known: Collection[str]) -> list[str]:
         known: names of the photographs; all of the model must be among them.
 
     Raises:
-        OptionError: when there is no such folder.
-        MappingError: when it is no model, or has images that are not known.
+        OptionError: when there is no such folder, or no model in it.
+        AffrectError: when it has none, or some that are not known.
     """
-    model = read_given_model(model_path, "--extend ", MappingError)
+    model = read_given_model(model_path, "--extend ")
     return _known_names(model, model_path, known)
 
 
@@ -163,11 +163,11 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     """Read a model and give it the ids and keypoints of a database.
 
     Raises:
-        OptionError: when there is no such folder.
-        MappingError: when it is no model, or does not fit the database.
+        OptionError: when there is no such folder, or no model in it.
+        AffrectError: when it does not fit the database.
     """
     old, path = (
-        read_given_model(extension.model_path, "--extend ", MappingError),
+        read_given_model(extension.model_path, "--extend "),
         extension.model_path,
     )
     with open_database(database_path) as database:
@@ -201,9 +201,9 @@ def _known_names(model: pycolmap.Reconstruction, path: Path, known: Collection[s
     names = sorted(image.name for image in _registered(model))
     missing = [name for name in names if name not in known]
     if not names:
-        raise MappingError(f"--extend {path}: the model has no images with poses")
+        raise AffrectError(f"--extend {path}: the model has no images with poses")
     if missing:
-        raise MappingError(
+        raise AffrectError(
             f"--extend {path}: {len(missing)} of its {len(names)} images, such as {missing[0]}, "
             "are not among the photographs; give the folder with old and new ones"
         )
@@ -218,13 +218,13 @@ def _take_cameras(
     for mine, now in images:
         camera, mapped = old.camera(mine.camera_id), new.camera(now.camera_id)
         if (camera.width, camera.height) != (mapped.width, mapped.height):
-            raise MappingError(
+            raise AffrectError(
                 f"--extend {path}: {mine.name} is {camera.width} x {camera.height} px there and "
                 f"{mapped.width} x {mapped.height} px here"
             )
         name, other = taken.setdefault(now.camera_id, (mine.name, camera))
         if camera.model != other.model or not np.array_equal(camera.params, other.params):
-            raise MappingError(
+            raise AffrectError(
                 f"--extend {path}: {name} and {mine.name} have different cameras there and share "
                 "one here; use the camera mode that the model was made with, or per-image"
             )
@@ -251,7 +251,7 @@ def _take_poses(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) ->
         if np.abs(difference).max() > SAME_POSE * (
             1 + np.abs(image.cam_from_world().translation).max()
         ):
-            raise MappingError(
+            raise AffrectError(
                 f"--extend {path}: the pose of {image.name} does not fit the rig it has here"
             )
 

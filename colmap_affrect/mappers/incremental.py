@@ -11,7 +11,7 @@ from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.colmap.native_options import resolve, set_values
-from colmap_affrect.errors import MappingError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel
 from colmap_affrect.mappers.snapshots import (
@@ -83,7 +83,7 @@ class IncrementalMapper:
             raise KeyboardInterrupt from error
         except (RuntimeError, ValueError) as error:
             reason = " ".join(str(error).split())
-            raise MappingError(f"COLMAP's incremental mapper failed: {reason}") from error
+            raise AffrectError(f"COLMAP's incremental mapper failed: {reason}") from error
         return [MappedModel(model) for model in models]
 
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:

@@ -51,7 +51,7 @@ def map_database(
             more than there are, also when a mapper tries several models.
 
     Raises:
-        MappingError: when COLMAP ends with an error.
+        AffrectError: when COLMAP ends with an error.
         KeyboardInterrupt: after mapping has been stopped and what it wrote, but snapshots, removed.
         OptionError: when the mapper cannot extend a model.
     """

@@ -129,7 +129,7 @@ class LightGlue:
     Options = LightGlueOptions
 
     def __init__(self, options: LightGlueOptions, context: MatcherContext) -> None:
-        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
+        """Load the network; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import resolve_device
 
         self.options, self.training = options, TRAININGS[options.trained_for]
@@ -193,7 +193,7 @@ class LightGlue:
 
 
 def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
-    """Build kornia's LightGlue with the parameters in a file, all of them, else WeightsError."""
+    """Build kornia's LightGlue with the parameters in a file, all of them, else AffrectError."""
     from kornia.feature import LightGlue as Network
 
     configuration = {

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import OptionError, PairListError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.atomic_files import replace_lines
@@ -95,7 +95,7 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
 
     Separated by spaces, a tab or a comma; names may contain spaces. Empty lines and lines with #
     are skipped, repeated pairs count once, in either order. The pairs are sorted. OptionError when
-    there is no such file, PairListError when it is unreadable or a name is not among ``names``.
+    there is no such file, AffrectError when it is unreadable or a name is not among ``names``.
     """
     ordered = sorted(set(names))
     number = {name: index for index, name in enumerate(ordered)}
@@ -117,17 +117,17 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise PairListError(f"{path}: cannot be read ({error})") from error
+        raise AffrectError(f"{path}: cannot be read ({error})") from error
     if problems:
         (count, line), more = problems[0], len(problems) - 1
-        raise PairListError(
+        raise AffrectError(
             f"{path}: line {count}: {line!r} is not two names of images"
             f"{_suggestion(line, ordered)}" + f", nor are {more} more lines" * (more > 0)
         )
     found.sort()  # np.unique takes seven times as much memory
     found = found[np.flatnonzero(np.diff(found, prepend=-1))]
     if not len(found):
-        raise PairListError(f"{path}: holds no pair of two different images")
+        raise AffrectError(f"{path}: holds no pair of two different images")
     numbers = np.empty((len(found), 2), np.int32)
     np.divmod(found, len(ordered), out=(numbers[:, 0], numbers[:, 1]), casting="unsafe")
     return PairList(ordered, numbers)

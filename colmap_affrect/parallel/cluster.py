@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 from threadpoolctl import threadpool_limits
 
-from colmap_affrect.errors import ClusterError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.parallel.executor import Result, Task, in_order
 
 if TYPE_CHECKING:
@@ -62,11 +62,11 @@ def _size(path: str) -> str:
 
 
 def require_environment(expected: Mapping[str, str]) -> None:
-    """Refuse a worker, where this is called, that would give other results: ClusterError."""
+    """Refuse a worker, where this is called, that would give other results: AffrectError."""
     found = environment(key for key in expected if key not in PACKAGES)
     for key, value in expected.items():
         if found[key] != value:
-            raise ClusterError(
+            raise AffrectError(
                 f"worker on {platform.node()}: {key} is {found[key]}, and {value} on the machine "
                 "that leads the work; results could differ: install the same versions, and have "
                 "files on storage that all machines share, under the same path"
@@ -97,18 +97,18 @@ def _work(pickled: bytes, expected: tuple[tuple[str, str], ...], task: bytes) ->
 def connected(address: str) -> Iterator[Cluster]:
     """Use the cluster of a scheduler, such as ``tcp://10.0.0.1:8786``, and leave it running.
 
-    Raises ClusterError when distributed is not installed, the scheduler does not answer, or there
+    Raises AffrectError when distributed is not installed, the scheduler does not answer, or there
     are no workers.
     """
     try:
         from dask import config
         from distributed import Client, Security
     except ModuleNotFoundError as error:
-        raise ClusterError(
+        raise AffrectError(
             f"--scheduler: {error.name} is not installed; pip install 'colmap-affrect[cluster]'"
         ) from error
     if not re.fullmatch(r"(tcp|tls)://.+:\d+", address):
-        raise ClusterError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
+        raise AffrectError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
     security = Security()  # as dask's configuration has it
     for name in ("distributed", "distributed.client"):  # errors that matter are raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -121,7 +121,7 @@ def connected(address: str) -> Iterator[Cluster]:
             try:
                 client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
             except TimeoutError as error:
-                raise ClusterError(
+                raise AffrectError(
                     f"{address}: the cluster has no workers; start some, with 'dask worker "
                     f"{address}' on each machine"
                 ) from error
@@ -150,7 +150,7 @@ def _require_scheduler(address: str, security: Security) -> None:
     except Exception as error:  # noqa: BLE001 - what listens there may say anything
         found = f"{type(error).__name__} {error}".strip()
     if found != "Scheduler":
-        raise ClusterError(
+        raise AffrectError(
             f"--scheduler {address}: no scheduler answers ({found}); give the address that 'dask "
             "scheduler' prints"
         )
@@ -167,7 +167,7 @@ class Cluster:
     ) -> Iterator[Result]:
         """See :class:`~colmap_affrect.parallel.executor.Executor`.
 
-        Raises ClusterError when the scheduler is lost, several workers are lost with one task, or a
+        Raises AffrectError when the scheduler is lost, several workers are lost with one task, or a
         worker differs or does not see the files.
         """
         from distributed import KilledWorker
@@ -183,18 +183,18 @@ class Cluster:
         try:
             yield from in_order(submit, tasks, self._num_tasks)
         except KilledWorker as error:
-            raise ClusterError(
+            raise AffrectError(
                 f"{self._address}: {error.allowed_failures + 1} workers were lost while working on "
                 "one task, for want of memory perhaps; run the same command again"
             ) from error
         except CancelledError as error:
-            raise ClusterError(
+            raise AffrectError(
                 f"{self._address}: the scheduler was lost; start it and run the same command again"
             ) from error
         except (ModuleNotFoundError, RuntimeError) as error:
             if not isinstance(why := error.__cause__ or error, ModuleNotFoundError):
                 raise
-            raise ClusterError(
+            raise AffrectError(
                 f"{self._address}: scheduler or workers do not have this version of colmap-affrect "
                 f"({why}); install it on all machines of the cluster"
             ) from error

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.errors import WeightsError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
@@ -44,7 +44,7 @@ def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) 
     """Refuse weights that are not those of the machine that leads the work."""
     for key, path in weights.items():
         if file_sha256(path) != digests[key]:
-            raise WeightsError(
+            raise AffrectError(
                 f"{path}: is another file than {key} on the machine that leads the work; give "
                 "both the same"
             )

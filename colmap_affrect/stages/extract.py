@@ -15,7 +15,7 @@ from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.errors import (
     DatabaseError,
     ImageError,
-    StaleStoreError,
+    StoreError,
     one_line,
     such_as,
 )
@@ -161,7 +161,7 @@ def extract_images(
     """Yield the features of images, or why one cannot be used, in order.
 
     ``images`` are names and levels of escalation. By default there are as many threads as cores and
-    memory allow. ClusterError when workers do not see the photographs or the depth maps.
+    memory allow. AffrectError when workers do not see the photographs or the depth maps.
     """
     if not images:
         return
@@ -278,7 +278,7 @@ def _refuse_other_photographs(
     before = (workspace.planned("extract") or {}).get("image_path", image_path)
     known = {} if before == image_path else FeatureStore(workspace.features).contents()
     if known and len(_changed(known, contents)) == len(known.keys() & contents.keys()):
-        raise StaleStoreError(
+        raise StoreError(
             f"{workspace.path}: the extract stage was run there with image_path={before!r}, and "
             f"none of the photographs in {image_path} is one of them; use --overwrite to discard "
             "the results, or another --output-path"
@@ -332,7 +332,7 @@ def _refuse_changed(context: Context, inputs: Inputs, names: Iterable[str]) -> N
     known = context.features.contents()
     now = inputs.contents(names, context.extraction, known)
     if changed := _counted(_changed(known, now), "changed"):
-        raise StaleStoreError(
+        raise StoreError(
             f"{context.workspace.features}: {changed[0]} since their features were extracted; run "
             "extract again"
         )

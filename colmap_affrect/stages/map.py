@@ -9,7 +9,7 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.tables import rows_digest
-from colmap_affrect.errors import StaleStoreError
+from colmap_affrect.errors import StoreError
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
@@ -43,8 +43,8 @@ def map_images(
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
     Images are registered into the model of ``extend``, or else begin anew; ``overwrite`` discards
-    the models that are there. MappingError when the model cannot be extended with these images,
-    StaleStoreError when the models that are there extend another one.
+    the models that are there. AffrectError when the model cannot be extended with these images,
+    StoreError when the models that are there extend another one.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -57,7 +57,7 @@ def map_images(
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
     known = workspace.made_from("map") if workspace.sparse.exists() else ""
     if known != inputs and " " in known and not extend:
-        raise StaleStoreError(
+        raise StoreError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
         )

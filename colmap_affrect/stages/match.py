@@ -74,7 +74,7 @@ def match(
 def load_matchers(context: Context, matchers: Iterable[MatcherOptions]) -> dict[str, Path]:
     """Return the files of weights that matchers read, by key.
 
-    Their networks are built once before matching begins: WeightsError for what cannot be used.
+    Their networks are built once before matching begins: AffrectError for what cannot be used.
     """
     resources, learned = context.resources, {m for m in matchers if m.weights}
     keys = sorted({key for options in learned for key in options.weights})

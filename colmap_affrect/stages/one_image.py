@@ -238,9 +238,9 @@ def prepare(
 ) -> ImageExtractor:
     """Find everything a recipe needs, before any image is touched, and build its parts.
 
-    ``image_names`` are those to come, to see whether there are depth maps for them. Raises
-    WeightsError when a file of weights is neither found nor downloaded, DeviceError when the device
-    is not there, OptionError when depth maps are needed and no source is given, DepthError when the
+    ``image_names`` are those to come, to see whether there are depth maps for them. AffrectError
+    when a file of weights is neither found nor downloaded, or the device is not there,
+    OptionError when depth maps are needed and no source is given, DepthError when the
     folder of depth maps has none of the images.
     """
     resources = resources or Resources()

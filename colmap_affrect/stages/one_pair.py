@@ -45,7 +45,7 @@ def iterate_matches(
 ) -> Generator[PairMatches, None, None]:
     """Match pairs, in an order in which an image, once read, stays in memory for most of its pairs.
 
-    By default there is a thread for each core. ClusterError when workers do not see the file of
+    By default there is a thread for each core. AffrectError when workers do not see the file of
     features.
     """
     if not pairs:

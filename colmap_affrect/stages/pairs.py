@@ -8,7 +8,7 @@ from itertools import combinations
 from pathlib import Path
 
 from colmap_affrect.colmap.database import nearest_positions
-from colmap_affrect.errors import PairListError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.pairs.lists import read_pairs, sequence_pairs, write_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
@@ -47,8 +47,8 @@ def choose_pairs(
 
     When images are added, pairs that were chosen by other options than these, which are by default
     those on record, stay; ``overwrite`` discards them first, and what was made of them. Raises
-    PairListError when the list cannot be used, DatabaseError when there are no positions to choose
-    by, StaleStoreError when earlier pairs are missing in the list, or other options made them.
+    AffrectError when the list cannot be used, DatabaseError when there are no positions to choose
+    by, StoreError when earlier pairs are missing in the list, or other options made them.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -142,7 +142,7 @@ def listed_pairs(context: Context) -> PairList:
     """Return the pairs of the list whose images have features."""
     context.workspace.require("pairs")
     if not context.workspace.pairs.exists():
-        raise PairListError(
+        raise AffrectError(
             f"{context.workspace.pairs}: no such file, the photographs have changed; run "
             "'colmap-affrect pairs' and then match again"
         )

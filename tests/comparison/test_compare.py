@@ -23,10 +23,9 @@ from colmap_affrect.comparison.method_run import MethodRun
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.tables import to_json, verdict
 from colmap_affrect.errors import (
-    ComparisonError,
-    DeviceError,
+    AffrectError,
     OptionError,
-    StaleStoreError,
+    StoreError,
 )
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
@@ -147,7 +146,7 @@ def test_finished_methods_are_not_run_again_where_photographs_moved_only(
     assert compare(images, compared[1], chosen).methods == compared[0].methods[:2]
     name = min(path.name for path in images.iterdir())
     (images / name).write_bytes((images / name).read_bytes() + b" ")
-    with pytest.raises(StaleStoreError, match=rf"run there with photographs\.{name}='.*, and"):
+    with pytest.raises(StoreError, match=rf"run there with photographs\.{name}='.*, and"):
         compare(images, compared[1], chosen)
     assert asked == []
 
@@ -169,7 +168,7 @@ def test_finished_methods_are_not_run_again_where_photographs_moved_only(
 def test_other_options_than_before_are_refused(
     scene, options, compared, asked, changes, message
 ) -> None:
-    with pytest.raises(StaleStoreError, match=f"{message}.*; use --overwrite"):
+    with pytest.raises(StoreError, match=f"{message}.*; use --overwrite"):
         compare(scene / "images", compared[1], replace(options, **changes))
     assert asked == []
 
@@ -180,7 +179,7 @@ def test_other_options_than_before_are_refused(
         ({"methods": ["sift", "defualt"]}, OptionError, "did you mean 'default'"),
         ({"seeds": (1, 1)}, OptionError, "give different seeds"),
         ({"seeds": (0, -5)}, OptionError, "random_seed=-5: should be greater than or equal to -1"),
-        ({"resources": Resources(device="cuda:99")}, DeviceError, "--device cuda:99"),
+        ({"resources": Resources(device="cuda:99")}, AffrectError, "--device cuda:99"),
         ({"ground_truth_path": Path("nowhere")}, OptionError, "nowhere: no such folder"),
         ({"pairs": PairOptions(match_list_path="nowhere")}, OptionError, "nowhere: cannot be read"),
         ({"cameras": CameraOptions(model="PINHOLES")}, OptionError, "PINHOLES is not one of"),
@@ -193,7 +192,7 @@ def test_bad_input_is_refused_before_any_work(
         compare(scene / "images", tmp_path / "out", replace(options, **changes))
     write_ground_truth(tmp_path / "truth", ".jpg")
     options = replace(options, ground_truth_path=tmp_path / "truth")
-    with pytest.raises(ComparisonError, match=r"shares no image name .* \(it has a.jpg, they"):
+    with pytest.raises(AffrectError, match=r"shares no image name .* \(it has a.jpg, they"):
         compare(scene / "images", tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
 
@@ -202,7 +201,7 @@ def test_bad_input_is_refused_before_any_work(
 def test_fewer_than_two_images_are_refused(tmp_path) -> None:
     images = tmp_path / "images"
     write_photographs(images, 1)
-    with pytest.raises(ComparisonError, match=r"only a\.png to use; .* at least two"):
+    with pytest.raises(AffrectError, match=r"only a\.png to use; .* at least two"):
         compare(images, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (images / "broken.png").write_bytes(b"no image")

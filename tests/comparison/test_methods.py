@@ -14,7 +14,7 @@ from colmap_affrect.comparison.sift import (
     extract_sift,
     match_sift,
 )
-from colmap_affrect.errors import ComparisonError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 
 
@@ -83,5 +83,5 @@ def test_sift_looks_at_the_masks_and_matches_the_pairs_of_the_list(tmp_path):
         assert len(database.read_matches(ids[first], ids[second])) > 20
         assert database.num_verified_image_pairs() == 0
     assert second == "b c.png"
-    with pytest.raises(ComparisonError, match=r"b c\.png: COLMAP matches no listed names"):
+    with pytest.raises(AffrectError, match=r"b c\.png: COLMAP matches no listed names"):
         match_sift(path, [(first, second)])

@@ -15,7 +15,7 @@ from colmap_affrect.comparison.pose_scores import (
     pair_errors,
     pose_scores,
 )
-from colmap_affrect.errors import ComparisonError
+from colmap_affrect.errors import AffrectError
 
 
 def rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
@@ -91,5 +91,5 @@ def test_folder_without_a_model_is_refused(tmp_path: Path, content: str | None) 
     if content:
         for name in ("cameras.txt", "images.txt", "points3D.txt"):
             (tmp_path / name).write_text(content)
-    with pytest.raises(ComparisonError, match="not a COLMAP model"):
+    with pytest.raises(AffrectError, match="not a COLMAP model"):
         read_poses(tmp_path)

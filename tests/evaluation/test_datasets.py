@@ -16,7 +16,7 @@ from posed_photographs import SIZE, TRUTH, pose, write_extreme_views, write_pair
 from small_scene import FOCAL_PX
 
 from colmap_affrect.colmap.model_files import relative_pose
-from colmap_affrect.errors import AffrectError, EvaluationError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.evaluation.datasets import Pairs, load_evd, load_imc, load_pairs, load_svp
 
 SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
@@ -69,7 +69,7 @@ def test_pairs_that_cannot_be_used_are_refused(change: Any, message: str, tmp_pa
     (load_pairs, r"pairs\.json: damaged"),
 ])  # fmt: skip
 def test_other_folders_are_refused(load: Any, message: str, tmp_path: Path) -> None:
-    with pytest.raises(EvaluationError, match=message):
+    with pytest.raises(AffrectError, match=message):
         load(tmp_path)
 
 
@@ -112,7 +112,7 @@ def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, 
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(EvaluationError, match=r"damaged|not finite"):
+    with pytest.raises(AffrectError, match=r"damaged|not finite"):
         load_svp(svp)
 
 
@@ -121,7 +121,7 @@ def test_points_of_images_are_passed_over_and_bad_lines_are_refused(svp: Path) -
     images.write_text(images.read_text().replace("png\n", "png\n10.5 20.5 1 30.5 40.5 -1\n"))
     assert len(load_svp(svp)) == 3
     (svp / "scene4_image_pairs.txt").write_text("a.png b.png 0\nb.png\n")
-    with pytest.raises(EvaluationError, match=r"scene4_image_pairs\.txt: 'b\.png' is no pair"):
+    with pytest.raises(AffrectError, match=r"scene4_image_pairs\.txt: 'b\.png' is no pair"):
         load_svp(svp)
 
 
@@ -159,7 +159,7 @@ def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
 ])  # fmt: skip
 def test_unusable_calibration_is_refused(imc: Path, changes: Entry, fault: str) -> None:
     scenes.write_calibration(imc, 0, **changes)
-    with pytest.raises(EvaluationError, match=rf"calibration_a\.h5: .*{fault}"):
+    with pytest.raises(AffrectError, match=rf"calibration_a\.h5: .*{fault}"):
         load_imc(imc)
 
 
@@ -261,7 +261,7 @@ def test_poses_and_points_in_pixels_of_both_origins(
 def test_unusable_truth_is_refused(
     changes: Entry, problem: str, tmp_path: Path, planar: Entry
 ) -> None:
-    with pytest.raises(EvaluationError, match=problem):
+    with pytest.raises(AffrectError, match=problem):
         listed(tmp_path, {**planar, **changes})
 
 
@@ -281,5 +281,5 @@ SAME = '{"image1": "a.png", "image2": "b.png", "homography": "h.txt"}'
 ])  # fmt: skip
 def test_bad_list_is_one_line(content: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "pairs.json").write_text(content)
-    with pytest.raises(EvaluationError, match=message):
+    with pytest.raises(AffrectError, match=message):
         load_pairs(tmp_path)

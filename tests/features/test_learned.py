@@ -12,7 +12,7 @@ from kornia import feature
 from numpy.testing import assert_allclose, assert_array_equal
 from random_weights import write_random_weights
 
-from colmap_affrect.errors import WeightsError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.features.base import EXTRACTORS, NetworkContext
 from colmap_affrect.features.learned import RADIUS_PX, LearnedFeatures
 from colmap_affrect.features.weights import WEIGHT_FILES, find
@@ -153,5 +153,5 @@ def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:
         ("xfeat", weights["aliked-n16"], "not the weights of xfeat"),
         ("disk", broken, "broken: "),
     ):
-        with pytest.raises(WeightsError, match=message):
+        with pytest.raises(AffrectError, match=message):
             make(options_of(key), {key: path})

@@ -15,7 +15,7 @@ from random_weights import randomized
 from synthetic import texture
 from torch.nn import functional
 
-from colmap_affrect.errors import DeviceError, OptionError, WeightsError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features import networks
 from colmap_affrect.features.networks import (
     OnPatches,
@@ -75,7 +75,7 @@ def patches() -> torch.Tensor:
 def test_resolve_device_that_is_not_there_says_what_to_use_instead() -> None:
     assert resolve_device("auto") == torch.device("cpu")
     for name in ("cuda", "cuda:1", "mps"):
-        with pytest.raises(DeviceError, match=rf"^--device {name}: .*use --device cpu or auto$"):
+        with pytest.raises(AffrectError, match=rf"^--device {name}: .*use --device cpu or auto$"):
             resolve_device(name)
 
 
@@ -98,11 +98,11 @@ def test_load_hardnet_computes_what_kornia_does(folder: Path, patches: torch.Ten
 
 
 def test_loaders_refuse_the_file_of_another_network(folder: Path) -> None:
-    with pytest.raises(WeightsError, match=r"orinet\.pth: not the weights of AffNet \("):
+    with pytest.raises(AffrectError, match=r"orinet\.pth: not the weights of AffNet \("):
         load_affnet(folder / "orinet.pth", "cpu")
-    with pytest.raises(WeightsError, match=r"affnet\.pth: not the weights of OriNet"):
+    with pytest.raises(AffrectError, match=r"affnet\.pth: not the weights of OriNet"):
         load_orinet(folder / "affnet.pth", "cpu")
-    with pytest.raises(WeightsError, match=r"hardtfeat\.pth: not the weights of hardnet \("):
+    with pytest.raises(AffrectError, match=r"hardtfeat\.pth: not the weights of hardnet \("):
         load_descriptor("hardnet", folder / "hardtfeat.pth", "cpu")
 
 
@@ -120,7 +120,7 @@ def test_load_affnet_refuses_a_file_that_differs_in_one_place(
     path = tmp_path / "changed.pth"
     state = torch.load(folder / "affnet.pth", weights_only=True)["state_dict"] | change
     torch.save({key: value for key, value in state.items() if value is not None}, path)
-    with pytest.raises(WeightsError, match=message):
+    with pytest.raises(AffrectError, match=message):
         load_affnet(path, "cpu")
 
 

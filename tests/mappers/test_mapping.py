@@ -11,7 +11,7 @@ from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.errors import MappingError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
@@ -82,7 +82,7 @@ def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(tmp_path: Path) 
     path = tmp_path / "database.db"
     synthesize(path, 3)
     wrong = mapper_of("incremental", mapper_options={"ba_global_function_tolerance": -1})
-    with pytest.raises(MappingError, match=r"incremental mapper failed: .*tolerance") as error:
+    with pytest.raises(AffrectError, match=r"incremental mapper failed: .*tolerance") as error:
         reconstruct(path, wrong)
     assert "\n" not in str(error.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]

@@ -14,7 +14,7 @@ from random_weights import write_comparing_lightglue
 from strategies import compose_affine
 
 from colmap_affrect.data import LocalFeatures, union
-from colmap_affrect.errors import OptionError, WeightsError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.affine import (
     lafs_from_keypoints,
     transform_frames,
@@ -212,11 +212,11 @@ def test_features_of_another_extractor_are_refused_in_one_line(matcher: LightGlu
 
 def test_weights_of_another_network_are_refused(comparing: Path, tmp_path: Path) -> None:
     with pytest.raises(
-        WeightsError, match=r"lightglue\.pth: not the weights of LightGlue for xfeat"
+        AffrectError, match=r"lightglue\.pth: not the weights of LightGlue for xfeat"
     ):
         load_network(comparing, LightGlueOptions(trained_for="xfeat"))
     state = torch.load(comparing, weights_only=True)
     del state["posenc.Wr.weight"]
     torch.save(state, tmp_path / "partial.pth")
-    with pytest.raises(WeightsError, match=r"partial\.pth: .*no posenc\.Wr\.weight"):
+    with pytest.raises(AffrectError, match=r"partial\.pth: .*no posenc\.Wr\.weight"):
         load_network(tmp_path / "partial.pth", LightGlueOptions())

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from colmap_affrect.errors import OptionError, PairListError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import (
     exhaustive_pairs,
@@ -113,7 +113,7 @@ def test_read_pairs_takes_what_others_write(pair_list: Path, text: str, pairs: l
 
 def test_read_pairs_lists_unknown_names_with_line_and_suggestion(pair_list: Path) -> None:
     pair_list.write_text("a.png b.png\na.png bb.png\n\nzzzz 1234\n")
-    with pytest.raises(PairListError) as error:
+    with pytest.raises(AffrectError) as error:
         read_pairs(pair_list, NAMES)
     assert str(error.value) == (
         f"{pair_list}: line 2: 'a.png bb.png' is not two names of images (did you mean b.png?), "
@@ -124,9 +124,9 @@ def test_read_pairs_lists_unknown_names_with_line_and_suggestion(pair_list: Path
 @pytest.mark.parametrize(
     ("content", "error", "message"),
     [
-        (b"# nothing\n", PairListError, "holds no pair of two different images"),
-        (b"a.png a.png\n", PairListError, "holds no pair of two different images"),
-        (b"\xff\xfe\x00a", PairListError, r"list of pairs\.txt: cannot be read"),
+        (b"# nothing\n", AffrectError, "holds no pair of two different images"),
+        (b"a.png a.png\n", AffrectError, "holds no pair of two different images"),
+        (b"\xff\xfe\x00a", AffrectError, r"list of pairs\.txt: cannot be read"),
         (None, OptionError, r"list of pairs\.txt: cannot be read"),
     ],
 )

@@ -20,7 +20,7 @@ from random_weights import write_comparing_lightglue
 from results import hdf5_content
 from small_scene import INTRINSICS, write_photographs
 
-from colmap_affrect.errors import ClusterError, StaleStoreError
+from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.parallel import cluster as cluster_module
 from colmap_affrect.parallel.cluster import Cluster, connected, environment, require_environment
@@ -122,21 +122,21 @@ def test_files_that_workers_do_not_see_are_named(photos: Path, address: str) -> 
         assert list(cluster.map(len, ["task"], [photos, photos / "a.png"])) == [4]
         unseen = Path(os.path.relpath(photos / "a.png"))
         with pytest.raises(
-            ClusterError, match=rf"{unseen} is missing, and .* bytes on the machine"
+            AffrectError, match=rf"{unseen} is missing, and .* bytes on the machine"
         ):
             list(cluster.map(len, ["task"], [photos, unseen]))
 
 
 def test_cluster_that_is_no_use_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster_module, "CONNECT_TIMEOUT_S", 0.2)
-    with pytest.raises(ClusterError, match=r"tcp://127\.0\.0\.1:1: no scheduler answers"):
+    with pytest.raises(AffrectError, match=r"tcp://127\.0\.0\.1:1: no scheduler answers"):
         connected("tcp://127.0.0.1:1").__enter__()
-    with pytest.raises(ClusterError, match="not an address such as"):
+    with pytest.raises(AffrectError, match="not an address such as"):
         connected("10.0.0.1").__enter__()
-    with pytest.raises(ClusterError, match=r"no scheduler answers .*TLS expects"):
+    with pytest.raises(AffrectError, match=r"no scheduler answers .*TLS expects"):
         connected("tls://10.0.0.1:8786").__enter__()
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ClusterError, match=r"distributed is not installed; .*\[cluster\]"):
+    with pytest.raises(AffrectError, match=r"distributed is not installed; .*\[cluster\]"):
         connected("tcp://10.0.0.1:8786").__enter__()
 
 
@@ -149,7 +149,7 @@ def test_port_of_another_program_is_refused_in_one_line(
         accepted = threading.Thread(target=greet, args=(server, said), daemon=True)
         accepted.start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(ClusterError, match=rf"{address}: no scheduler answers \(.+\); give"):
+        with pytest.raises(AffrectError, match=rf"{address}: no scheduler answers \(.+\); give"):
             connected(address).__enter__()
 
 
@@ -165,10 +165,10 @@ def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None
     (tmp_path / "a.png").write_bytes(b"1")
     here = environment([str(tmp_path / "a.png"), str(tmp_path)])
     require_environment(here)
-    with pytest.raises(ClusterError, match=r"kornia is .*, and 0\.1 on the machine that leads"):
+    with pytest.raises(AffrectError, match=r"kornia is .*, and 0\.1 on the machine that leads"):
         require_environment({**here, "kornia": "0.1"})
     (tmp_path / "a.png").write_bytes(b"22")
-    with pytest.raises(ClusterError, match=r"a\.png is 2 bytes, and 1 bytes on the machine"):
+    with pytest.raises(AffrectError, match=r"a\.png is 2 bytes, and 1 bytes on the machine"):
         require_environment(here)
 
 
@@ -212,7 +212,7 @@ def test_matches_of_other_weights_are_not_mixed(
     assert list(workspace.recorded()["match"]["weights"]) == ["lightglue-sift"]
     assert Context(workspace).matching == WITH_NETWORK.matching
     write_comparing_lightglue(tmp_path / "sift_lightglue.pth", sharpness=30.0)
-    with pytest.raises(StaleStoreError, match="match stage was run there with weights"):
+    with pytest.raises(StoreError, match="match stage was run there with weights"):
         matched(tmp_path / "out", extracted, tmp_path, Threads(1))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
+from colmap_affrect.errors import OptionError, StoreError, WorkspaceError
 from colmap_affrect.project.record import STAGES as ALL_STAGES
 from colmap_affrect.project.workspace import Workspace
 
@@ -77,7 +77,7 @@ def test_record_options_with_other_options_names_the_first_that_differs(
     workspace.record_options("extract", OPTIONS)
     before = workspace.config.read_bytes()
     why = f"^.*the extract stage was run there with {re.escape(named)}.*--overwrite.*$"
-    with pytest.raises(StaleStoreError, match=why):
+    with pytest.raises(StoreError, match=why):
         workspace.record_options("extract", changed)
     assert workspace.config.read_bytes() == before
 
@@ -115,7 +115,7 @@ def test_record_options_with_overwrite_discards_this_stage_and_later_ones(
 def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
     finished: Workspace, tmp_path: Path
 ) -> None:
-    with pytest.raises(StaleStoreError, match="the extract stage was run there, which copy cannot"):
+    with pytest.raises(StoreError, match="the extract stage was run there, which copy cannot"):
         finished.record_options("copy", {}, overwrite=True)
     copied = Workspace(tmp_path / "copy")
     copied.path.mkdir()
@@ -124,7 +124,7 @@ def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
         copied.record_options(stage, {"by": stage})
     copied.database.write_bytes(b"copy")
     assert copied.recorded()["begun"] == stages
-    with pytest.raises(StaleStoreError, match="the copy stage was run there, which extract cannot"):
+    with pytest.raises(StoreError, match="the copy stage was run there, which extract cannot"):
         copied.record_options("extract", {})
     copied.snapshots.mkdir()
     copied.record_options("copy", {"by": "another"}, overwrite=True)
@@ -141,7 +141,7 @@ def test_results_of_somebody_else_are_refused_and_left_as_they_are(
     path = workspace.path / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"SQLite format 3\0 or so")
-    with pytest.raises(StaleStoreError, match="was not made here; it is left as it is") as error:
+    with pytest.raises(StoreError, match="was not made here; it is left as it is") as error:
         workspace.record_options("extract", OPTIONS, overwrite=overwrite)
     assert str(workspace.path / name.split("/")[0]) in str(error.value)
     assert path.read_bytes() == b"SQLite format 3\0 or so"
@@ -186,7 +186,7 @@ def test_models_that_somebody_put_beside_ours_are_not_removed(
     foreign = workspace.sparse / name
     foreign.parent.mkdir(parents=True, exist_ok=True)
     foreign.touch()
-    with pytest.raises(StaleStoreError, match="was not made by this run and would be removed"):
+    with pytest.raises(StoreError, match="was not made by this run and would be removed"):
         workspace.record_options("extract", {}, overwrite=True)
     assert foreign.exists()
 

@@ -18,7 +18,7 @@ from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
-from colmap_affrect.errors import StaleStoreError
+from colmap_affrect.errors import StoreError
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.interop.pycolmap_api import extract_features
 from colmap_affrect.project.stores import FeatureStore
@@ -198,9 +198,7 @@ def test_changed_photograph_of_a_users_database_is_named(tmp_path: Path) -> None
     write_photographs(tmp_path / "photos", 2)
     extract_features(tmp_path / "own.db", tmp_path / "photos", extraction_options=FAST[1])
     repaint(tmp_path / "photos" / FIRST)
-    with pytest.raises(
-        StaleStoreError, match=r"own\.db: since it was made, 1 changed \(a\.png\); use"
-    ):
+    with pytest.raises(StoreError, match=r"own\.db: since it was made, 1 changed \(a\.png\); use"):
         extract_features(tmp_path / "own.db", tmp_path / "photos", extraction_options=FAST[1])
 
 

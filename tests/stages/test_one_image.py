@@ -17,7 +17,7 @@ from numpy.testing import assert_array_equal
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.errors import DepthError, DeviceError, OptionError, WeightsError
+from colmap_affrect.errors import AffrectError, DepthError, OptionError
 from colmap_affrect.features.base import FeatureOptions
 from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.photographs import CameraOptions
@@ -141,7 +141,7 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
 
 def test_device_that_is_not_there_is_one_clear_line(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(DeviceError, match=r"--device cuda: .*use --device cpu or auto") as error:
+    with pytest.raises(AffrectError, match=r"--device cuda: .*use --device cpu or auto") as error:
         prepare(load_recipe("default").extraction, Resources(device="cuda"))
     assert "\n" not in str(error.value)
 
@@ -190,7 +190,7 @@ def test_work_in_another_process_refuses_other_weights(
     pickle.loads(matcher)
     found["affnet"].write_bytes(b"of another release")
     for content in (pickled, matcher):
-        with pytest.raises(WeightsError, match=r"AffNet\.pth: is another file than affnet on the"):
+        with pytest.raises(AffrectError, match=r"AffNet\.pth: is another file than affnet on the"):
             pickle.loads(content)
 
 
