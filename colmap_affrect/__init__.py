@@ -43,7 +43,6 @@ _PUBLIC = {
     "compare": "colmap_affrect.comparison.compare",
     "evaluate": "colmap_affrect.evaluation.evaluate",
     "extract_features": "colmap_affrect.interop.pycolmap_api",
-    "extract_image": "colmap_affrect.stages.one_image",
     "load_recipe": "colmap_affrect.recipes",
     "incremental_mapping": "colmap_affrect.interop.pycolmap_api",
     "map_from_database": "colmap_affrect.pipeline",

@@ -1,5 +1,6 @@
 """From a folder of photographs to a COLMAP model: the stages one after the other."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,11 +25,10 @@ from colmap_affrect.project.report import ReconstructionReport, StageReport, ins
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.run_page import write_run_page
-from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_descriptors
 from colmap_affrect.stages.guide import guide, guided_counts
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.map import (
     advice,
     contradicting_pairs,
@@ -38,7 +38,7 @@ from colmap_affrect.stages.map import (
 )
 from colmap_affrect.stages.match import load_matchers, match
 from colmap_affrect.stages.mend import watched
-from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed_pairs
+from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 from colmap_affrect.stages.verify import copy_verified, num_verified_inliers, verify_matches
 
 
@@ -109,7 +109,11 @@ def run(
     mapper = MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    num_pairs = expected_num_pairs(options.pairs, len(names))
+    num_pairs = math.comb(len(names), 2)
+    if options.pairs.match_list_path:
+        num_pairs = len(read_pairs(Path(options.pairs.match_list_path), names))
+    elif "exhaustive" not in options.pairs.methods:
+        num_pairs = min(num_pairs, len(names) * options.pairs.num_neighbors)
     shown = progress.with_forecast(Forecast(len(names), num_pairs))
     context = Context(Workspace(output_path), options.resources, executor, shown)
     if options.extend:
@@ -117,8 +121,6 @@ def run(
             options.extend.refuse_discarding(output_path)
         require_extends(mapper.options)
         existing_names(options.extend.model_path, names)
-    if options.pairs.match_list_path:
-        read_pairs(Path(options.pairs.match_list_path), names)
     options.recipe.extraction.check_depth()
     resolve(options.recipe.weights, options.resources.weights_path, progress=progress)
     load_matchers(context, options.recipe.extraction.matchers(options.recipe.matching))

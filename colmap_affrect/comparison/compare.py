@@ -27,7 +27,7 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.inputs import Inputs
+from colmap_affrect.stages.context import Inputs
 
 NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
 

@@ -82,11 +82,6 @@ def _installed(key: str) -> list[Path]:
     return [Path(str(f.locate())).absolute() for f in files if f.name in published.names]
 
 
-def missing(keys: Iterable[str], weights_path: Path | None = None) -> list[WeightFile]:
-    """Return the files that are in none of the places; nothing is downloaded."""
-    return [WEIGHT_FILES[key] for key in keys if not find(key, weights_path)]
-
-
 def is_published(key: str, path: Path) -> bool | None:
     """Return whether a file is the published one; None if the sha256 of that is not known."""
     published = WEIGHT_FILES[key].sha256
@@ -120,7 +115,7 @@ def fetch(
     if target.exists() and not target.is_dir():
         raise OptionError(f"--weights {target}: not a folder; give the folder of the weights")
     keys, failures = list(keys), {}
-    lacking = missing(keys)  # before anything is written
+    lacking = [WEIGHT_FILES[key] for key in keys if not find(key)]  # before anything is written
     for key in keys:
         path = target / WEIGHT_FILES[key].file_name
         if not path.exists():

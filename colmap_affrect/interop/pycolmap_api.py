@@ -33,11 +33,10 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.stages import verify as verify_stage
-from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_images_and_keypoints
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import add_pairs

@@ -50,7 +50,7 @@ from colmap_affrect.stages.extract import (
     write_images_and_keypoints,
 )
 from colmap_affrect.stages.guide import restore_exact
-from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, matched_at_level
+from colmap_affrect.stages.match import match_pairs, matched_at_level, write_batches
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers, verify_new
@@ -274,16 +274,11 @@ class Escalation:
 
     def measured(self, pair: Pair, indices: NDArray[np.integer]) -> Bools:
         """Return which of the (M, 2) matches of a pair are of frames that were measured singly."""
-        first, second = (
-            self.are_measured(name, indices[:, side]) for side, name in enumerate(pair)
-        )
-        return np.asarray(first & second)
-
-    def are_measured(self, name: str, rows: NDArray[np.integer]) -> Bools:
-        """Return which keypoints of an image, (N,) rows, are of frames that were measured."""
-        ends = self.features.level_ends(name)
-        levels = np.searchsorted(ends, rows, side="right")
-        return np.asarray(np.array(self._is_measured)[levels])
+        found = np.ones(len(indices), bool)
+        for name, rows in zip(pair, indices.T, strict=True):
+            levels = np.searchsorted(self.features.level_ends(name), rows, side="right")
+            found &= np.array(self._is_measured)[levels]
+        return found
 
     def _match_again(
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
@@ -291,28 +286,18 @@ class Escalation:
         size_px = self.extraction.levels[level].max_image_size_px
         verifier, graph = PairVerifier(self.path, self.verification, size_px), self.graph()
         others = self._inliers_of_other_kind(pairs, level)
-        tried: list[Pair] = []
-        better: list[PairMatches] = []
 
-        def record() -> None:
+        def judged(found: PairMatches) -> tuple[Pair, PairMatches | None]:
+            chosen, worth = self._judged(found, others.get(found.names), verifier)
+            return found.names, chosen if worth > graph.worth(found.names) else None
+
+        def write(batch: Sequence[tuple[Pair, PairMatches | None]]) -> None:
+            better = [chosen for _, chosen in batch if chosen]
+            tried = [names for names, _ in batch]
             self.matches.write(better, tried, level)  # both or neither, if it is killed here
-            tried.clear()
-            better.clear()
 
-        try:
-            matched = matched_at_level(self.context, pairs, self.matching, level)
-            with closing(matched) as found_pairs:
-                for found in found_pairs:
-                    tried.append(found.names)
-                    chosen, worth = self._judged(found, others.get(found.names), verifier)
-                    if worth > graph.worth(found.names):
-                        better.append(chosen)
-                    advance(1)
-                    if len(tried) == PAIRS_PER_WRITE:
-                        record()
-        finally:
-            if tried:
-                record()
+        with closing(matched_at_level(self.context, pairs, self.matching, level)) as found_pairs:
+            write_batches(map(judged, found_pairs), write, advance)
 
     def _judged(
         self, found: PairMatches, others: Indices | None, verifier: PairVerifier

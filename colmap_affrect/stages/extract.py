@@ -29,8 +29,7 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.inputs import Inputs
+from colmap_affrect.stages.context import Context, Inputs
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
     ImageExtractor,
@@ -62,7 +61,8 @@ def extract(
     workspace, folder = context.workspace, Path(inputs.image_path)
     inputs.check()
     workspace.require_own(folder)
-    _require_usable_cameras(workspace, inputs)
+    if inputs.from_database and not workspace.database.exists():
+        refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)  # before it is on record
     names = inputs.names()
     names = checked_names(folder, image_names, "image_names") if image_names else names
     options, known = recipe.extraction, {} if overwrite else context.features.contents()
@@ -102,12 +102,6 @@ def extract(
     new, kept = set(missing) - failures.keys(), done - failures.keys()
     wall_s = time.perf_counter() - start
     return StageReport("extract", wall_s, len(new), len(kept), failures, warnings)
-
-
-def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:
-    """Refuse cameras of a database that cannot be used before it is on record."""
-    if inputs.from_database and not workspace.database.exists():
-        refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)
 
 
 def _extract_missing(

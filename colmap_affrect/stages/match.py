@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
+
+Found = TypeVar("Found")
 
 
 def match(
@@ -89,19 +92,26 @@ def match_pairs(
     context: Context, pairs: Sequence[Pair], options: MatcherOptions, advance: Callable[[int], None]
 ) -> None:
     """Match pairs by the features that every image has, and store them batch by batch."""
-    matches, batch, written = context.matches, list[PairMatches](), time.monotonic()
+    with closing(matched_at_level(context, pairs, options, 0)) as found_pairs:
+        write_batches(found_pairs, context.matches.write, advance)
+
+
+def write_batches(
+    found: Iterable[Found], write: Callable[[list[Found]], None], advance: Callable[[int], None]
+) -> None:
+    """Write what is found of pairs batch by batch, also the last one when the search is stopped."""
+    batch, written = list[Found](), time.monotonic()
     try:
-        with closing(matched_at_level(context, pairs, options, 0)) as found_pairs:
-            for found in found_pairs:
-                batch.append(found)
-                advance(1)
-                is_due = time.monotonic() - written > SECONDS_PER_WRITE
-                if len(batch) == PAIRS_PER_WRITE or is_due:
-                    matches.write(batch)
-                    batch, written = [], time.monotonic()
+        for item in found:
+            batch.append(item)
+            advance(1)
+            is_due = time.monotonic() - written > SECONDS_PER_WRITE
+            if len(batch) == PAIRS_PER_WRITE or is_due:
+                write(batch)
+                batch, written = [], time.monotonic()
     finally:
         if batch:
-            matches.write(batch)
+            write(batch)
 
 
 def matched_at_level(

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.data import (
-    GrayImage,
     LocalFeatures,
     Mask,
     Photograph,
@@ -217,17 +216,6 @@ def num_images_at_once(extractor: ImageExtractor) -> int:
     num_bytes = max(x.features.bytes_per_px * x.max_image_size_px**2 for x in levels)
     most = 2 if extractor.options.uses_networks else available_cores()
     return min(most, max(1, available_memory_bytes() // 2 // num_bytes))
-
-
-def extract_image(image: GrayImage, options: ExtractionOptions | None = None) -> LocalFeatures:
-    """Extract the features of one (H, W) uint8 image, frames in its px.
-
-    For many images build the extractor once with :func:`prepare`.
-    """
-    extractor = prepare(options or ExtractionOptions())
-    size = (image.shape[1], image.shape[0])
-    photograph = Photograph(image, "", None, camera_matrix(size))
-    return extractor.execute(photograph, extractor.plan(photograph))
 
 
 def prepare(

@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Collection, Sequence
-from contextlib import suppress
 from itertools import combinations
 from pathlib import Path
 
@@ -24,20 +23,6 @@ MANY_PAIRS = (
     "all pairs of %d images are %d; --pairs retrieval matches the promising ones only "
     "(see --num-neighbors)"
 )
-
-
-def expected_num_pairs(options: PairOptions, num_images: int) -> int:
-    """Return about how many pairs there will be, before anything is known of the images.
-
-    A list of pairs that cannot be read counts as none; :func:`choose_pairs` says why.
-    """
-    every = num_images * (num_images - 1) // 2
-    if options.match_list_path:
-        with suppress(OSError), Path(options.match_list_path).open("rb") as lines:
-            return sum(1 for _ in lines)
-        return 0
-    is_every = "exhaustive" in options.methods
-    return every if is_every else min(every, num_images * options.num_neighbors)
 
 
 def choose_pairs(

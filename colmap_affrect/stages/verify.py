@@ -24,8 +24,7 @@ from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.inputs import source_files
+from colmap_affrect.stages.context import Context, source_files
 from colmap_affrect.stages.match import write_matches
 from colmap_affrect.stages.pairs import listed_pairs
 

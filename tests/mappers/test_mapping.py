@@ -22,10 +22,9 @@ from colmap_affrect.pipeline import map_and_report
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches

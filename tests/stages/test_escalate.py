@@ -23,11 +23,10 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import escalate as escalation
-from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.context import Context, Inputs
 from colmap_affrect.stages.escalate import Escalation
 from colmap_affrect.stages.escalation_graph import weakly_connected_images
 from colmap_affrect.stages.extract import extract
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import extracted_px, verify_matches

@@ -23,7 +23,7 @@ from colmap_affrect.project.stores import STATIONARY
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import guide as stage
-from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import (
     current,
@@ -33,7 +33,6 @@ from colmap_affrect.stages.guide import (
     inliers_by_guiding,
     restore_exact,
 )
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.stationary import NUM_CELLS

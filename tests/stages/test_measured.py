@@ -24,7 +24,7 @@ from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import map as stage
-from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.context import Context, Inputs
 from colmap_affrect.stages.escalate import (
     MIN_NUM_TELLING,
     OUTNUMBERED,
@@ -32,7 +32,6 @@ from colmap_affrect.stages.escalate import (
     escalate,
 )
 from colmap_affrect.stages.extract import extract
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verified_inliers, verify_matches

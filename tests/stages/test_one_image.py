@@ -28,9 +28,8 @@ from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 from colmap_affrect.stages import one_image, one_pair
-from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.extract import extract
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_image import num_images_at_once, prepare
 
 WIDTH, HEIGHT = 480, 360
