@@ -31,8 +31,8 @@ from colmap_affrect.progress import Progress, Stopwatch
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.match import CachedMatcher, Matching
 from colmap_affrect.stages.one_image import prepare
-from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)
 

@@ -47,7 +47,7 @@ def inspect_image(
 def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int) -> InspectedLevel:
     """Carry out level ``number`` of a recipe as extraction does, and keep all that passes by."""
     start = time.perf_counter()
-    plan, warning = extractor.plan_or_warn(photograph, number)
+    plan, warning = extractor.plan(photograph, number)
     recorder = _Recorder(extractor.extractors[number])
     recorders = (*extractor.extractors[:number], recorder, *extractor.extractors[number + 1 :])
     features = replace(extractor, extractors=recorders).execute(photograph, plan, number)

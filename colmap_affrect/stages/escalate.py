@@ -87,14 +87,12 @@ def escalate(
     escalation = Escalation(context, options)
     if overwrite:
         escalation.undo()
-    if len(colmap_database.unverified_pairs(context.workspace.database)):
-        escalation.write()  # it was killed there
+    escalation.write()  # it may have been killed before
     escalated: set[Pair] = set()
     while work := escalation.next_work():
         level, todo = work
         escalation.match_at(todo, level)
         escalated |= set(todo)
-    escalation.write()
     return StageReport("escalate", time.perf_counter() - start, len(escalated))
 
 
@@ -251,7 +249,6 @@ class Escalation:
             match_pairs(self.context, higher, self.matching, advance)
         self.matches.write((), self.pairs, 0)
         self.matches.keep_note(STEP, None)
-        self.write()
 
     def _extend(self, names: Sequence[str], level: int, advance: Callable[[int], None]) -> None:
         """Add to images the features of all levels that they lack, up to this one."""

@@ -27,8 +27,7 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore, GuidedPair
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalation_graph import weakly_connected_images
-from colmap_affrect.stages.match import PAIRS_PER_WRITE
-from colmap_affrect.stages.one_pair import ImageCache
+from colmap_affrect.stages.match import PAIRS_PER_WRITE, ImageCache
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (
     extracted_px,

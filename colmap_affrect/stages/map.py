@@ -29,9 +29,6 @@ logger = logging.getLogger(__name__)
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
-TOO_FEW = "more photographs: two that can be read and show the same from two places make a model"
-"""Advised where nothing else would help."""
-
 
 def map_images(
     context: Context,
@@ -163,7 +160,7 @@ def advice(
     workspace = context.workspace
     num_keypoints = colmap_database.keypoint_counts(workspace.database)
     if (missing or doubts) and sum(map(bool, num_keypoints.values())) < 2:
-        return (TOO_FEW,)
+        return ("more photographs: two that can be read and show the same make a model",)
     missing = [name for name in missing if name in num_keypoints]  # nothing helps unreadable ones
     if not (missing or doubts):
         return ()

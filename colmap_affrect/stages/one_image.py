@@ -130,7 +130,7 @@ class ImageExtractor:
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
         with self.network_lock:
-            plan, warning = self.plan_or_warn(photograph, level)
+            plan, warning = self.plan(photograph, level)
             features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
             resized = resized_from_original(original_size, photograph.size)
@@ -154,11 +154,6 @@ class ImageExtractor:
         stored = decode(path)
         black_and_white = tones(stored) if self.options.stretch_contrast else None
         image = in_eight_bits(stored, black_and_white)
-        if mask is not None and mask.shape != image.shape:
-            raise ImageError(
-                f"{path}: is {image.shape[1]} x {image.shape[0]} px and its mask "
-                f"{mask.shape[1]} x {mask.shape[0]} px; they must have one size"
-            )
         original_size = (image.shape[1], image.shape[0])
         chosen = self.options.levels[level]
         limit = chosen.max_image_size_px
@@ -175,16 +170,12 @@ class ImageExtractor:
         found = Photograph(gray, name or path.name, path, camera, mask, color, stretched)
         return found, original_size
 
-    def plan(self, photograph: Photograph, level: int = 0) -> RectificationPlan:
-        """Decide which warps to look at; DepthError when a depth map is needed and unusable."""
+    def plan(self, photograph: Photograph, level: int = 0) -> tuple[RectificationPlan, str]:
+        """Decide which warps to look at; without a usable depth map none, and say why."""
         if min(photograph.size) < MIN_RECTIFIABLE_PX:
-            return RectificationPlan(photograph.size)
-        return self.rectifiers[level].plan(photograph)
-
-    def plan_or_warn(self, photograph: Photograph, level: int = 0) -> tuple[RectificationPlan, str]:
-        """Plan; without a usable depth map plan no warps and say why, else say nothing."""
+            return RectificationPlan(photograph.size), ""
         try:
-            return self.plan(photograph, level), ""
+            return self.rectifiers[level].plan(photograph), ""
         except DepthError as error:
             return RectificationPlan(photograph.size), f"not rectified: {error}"
 

@@ -31,8 +31,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.extract import extract
-from colmap_affrect.stages.match import match
-from colmap_affrect.stages.one_pair import Matching, iterate_matches
+from colmap_affrect.stages.match import Matching, iterate_matches, match
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 
 CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)

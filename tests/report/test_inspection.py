@@ -47,7 +47,7 @@ def test_level_has_the_plan_and_the_features_of_extraction(
     extractor: ImageExtractor, photo: Path, tmp_path: Path
 ) -> None:
     photograph, _ = extractor.photograph(photo)
-    level, plan = inspect_level(extractor, photograph, 0), extractor.plan_or_warn(photograph)[0]
+    level, plan = inspect_level(extractor, photograph, 0), extractor.plan(photograph)[0]
     features = extractor.extract_file(photo).features
     assert len(level.plan.items) == len(plan.items) > 0
     assert_array_equal(level.features.lafs, features.lafs)

@@ -27,7 +27,7 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
-from colmap_affrect.stages import one_image, one_pair
+from colmap_affrect.stages import match, one_image
 from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.one_image import num_images_at_once, prepare
@@ -181,10 +181,10 @@ def test_work_in_another_process_refuses_other_weights(
     found = {"affnet": tmp_path / "AffNet.pth"}
     found["affnet"].write_bytes(b"published")
     pickled = pickle.dumps(replace(prepare(ExtractionOptions()), weights=found))
-    for module in (one_image, one_pair):
+    for module in (one_image, match):
         monkeypatch.setattr(module, "resolve", lambda *_, **__: found)
     store = FeatureStore(tmp_path / "features.h5")
-    matcher = pickle.dumps(one_pair.CachedMatcher(one_pair.Matching(store, NearestOptions())))
+    matcher = pickle.dumps(match.CachedMatcher(match.Matching(store, NearestOptions())))
     assert pickle.loads(pickled).options == ExtractionOptions()
     pickle.loads(matcher)
     found["affnet"].write_bytes(b"of another release")
@@ -232,7 +232,7 @@ def test_extractors_that_ask_for_colour_see_the_warps_in_colour(tmp_path):
     assert whole[5, 7, 0] > 120  # red comes first
     assert warps
     photograph, _ = gray.photograph(path)
-    for view, item in zip(warps, gray.plan(photograph).items, strict=True):
+    for view, item in zip(warps, gray.plan(photograph)[0].items, strict=True):
         assert view.shape == (*item.canvas_size[::-1], 3)
         channel = warp(np.ascontiguousarray(whole[:, :, 1]), item)
         assert_array_equal(view[:, :, 1], channel)

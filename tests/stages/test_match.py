@@ -12,8 +12,8 @@ from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs
 from colmap_affrect.project.stores import FeatureStore
-from colmap_affrect.stages import one_pair
-from colmap_affrect.stages.one_pair import CachedMatcher, Matching, iterate_matches
+from colmap_affrect.stages import match as stage
+from colmap_affrect.stages.match import CachedMatcher, Matching, iterate_matches
 
 NAMES = [f"{index}.png" for index in range(6)]
 NUM_FEATURES = 50
@@ -50,11 +50,11 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
     reads: list[str] = []
     read = CachedMatcher._prepare
 
-    def counted(cache: CachedMatcher, name: str) -> one_pair.PreparedImage:
+    def counted(cache: CachedMatcher, name: str) -> stage.PreparedImage:
         reads.append(name)
         return read(cache, name)
 
     monkeypatch.setattr(CachedMatcher, "_prepare", counted)
-    monkeypatch.setattr(one_pair, "CACHE_BYTES", 3 * 800 * NUM_FEATURES)
+    monkeypatch.setattr(stage, "CACHE_BYTES", 3 * 800 * NUM_FEATURES)
     assert matches(store) == expected
     assert len(NAMES) < len(reads) <= 3 * len(NAMES)
