@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
-from colmap_affrect.colmap.model_files import SUMMARY, registered_names
+from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.summaries import model_folders, read_summary
@@ -214,10 +214,7 @@ def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
         return path.exists()
 
     def num_images(model: Path) -> int:
-        if not read_summary(model):
-            what = "is missing or damaged: how the model came about is not known any more"
-            again = f"run 'colmap-affrect map --output-path {quoted} --overwrite'"
-            diagnosis.add("error", model / SUMMARY, what, again)
+        read_summary(model)
         return len(registered_names(model))
 
     done = read(workspace.config, _stages, diagnosis, context) or []

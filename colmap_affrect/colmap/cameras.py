@@ -26,7 +26,6 @@ from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_agai
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import Options
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.contents import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.tables import read_table
 
@@ -81,13 +80,13 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     with damage(path, made_again("verify", path.parent), WorkspaceError):
         if not path.exists():
             return {}
-        return _RECORDS.validate_json(without_checksum(path.read_bytes()))
+        return _RECORDS.validate_json(path.read_bytes())
 
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Replace the file as a whole."""
     content = _RECORDS.dump_json(dict(sorted(records.items())), indent=1)
-    replace_text(path, with_checksum(content.decode()))
+    replace_text(path, content.decode())
 
 
 @cache

@@ -30,7 +30,6 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.project.atomic_files import cannot_write
-from colmap_affrect.project.contents import without_checksum
 
 Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
 Poses = dict[str, Pose]  # poses by image name
@@ -170,7 +169,7 @@ def _is_binary(folder: Path) -> bool:
 def kept_digests(folder: Path) -> dict[str, str]:
     """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
-        known = json.loads(without_checksum((folder / SUMMARY).read_bytes()))["model"]
+        known = json.loads((folder / SUMMARY).read_bytes())["model"]
     except (OSError, ValueError, TypeError, KeyError):
         return {}
     return known if isinstance(known, dict) else {}

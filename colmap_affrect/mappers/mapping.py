@@ -1,6 +1,5 @@
 """From a verified database to a folder of models, by any mapper."""
 
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -8,9 +7,7 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import (
-    SUMMARY,
     num_long_tracks,
-    read_given_model,
     seen_points,
     write_model,
 )
@@ -20,11 +17,9 @@ from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.reliability import Judgement, judge
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
-from colmap_affrect.mappers.summaries import model_folders, read_summary, write_summary
+from colmap_affrect.mappers.summaries import write_summary
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import DOUBTFUL, ModelSummary, Registration
-
-logger = logging.getLogger(__name__)
 
 Judgements = Mapping[str, Judgement]
 """By the names of the images."""
@@ -92,20 +87,6 @@ def map_database(
 def _size(judged: tuple[MappedModel, Judgements]) -> tuple[int, int]:
     model = judged[0].reconstruction
     return model.num_reg_images(), model.num_points3D()
-
-
-def read_models(sparse_path: Path, task: MappingTask) -> list[ModelSummary]:
-    """Return the summaries of the models that :func:`map_database` wrote for a task.
-
-    A model whose summary is damaged is judged anew; how it came about is not known any more.
-    """
-    return [read_summary(path) or _judged_anew(path, task) for path in model_folders(sparse_path)]
-
-
-def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
-    logger.warning("%s: %s is missing or damaged; the model is judged anew", folder, SUMMARY)
-    model = MappedModel(read_given_model(folder))
-    return _summary(model, judge(model, task), task)
 
 
 def _judged(mapped: MappedModel, task: MappingTask) -> tuple[MappedModel, Judgements]:

@@ -1,18 +1,13 @@
 """What files hold: SHA-256 digests, kept with sizes and times so that an idle run reads none.
 
-A store keeps with the features of an image what they were extracted from. JSON objects have a
-checksum as last entry.
+A store keeps with the features of an image what they were extracted from.
 """
 
 import hashlib
-import re
-import zlib
 from collections.abc import Callable, Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
-
-CHECKSUM = re.compile(rb',\s*"crc32": "([0-9a-f]{8})"\s*}\s*$')
 
 
 class Content(NamedTuple):
@@ -61,21 +56,3 @@ def _or_empty(read: Callable[[Path], str], path: Path) -> str:
         return read(path)
     except OSError:
         return ""
-
-
-def with_checksum(text: str) -> str:
-    """Return the text of a JSON object with a checksum."""
-    body = text.rstrip().removesuffix("}").rstrip()
-    if body == "{":
-        return text
-    return f'{body},\n "crc32": "{zlib.crc32(body.encode()):08x}"\n}}\n'
-
-
-def without_checksum(content: bytes) -> bytes:
-    """Return a JSON object without its checksum; ValueError if it has one that does not fit."""
-    if not (found := CHECKSUM.search(content)):
-        return content
-    body = content[: found.start()]
-    if zlib.crc32(body) != int(found[1], 16):
-        raise ValueError("it is not as it was written")
-    return body + b"}"

@@ -13,10 +13,10 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
-from colmap_affrect.mappers.mapping import map_database, read_models
+from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
-from colmap_affrect.mappers.summaries import refuse_edited
+from colmap_affrect.mappers.summaries import read_summaries
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
@@ -58,16 +58,15 @@ def map_images(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
         )
-    task = _task(context, existing)
     if known == inputs:
-        models = read_models(workspace.sparse, task)
+        models = read_summaries(workspace.sparse)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
-    refuse_edited(workspace.sparse)
+    read_summaries(workspace.sparse)  # refuses edited ones
     workspace.record_made_from(map="")  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
-        models = map_database(mapper, task, workspace.sparse, advance)
+        models = map_database(mapper, _task(context, existing), workspace.sparse, advance)
     workspace.record_made_from(map=inputs)
     warnings = {}
     if extend and existing and existing.num_other_keypoints:
