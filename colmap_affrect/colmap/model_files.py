@@ -170,7 +170,7 @@ def kept_digests(folder: Path) -> dict[str, str]:
     """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
         known = json.loads((folder / SUMMARY).read_bytes())["model"]
-    except (OSError, ValueError, TypeError, KeyError):
+    except DAMAGE:
         return {}
     return known if isinstance(known, dict) else {}
 

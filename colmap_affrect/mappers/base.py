@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
     from colmap_affrect.colmap.cameras import CameraRecord
     from colmap_affrect.mappers.existing import ExistingModel
+    from colmap_affrect.project.report import Registration
 
 
 class MapperOptions(PartOptions, PresetOptions):
@@ -98,37 +99,19 @@ class MappingTask:
 
 
 @dataclass(frozen=True)
-class Bridge:
-    """Images that came into a model by one verified pair, not by tracks through three images.
-
-    Attributes:
-        pair: names of an image that the model had, and of one that came in.
-        names: all images that came in with it, sorted; more than one when a whole model did.
-        num_agreeing: places whose depths agree on the scale.
-        num_ratios: places where both the model and the pair know a depth.
-        scale_error_frac: standard error of the scale.
-    """
-
-    pair: tuple[str, str]
-    names: tuple[str, ...]
-    num_agreeing: int
-    num_ratios: int
-    scale_error_frac: float
-
-
-@dataclass(frozen=True)
 class MappedModel:
     """A model and how some of its images came in.
 
     Attributes:
         reconstruction: the model.
-        bridges: in the order in which they were made.
+        bridges: by the names of images that came in by one verified pair, alone or with a whole
+            model, not by tracks through three images.
         taken_out: images that were surely wrong and had to leave, with the reason.
         moves: what made the model, in the words of a report.
     """
 
     reconstruction: pycolmap.Reconstruction
-    bridges: tuple[Bridge, ...] = ()
+    bridges: Mapping[str, Registration] = field(default_factory=dict)
     taken_out: Mapping[str, str] = field(default_factory=dict)
     moves: tuple[str, ...] = ()
 

@@ -20,7 +20,6 @@ from colmap_affrect.geometry.two_views import (
     ScaleEstimate,
     scale_between,
 )
-from colmap_affrect.mappers.base import Bridge
 from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
     CameraById,
@@ -31,6 +30,7 @@ from colmap_affrect.mappers.pair_graph import (
     inverse,
     poses_of,
 )
+from colmap_affrect.project.report import Registration
 
 RADIUS_FRAC = 0.03
 """Places of known depth are neighbours up to this part of the longer side of the image."""
@@ -95,7 +95,7 @@ class Hypothesis:
         other: index of the model that comes in; None for a single image.
     """
 
-    bridge: Bridge
+    bridge: Registration
     poses: Mapping[int, Pose]
     cameras: CameraById
     share: float
@@ -232,10 +232,9 @@ class Bridges:
                 agreeing += pair.weight * self.graph.agreement(pair, all_poses, all_cameras)
         if weight and agreeing < MIN_SHARE * weight:
             return None
-        names = self.graph.names
-        bridge = Bridge(
-            (names[ids[0]], names[ids[1]]),
-            tuple(sorted(names[image_id] for image_id in poses)),
+        bridge = Registration(
+            "bridged",
+            self.graph.names[ids[0]],
             scale.num_agreeing,
             scale.num_ratios,
             scale.error_frac,

@@ -10,10 +10,10 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.adjustment import FAST, FINAL, MEDIUM, Adjuster
-from colmap_affrect.mappers.base import Bridge
 from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
 from colmap_affrect.mappers.evidence import Evidence
 from colmap_affrect.mappers.pair_graph import CameraById, PairGraph, PoseById
+from colmap_affrect.project.report import Registration
 
 MIN_POINTS = 10  # of a first pair
 ALWAYS = 10  # images up to which everything is adjusted after each one
@@ -151,9 +151,9 @@ class Joiner:
 
     def join(
         self, model: pycolmap.Reconstruction, others: Models
-    ) -> tuple[pycolmap.Reconstruction, tuple[Bridge, ...]]:
+    ) -> tuple[pycolmap.Reconstruction, dict[str, Registration]]:
         """Bridge from a model to images and to others until nothing joins; return its bridges."""
-        built: list[Bridge] = []
+        built: dict[str, Registration] = {}
         score = self.evidence.of(model)
         while True:
             hypotheses = self.bridges.find(Part(model), [Part(other) for other in others])
@@ -164,8 +164,8 @@ class Joiner:
                 if new and new_score > score and self.graph.supports(grown, new):
                     break
             else:
-                return model, tuple(built)
+                return model, built
             model, score = grown, new_score
-            built.append(hypothesis.bridge)
+            built.update({self.graph.names[i]: hypothesis.bridge for i in hypothesis.poses})
             if hypothesis.other is not None:
                 others = [other for i, other in enumerate(others) if i != hypothesis.other]

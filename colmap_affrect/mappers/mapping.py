@@ -131,21 +131,10 @@ def _summary(mapped: MappedModel, found: Judgements, task: MappingTask) -> Model
 def registrations(model: MappedModel, task: MappingTask) -> dict[str, Registration]:
     """Tell by what each registered image was registered."""
     reconstruction = model.reconstruction
-    bridged = {
-        name: Registration(
-            "bridged",
-            bridge.pair[0],
-            bridge.num_agreeing,
-            bridge.num_ratios,
-            bridge.scale_error_frac,
-        )
-        for bridge in model.bridges
-        for name in bridge.names
-    }
     guided = _tied_by_guided_matches(reconstruction, task) if task.guided else set()
     names = {i: reconstruction.images[i].name for i in reconstruction.reg_image_ids()}
     return {
-        name: bridged.get(name, Registration("guided" if image_id in guided else "tracks"))
+        name: model.bridges.get(name, Registration("guided" if image_id in guided else "tracks"))
         for image_id, name in sorted(names.items(), key=lambda item: item[1])
     }
 

@@ -26,7 +26,7 @@ from colmap_affrect.mappers.adjustment import (
     FocalPrior,
     priors_of,
 )
-from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import Evidence, cells, pair_evidence
 from colmap_affrect.mappers.pair_graph import (
     Ids,
@@ -36,6 +36,7 @@ from colmap_affrect.mappers.pair_graph import (
     graph_of,
     poses_of,
 )
+from colmap_affrect.project.report import Registration
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 FREE_SIGMA = 1.0  # of the logarithm of a focal length that is given, where it is freed
@@ -86,7 +87,7 @@ class Measures:
     focal_px: float
     fitting_px: float
     turned: float
-    bridge: Bridge | None
+    bridge: Registration | None
     original: str
     zoom: float
 
@@ -108,7 +109,7 @@ def _bridge_reason(m: Measures) -> str:
     if not m.bridge:
         return ""
     error = f"{m.bridge.scale_error_frac:.0%}"
-    return f"bridged by {m.bridge.pair[0]} alone, at a distance known to +-{error}"
+    return f"bridged by {m.bridge.by} alone, at a distance known to +-{error}"
 
 
 TERMS: Mapping[str, Term] = {
@@ -211,7 +212,6 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
     growth, fitting_px = _focal_growths(model, task), fitting_focals(model, task)
     zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
-    bridges = {name: bridge for bridge in mapped.bridges for name in bridge.names}
     found = {}
     for image_id, own in pairs_of.items():
         shares = [agreements[pair.ids] for pair in own]
@@ -234,7 +234,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             focal_px=float(camera.mean_focal_length()),
             fitting_px=fitting_px.get(camera.camera_id, 0.0),
             turned=float(np.mean(rotations)) if rotations else 0.0,
-            bridge=bridges.get(name),
+            bridge=mapped.bridges.get(name),
             original=graph.names[originals[image_id]] if image_id in originals else "",
             zoom=zooms.get((camera.width, camera.height), 1.0),
         )

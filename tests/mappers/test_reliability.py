@@ -13,7 +13,7 @@ from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.geometry.parallax import mirrored_share
-from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.mapping import registrations
 from colmap_affrect.mappers.reliability import TERMS, judge, judged, measure
 from colmap_affrect.project.report import DOUBTFUL, SURE, Registration
@@ -61,7 +61,7 @@ def test_image_that_contradicts_its_pairs_is_doubted_and_the_others_are_not(tmp_
 def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     good = measure(mapped, task)[last(mapped).name]
-    bridge = Bridge(("a", "b"), ("b",), 11, 39, 0.25)
+    bridge = Registration("bridged", "a", 11, 39, 0.25)
     bad = {
         "evidence": (replace(good, evidence=-20.0), "speak against"),
         "agreement": (replace(good, agreement=0.1), "only 10% of the matches"),
@@ -217,9 +217,9 @@ def test_given_focal_lengths_are_doubted_where_the_points_say_others(
 def test_how_images_came_in(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     name = last(mapped).name
-    bridge = Bridge(("a.jpg", name), (name,), 32, 36, 0.031)
-    found = registrations(MappedModel(mapped.reconstruction, (bridge,)), task)
-    assert found.pop(name) == Registration("bridged", "a.jpg", 32, 36, 0.031)
+    bridge = Registration("bridged", "a.jpg", 32, 36, 0.031)
+    found = registrations(MappedModel(mapped.reconstruction, {name: bridge}), task)
+    assert found.pop(name) == bridge
     assert set(found.values()) == {Registration("tracks")}
 
 

@@ -123,11 +123,9 @@ def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path
             relative_pose(found[first], found[second]), relative_pose(truth[first], truth[second])
         )
         assert max(errors) < 1.0
-    came_in = [name for bridge in model.bridges for name in bridge.names]
-    assert len(came_in) == len(set(came_in)) == 4
-    for bridge in model.bridges:
-        assert bridge.pair[0] not in bridge.names
-        assert bridge.pair[1] in bridge.names or bridge.pair[0] == bridge.pair[1]
+    assert len(model.bridges) == 4
+    for name, bridge in model.bridges.items():
+        assert bridge.by != name
         assert bridge.num_agreeing > 0.8 * bridge.num_ratios
         assert 0.0 < bridge.scale_error_frac < MAX_SCALE_ERROR
 
@@ -173,5 +171,5 @@ def test_what_incremental_mapping_registers_is_left_as_it_is(tmp_path: Path, cou
     path = tmp_path / "database.db"
     write_scene(path, views(count), [(0, 1)])
     (model,) = mapped(path, tmp_path / "models")
-    assert model.bridges == ()
+    assert model.bridges == {}
     assert model.reconstruction.num_reg_images() == 2

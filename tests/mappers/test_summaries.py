@@ -64,8 +64,6 @@ def test_a_model_that_has_changed_is_refused_but_its_copy_is_not(
 @pytest.mark.parametrize("content", ['{"model": [1]}', "", "[]"])
 def test_a_damaged_summary_is_one_clear_line(folder: Path, content: str) -> None:
     (folder / SUMMARY).write_text(content)
-    with pytest.raises(
-        StoreError, match=r"summary\.json: damaged .*; if you have edited"
-    ):
+    with pytest.raises(StoreError, match=r"summary\.json: damaged .*; if you have edited"):
         read_summary(folder)
     assert read_given_model(folder).num_points3D() == 20
