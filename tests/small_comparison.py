@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
@@ -18,10 +17,6 @@ from colmap_affrect.pairs.base import Pair
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")
 IMAGE_SIZE = (160, 120)
-SIMILARITY = pycolmap.Sim3d(
-    2.5, pycolmap.Rotation3d(np.array([0.1, 0.7, -0.2, 0.4])), np.array([3.0, -1.0, 2.0])
-)
-"""Between the models of the two methods: no model has a frame of its own."""
 
 
 def make_comparison(folder: Path) -> Comparison:
@@ -38,7 +33,7 @@ def make_comparison(folder: Path) -> Comparison:
         write_image(photographs / name, slanted)
     truth, pair_inliers = write_scene(folder / "all.db")
     sift = _write_method(folder, "sift", truth, NAMES[:4])
-    default = _write_method(folder, "default", truth, NAMES[:5], SIMILARITY)
+    default = _write_method(folder, "default", truth, NAMES[:5])
     first = _seed(0, default, len(pair_inliers), wrong=[NAMES[4]])
     second = _seed(1, default, len(pair_inliers) - 1)
     models = tuple(sorted(NAMES[:4])), tuple(NAMES[4:])
@@ -82,15 +77,12 @@ def _write_method(
     method: str,
     truth: pycolmap.Reconstruction,
     names: Sequence[str],
-    new_from_old: pycolmap.Sim3d | None = None,
 ) -> pycolmap.Reconstruction:
     """Write the database and the model of a method, which registers some of the images."""
     model = pycolmap.Reconstruction(truth)
     for image in list(model.images.values()):
         if image.name not in names:
             model.deregister_frame(image.frame_id)
-    if new_from_old is not None:
-        model.transform(new_from_old)
     seed = folder / "methods" / method / "seed-0"
     (seed / "sparse" / "0").mkdir(parents=True)
     model.write(seed / "sparse" / "0")

@@ -11,7 +11,7 @@ from colmap_affrect.comparison.tables import headline, notes, table
 from colmap_affrect.options import flat
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.report import page
-from colmap_affrect.report.scene import read_scene
+from colmap_affrect.report.scene import read_view
 
 TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
 
@@ -68,8 +68,8 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
     columns = columns_of(comparison)
     names, folder = comparison.image_names, Path(comparison.image_path)
     cards = cards_of(columns, comparison)
-    shown = {column.method.name: column.method.shown_seed for column in columns}
-    views = read_scene({n: output_path / s.model_path if s else None for n, s in shown.items()})
+    shown = [column.method.shown_seed for column in columns]
+    views = [read_view(output_path / seed.model_path if seed else None) for seed in shown]
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
     content = {
         "comparison": comparison,

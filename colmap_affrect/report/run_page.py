@@ -21,7 +21,7 @@ from colmap_affrect.project.report import (
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.page import TEMPLATES, write_page
 from colmap_affrect.report.pictures import base64_text
-from colmap_affrect.report.scene import read_scene
+from colmap_affrect.report.scene import read_view
 
 KINDS = {
     "tracks": "registered by common points",
@@ -68,7 +68,7 @@ def write_run_page(
     cards = [_card(number, name, report, model) for number, name in enumerate(names, 1)]
     known = set(names)
     pair_inliers = {pair: n for pair, n in pair_inliers.items() if known >= set(pair)}
-    (view,) = read_scene({"this run": workspace.sparse / "0" if report.models else None})
+    view = read_view(workspace.sparse / "0" if report.models else None)
     kinds = Counter(card.kind for card in cards)
     content = {
         "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",

@@ -1,4 +1,4 @@
-"""Cameras and points of models, in one frame, to be drawn in a page."""
+"""Cameras and points of a model, to be drawn in a page."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,8 +13,7 @@ from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.report.pictures import base64_text
 
-MAX_ALIGNMENT_ERROR = 0.05  # of a camera in two models, in radii of the view
-MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE = 20_000, 40_000  # of a model, and of all that are on a page
+MAX_NUM_POINTS = 20_000  # that are drawn of a model
 POINT_PERCENTILE = 90.0  # share of the points, from the middle outwards, that the view holds
 RADIUS_MARGIN = 1.15
 MIN_COMMON_DIRECTION = 0.3  # length of the mean horizontal viewing direction that gives a front
@@ -32,7 +31,7 @@ class View3D:
     points: str = ""
     # name and (5, 3) centre and corners of the pyramid of each camera
     cameras: tuple[tuple[str, Array], ...] = ()
-    note: str = ""  # what is special about it; empty if nothing is
+    note: str = ""  # why there is nothing to draw; empty if there is
 
     def script_data(self, index: Mapping[str, int], kinds: Mapping[str, str]) -> dict[str, Any]:
         """Return what the page's script reads; ``kinds`` are names of colours by photograph."""
@@ -48,41 +47,16 @@ class View3D:
         return {"points": self.points, "count": self.num_points, "cameras": cameras}
 
 
-def read_scene(paths: Mapping[str, Path | None]) -> list[View3D]:
-    """Read models (None: no model) by name, and bring them into the frame of the largest."""
-    models: dict[str, pycolmap.Reconstruction] = {}
-    notes = {name: "There is no model." for name, path in paths.items() if path is None}
-    for name, path in paths.items():
-        try:
-            if path is not None:
-                models[name] = read_given_model(path)
-        except AffrectError as error:
-            notes[name] = f"The model cannot be shown: {error}"
-    if models:
-        notes |= _bring_into_one_frame(models)
-    limit = min(MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE // max(1, len(paths)))
-    return [
-        _view(models[name], notes.get(name, ""), limit) if name in models else View3D(note=note)
-        for name, note in ((name, notes.get(name, "")) for name in paths)
-    ]
-
-
-def _bring_into_one_frame(models: Mapping[str, pycolmap.Reconstruction]) -> dict[str, str]:
-    """Align models with the largest; return which have a frame of their own, and why."""
-    notes, reference = {}, max(models, key=lambda name: models[name].num_reg_images())
-    _turn_upright(models[reference])
-    for name in models.keys() - {reference}:
-        align = pycolmap.align_reconstructions_via_proj_centers
-        similarity = align(models[name], models[reference], MAX_ALIGNMENT_ERROR)
-        if similarity:
-            models[name].transform(similarity)
-            continue
-        _turn_upright(models[name])
-        notes[name] = (
-            f"Shares fewer than three photographs at different places with the model of "
-            f"{reference}: drawn in a frame of its own."
-        )
-    return notes
+def read_view(path: Path | None) -> View3D:
+    """Read a model, turned upright; without one, or where it cannot be read, a note says so."""
+    if path is None:
+        return View3D(note="There is no model.")
+    try:
+        model = read_given_model(path)
+    except AffrectError as error:
+        return View3D(note=f"The model cannot be shown: {error}")
+    _turn_upright(model)
+    return _view(model)
 
 
 def _turn_upright(model: pycolmap.Reconstruction) -> None:
@@ -113,10 +87,10 @@ def _poses(model: pycolmap.Reconstruction) -> tuple[Array, Array]:
     return axes, np.array([pose.translation for pose in poses]).reshape(-1, 3)
 
 
-def _view(model: pycolmap.Reconstruction, note: str, max_num_points: int) -> View3D:
+def _view(model: pycolmap.Reconstruction) -> View3D:
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
-    if len(ids) > max_num_points:
-        ids = np.random.default_rng(0).choice(ids, max_num_points, replace=False)
+    if len(ids) > MAX_NUM_POINTS:
+        ids = np.random.default_rng(0).choice(ids, MAX_NUM_POINTS, replace=False)
     chosen = [model.points3D[point_id] for point_id in ids.tolist()]
     points = np.array([point.xyz for point in chosen]).reshape(-1, 3)
     colors = np.array([point.color for point in chosen], dtype=np.uint8).reshape(-1, 3)
@@ -131,7 +105,6 @@ def _view(model: pycolmap.Reconstruction, note: str, max_num_points: int) -> Vie
         len(points),
         base64_text(quantised.tobytes() + colors.tobytes()),
         tuple(zip(names, _pyramids(model), strict=True)),
-        note,
     )
 
 
