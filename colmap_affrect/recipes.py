@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import EXTRACTORS, FeatureOptions, NetworkOptions
 from colmap_affrect.features.sift import SiftOptions
-from colmap_affrect.images.depth import DEPTH_SOURCES, DepthFilesOptions, DepthOptions
+from colmap_affrect.images.depth import DepthOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
@@ -64,9 +64,7 @@ class ExtractionOptions(Options):
     escalation: Annotated[tuple[LevelOptions, ...], Field(strict=False)] = ()
     """For pairs that fail verification, one after the other until it succeeds."""
     features: AnyFeatures = SiftOptions()
-    depth: Annotated[SerializeAsAny[DepthOptions], BeforeValidator(DEPTH_SOURCES.options)] = (
-        DepthFilesOptions()
-    )
+    depth: DepthOptions = DepthOptions()
     max_image_size_px: ImageSize = 2400
     """Larger images are shrunk to this longer side before extraction, which bounds memory. COLMAP's
     limit for SIFT is 3200."""
@@ -94,7 +92,7 @@ class ExtractionOptions(Options):
     def check_depth(self) -> None:
         """Refuse rectifiers that read depth maps where none are given; OptionError says how."""
         needing = [x.rectifier.name for x in self.levels if x.rectifier.uses_depth]
-        if needing and isinstance(self.depth, DepthFilesOptions) and not self.depth.path:
+        if needing and not self.depth.path:
             raise OptionError(f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER")
 
     def matchers(self, matching: MatcherOptions) -> tuple[MatcherOptions, ...]:
@@ -121,7 +119,7 @@ class ExtractionOptions(Options):
     @property
     def uses_networks(self) -> bool:
         """Whether anything runs on torch."""
-        return self.depth.uses_network or any(part.uses_network for part in self._network_parts)
+        return any(part.uses_network for part in self._network_parts)
 
 
 class EscalateOptions(Options):

@@ -66,7 +66,7 @@ def recipe(options: argparse.Namespace) -> Recipe:
 def depth_settings(options: argparse.Namespace) -> list[str]:
     """Return the change of a recipe that --depth-path asks for."""
     path = folder("--depth-path", options.depth_path)
-    return ['depth.name="files"', f"depth.path={json.dumps(str(path.resolve()))}"] if path else []
+    return [f"depth.path={json.dumps(str(path.resolve()))}"] if path else []
 
 
 def changed(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOptions:

@@ -1,4 +1,4 @@
-"""Depth maps of photographs: ``.npy``, 16-bit ``.png`` or ``.tif``, or of another package.
+"""Depth maps of photographs: ``.npy``, 16-bit ``.png`` or ``.tif``.
 
 A depth map is (h, w) float32: depth along the optical axis, > 0, NaN where it is unknown. It
 covers the whole image at any resolution, so that ``conventions.resized_from_original`` relates
@@ -6,11 +6,10 @@ its pixels to those of the photograph. The unit is free: normals do not depend o
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import log, prod
 from pathlib import Path
 from posixpath import splitext
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.reading import decode
-from colmap_affrect.options import PartOptions, Registry
+from colmap_affrect.options import Options
 
 SUFFIXES = (".npy", ".png", ".tif", ".tiff")  # in the order in which they are looked for
 MAX_NUM_VALUES = 1 << 27  # of a map; more is taken for damage
@@ -31,58 +30,15 @@ MAX_ASPECT_RATIO = 1.05  # of aspects of map and photograph: networks round size
 MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
 
 
-class DepthSource(Protocol):
-    """Depth maps of photographs; called with its ``Options`` and a :class:`DepthContext`."""
-
-    def depth(self, photograph: Photograph) -> Singles:
-        """Return (h, w) float32 z-depth > 0, NaN where unknown, of any size over the whole image.
-
-        Raises DepthError when there is no usable map.
-        """
-
-    def require_some(self, names: Sequence[str]) -> None:
-        """Raise DepthError when there cannot be a map for any of the images named."""
-
-
-@dataclass(frozen=True)
-class DepthContext:
-    """What depth sources work with."""
-
-    cache_path: Path | None = None  # folder that keeps a network's predictions; None keeps none
-    device: str = "cpu"  # where a network runs: ``cpu``, ``cuda``, ``cuda:1``, ``mps``
-
-
-class DepthOptions(PartOptions):
-    """Base of the options of all depth sources."""
-
-    uses_network: ClassVar[bool] = False
-    """Whether it runs on torch."""
-    kind: Literal["z", "ray", "inverse"] = "z"
-    """What the values are: ``z`` (along the optical axis), ``ray`` (distance from the camera), or
-    ``inverse`` (1 / z). For a network ``z`` means as its own configuration says."""
-
-    @property
-    def folder(self) -> Path | None:
-        """Folder that is read while images are worked on, if there is one."""
-        return None
-
-    def file(self, name: str) -> Path | None:  # noqa: ARG002
-        """Return the file that the depth of an image is read from, if there is one."""
-        return None
-
-
-class DepthFilesOptions(DepthOptions):
+class DepthOptions(Options):
     """Depth maps in a folder."""
 
-    name: Literal["files"] = "files"
     path: str = ""
     """Folder of depth maps, named as the images: ``a/b.jpg`` has ``a/b.npy``, or .png, .tif (also
     after the image's full name, ``a/b.jpg.npy``)."""
-
-    @property
-    def folder(self) -> Path | None:
-        """The folder of the maps."""
-        return Path(self.path) if self.path else None
+    kind: Literal["z", "ray", "inverse"] = "z"
+    """What the values are: ``z`` (along the optical axis), ``ray`` (distance from the camera), or
+    ``inverse`` (1 / z)."""
 
     def file(self, name: str) -> Path | None:
         """Return the map of an image, if any: ``a/b.jpg.npy`` and so on, then ``a/b.npy``."""
@@ -91,25 +47,11 @@ class DepthFilesOptions(DepthOptions):
         return next((path for path in paths if path.is_file()), None)
 
 
-DEPTH_SOURCES: Registry[DepthSource] = Registry(
-    kind="depth source",
-    group="colmap_affrect.depth",
-    built_in={
-        "files": "colmap_affrect.images.depth:DepthFiles",
-    },
-    default="files",
-)
-
-
-class DepthFiles:
+class DepthMaps:
     """Depth maps in a folder; values that are not finite or not positive are unknown."""
 
-    Options = DepthFilesOptions
-
-    def __init__(self, options: DepthFilesOptions, context: DepthContext | None = None) -> None:
-        del context
-        self._options = options
-        self._path = Path(options.path)
+    def __init__(self, options: DepthOptions) -> None:
+        self._options, self._path = options, Path(options.path)
 
     def require_some(self, names: Sequence[str]) -> None:
         """Raise DepthError when no image has a map, OptionError when there is no folder."""
@@ -122,7 +64,10 @@ class DepthFiles:
             )
 
     def depth(self, photograph: Photograph) -> Singles:
-        """Read a map; DepthError if there is none, or it is damaged or not of this photograph."""
+        """Return (h, w) float32 z-depth > 0, NaN where unknown, of any size over the whole image.
+
+        DepthError if there is no map, or it is damaged or not of this photograph.
+        """
         path = self._options.file(photograph.name)
         if path is None:
             raise DepthError(

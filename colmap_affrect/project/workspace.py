@@ -37,7 +37,7 @@ FILES_OF_MODEL = {
 }  # fmt: skip
 LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends
 OWN_STEMS = {
-    "cameras", "config", "database", "depth", "features", "guided", "matches", "methods", "pairs",
+    "cameras", "config", "database", "features", "guided", "matches", "methods", "pairs",
     "report", "run", "shared", "sparse",
 }  # fmt: skip
 """How names of files and folders begin that are written here."""
@@ -64,7 +64,6 @@ class Workspace:
         self.pairs = path / "pairs.txt"  # those to match
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
         self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
-        self.depth = path / "depth"  # folder of the depth maps that a network made
         self.config, self.log = path / "config.toml", path / "run.log"  # options; of all runs
         self.report, self.page = path / "report.json", path / "report.html"  # of the last run
         self.cameras = path / "cameras.json"  # what is known of the database's, and from where

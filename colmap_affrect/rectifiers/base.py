@@ -14,7 +14,7 @@ from colmap_affrect.features.base import SHAPES, ShapeOptions, ShapeSource
 from colmap_affrect.features.second_moment import SecondMomentOptions
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.tilts import Cover, cover_shapes
-from colmap_affrect.images.depth import DepthSource
+from colmap_affrect.images.depth import DepthMaps
 from colmap_affrect.options import PartOptions, Registry, within
 
 
@@ -30,7 +30,7 @@ class RectifierInputs:
     """What a rectifier may read beside the photograph."""
 
     shapes: ShapeSource | None = None  # the source that its options name, if any
-    depth: DepthSource | None = None  # None when the recipe needs no depth
+    depth: DepthMaps | None = None  # None when the recipe needs no depth
 
 
 class RectifierOptions(PartOptions):

@@ -139,7 +139,6 @@ class Resources:
 
     weights_path: Path | None = None  # folder with the weights of networks; None: the usual places
     device: str = "auto"  # of networks and of matching: auto, cpu, cuda, cuda:1, mps
-    depth_cache_path: Path | None = None  # folder that keeps the depth maps of a network, if any
 
     def require_device(self, *, uses_network: bool = False) -> str:
         """Return the device, if it is there; torch is loaded only to ask for one or use it."""

@@ -44,14 +44,10 @@ from colmap_affrect.stages.escalation_graph import (
     insecure_images,
     weakly_connected_images,
 )
-from colmap_affrect.stages.extract import (
-    extract_images,
-    prepared_recipe,
-    write_images_and_keypoints,
-)
+from colmap_affrect.stages.extract import extract_images, write_images_and_keypoints
 from colmap_affrect.stages.guide import restore_exact
 from colmap_affrect.stages.match import match_pairs, matched_at_level, write_batches
-from colmap_affrect.stages.one_image import ImageExtractor
+from colmap_affrect.stages.one_image import ImageExtractor, prepare
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers, verify_new
 
@@ -144,7 +140,8 @@ class Escalation:
     @cached_property
     def extractor(self) -> ImageExtractor:
         """The recipe, prepared for all images when it is needed first."""
-        return prepared_recipe(self.context, self.extraction, self.features.names())
+        names, context = self.features.names(), self.context
+        return prepare(self.extraction, context.resources, names, context.progress)
 
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of each pair that is in the database, 0 where it is not verified."""

@@ -4,7 +4,6 @@ import logging
 import time
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
@@ -70,7 +69,7 @@ def extract(
     if contents != known:  # else they were seen to be good
         inputs.check_names(names)
     whole = inputs.photographs.without_mask(names)
-    extractor = prepared_recipe(context, options, names)
+    extractor = prepare(options, context.resources, names, context.progress)
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
     weights = digests(extractor.weights)
@@ -141,14 +140,6 @@ def _extract_missing(
     return failures
 
 
-def prepared_recipe(
-    context: Context, options: ExtractionOptions, names: Sequence[str]
-) -> ImageExtractor:
-    """Prepare a recipe for the images of a workspace, which keeps the depth maps of networks."""
-    resources = replace(context.resources, depth_cache_path=context.workspace.depth)
-    return prepare(options, resources, names, context.progress)
-
-
 def extract_images(
     context: Context, inputs: Inputs, extractor: ImageExtractor, images: Sequence[tuple[str, int]]
 ) -> Generator[ExtractedImage | ImageError, None, None]:
@@ -163,8 +154,8 @@ def extract_images(
         _refuse_changed(context, inputs, later)
     executor = context.executor or Threads(min(num_images_at_once(extractor), len(images)))
     files = inputs.photographs.files(images[0][0])
-    if depth_folder := extractor.options.depth.folder:
-        files.append(depth_folder)
+    if extractor.options.depth.path:
+        files.append(Path(extractor.options.depth.path))
     tasks = _image_tasks(context.workspace, inputs, extractor.options, images)
     for (name, level), found in zip(images, executor.map(extractor, tasks, files), strict=True):
         if isinstance(found, ExtractedImage):

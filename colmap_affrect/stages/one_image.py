@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -23,7 +23,7 @@ from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import camera_matrix, resized_from_original
-from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
+from colmap_affrect.images.depth import DepthMaps
 from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.images.reading import (
     decode,
@@ -230,8 +230,7 @@ def prepare(
     extractor = cache(lambda features: EXTRACTORS.make(features, network))
     extractors = tuple(extractor(level.features) for level in options.levels)
     if options.uses_depth:
-        context = DepthContext(resources.depth_cache_path, device)
-        depth = DEPTH_SOURCES.make(options.depth, context)
+        depth = DepthMaps(options.depth)
         if image_names is not None:
             depth.require_some(image_names)
     shapes = cache(lambda source, features: SHAPES.make(source, network, features))
@@ -249,7 +248,7 @@ def prepare(
 def _prepared_elsewhere(
     options: ExtractionOptions, resources: Resources, sent: Mapping[str, str]
 ) -> ImageExtractor:
-    """Prepare a recipe in another process; depth maps of networks are not kept from there."""
-    extractor = prepare(options, replace(resources, depth_cache_path=None))
+    """Prepare a recipe in another process."""
+    extractor = prepare(options, resources)
     require_same_files(extractor.weights, sent)
     return extractor

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import write_image
 
 from colmap_affrect.errors import DepthError, OptionError
-from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions
+from colmap_affrect.images.depth import DepthMaps, DepthOptions
 
 
 def asymmetric_map(size=(6, 4)):
@@ -32,7 +32,7 @@ def write_map(path, values):
 
 
 def source(path, **options):
-    return DepthFiles(DepthFilesOptions(path=str(path), **options))
+    return DepthMaps(DepthOptions(path=str(path), **options))
 
 
 # --- files: formats and places

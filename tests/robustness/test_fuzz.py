@@ -16,7 +16,7 @@ from damaged import HARMS
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.conventions import camera_matrix
-from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions
+from colmap_affrect.images.depth import DepthMaps, DepthOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.recipes import load_recipe, recipe_folder, recipe_names
 
@@ -47,7 +47,7 @@ def recipe(path: Path) -> None:
 def depth_map(path: Path) -> None:
     camera = camera_matrix((6, 4))
     photograph = Photograph(np.zeros((4, 6), np.uint8), "a.jpg", path.with_name("a.jpg"), camera)
-    depth = DepthFiles(DepthFilesOptions(path=str(path.parent))).depth(photograph)
+    depth = DepthMaps(DepthOptions(path=str(path.parent))).depth(photograph)
     assert depth.dtype == np.float32
     assert not (depth <= 0).any()
 

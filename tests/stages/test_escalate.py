@@ -304,7 +304,7 @@ def test_pairs_that_verify_well_escalate_nowhere(
         shutil.copy(photos / name, folder / name)
     workspace = verified(folder, tmp_path / "out", "on-demand")
     first = matches(workspace, EASY)
-    monkeypatch.setattr(escalation, "prepared_recipe", None)  # nothing to extract
+    monkeypatch.setattr(escalation, "prepare", None)  # nothing to extract
     assert escalate(workspace).num_done == 0
     assert_array_equal(matches(workspace, EASY), first)
 
@@ -332,7 +332,7 @@ def test_again_does_nothing(
     escalated: tuple[Workspace, StageReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     workspace = copy(escalated[0], tmp_path / "again")
-    monkeypatch.setattr(escalation, "prepared_recipe", None)  # no features, so nothing to prepare
+    monkeypatch.setattr(escalation, "prepare", None)  # no features, so nothing to prepare
     assert escalate(workspace).num_done == 0
     same_state(workspace, escalated[0])
 
