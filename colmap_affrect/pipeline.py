@@ -14,7 +14,7 @@ from colmap_affrect.errors import ImageError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
-from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
+from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
@@ -119,7 +119,6 @@ def run(
     if options.extend:
         if overwrite:
             options.extend.refuse_discarding(output_path)
-        require_extends(mapper.options)
         existing_names(options.extend.model_path, names)
     options.recipe.extraction.check_depth()
     resolve(options.recipe.weights, options.resources.weights_path, progress=progress)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +38,6 @@ class MapperOptions(PartOptions, PresetOptions):
     """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
     over those above."""
 
-    extends: ClassVar[bool] = False
-    """The mapper can register images into an existing model, ``MappingTask.extend``."""
-
 
 @dataclass(frozen=True, eq=False)
 class MappingTask:
@@ -49,7 +46,7 @@ class MappingTask:
     Attributes:
         database_path: COLMAP database with two-view geometries.
         image_path: folder of the photographs, for the colours of the points; None for no colours.
-        extend: register images into this model; only for mappers whose options say ``extends``.
+        extend: register images into this model.
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
         guided: (M, 2) features of pairs of image ids that only guided matching has matched.

@@ -17,11 +17,6 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers.base import MAPPERS, MapperOptions
-
-SAME_KEYPOINTS_PX = 1e-3
-"""Keypoints of a model this near to those of the database are the same: a model holds the
-database's own, and text files round."""
 
 SAME_POSE = 1e-6
 """Largest difference of the elements of two poses that are the same; quaternions round."""
@@ -64,19 +59,13 @@ class ExistingModel:
     """A finished model with the ids of a database.
 
     Attributes:
-        reconstruction: all images of the database, those of the model registered.
-        names: of the images of the model, sorted.
+        reconstruction: all images of the database, those of the model registered; without points,
+            which are to be triangulated anew, as the keypoints may be others.
         refine: its poses and cameras may move.
-        num_other_keypoints: images whose keypoints in the model are not those of the database;
-            only their poses and cameras are kept, their points are to be triangulated anew.
-        other_camera_models: cameras have another model than in the database.
     """
 
     reconstruction: pycolmap.Reconstruction
-    names: tuple[str, ...]
     refine: bool
-    num_other_keypoints: int
-    other_camera_models: bool
 
     @property
     def images(self) -> list[pycolmap.Image]:
@@ -93,21 +82,12 @@ class ExistingModel:
                 self.reconstruction.frame(image.frame_id).rig_id for image in self.images
             }
 
-    def database(self, path: Path, folder: Path) -> Path:
-        """Return a database whose cameras have the model's camera models, as COLMAP demands.
-
-        Args:
-            path: the database that the model was read for.
-            folder: where a copy is made if it is needed.
-        """
-        if not self.other_camera_models:
-            return path
-        copy = folder / "database.db"
+    def copy_database(self, path: Path, copy: Path) -> None:
+        """Copy a database with the model's cameras: COLMAP demands the same camera models."""
         copy_database(path, copy)
         with open_database(copy) as database:
             for camera_id in {image.camera_id for image in self.images}:
                 database.update_camera(self.reconstruction.camera(camera_id))
-        return copy
 
     def is_part_of(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model that was made from this one has all its images, posed or not.
@@ -130,20 +110,6 @@ class ExistingModel:
                 model.register_frame(image.frame_id)
 
 
-def require_extends(options: MapperOptions) -> None:
-    """Refuse to extend a model with a mapper that cannot.
-
-    Raises:
-        OptionError: naming those that can.
-    """
-    if not options.extends:
-        able = [name for name in MAPPERS.names() if MAPPERS.options(name).extends]
-        raise OptionError(
-            f"--extend: the {options.name} mapper cannot register images into an existing model; "
-            f"use --mapper {' or '.join(able)}"
-        )
-
-
 def existing_names(model_path: Path, known: Collection[str]) -> list[str]:
     """Return the sorted names of the images of a model that is to be extended.
 
@@ -160,33 +126,25 @@ def existing_names(model_path: Path, known: Collection[str]) -> list[str]:
 
 
 def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
-    """Read a model and give it the ids and keypoints of a database.
+    """Read the poses and cameras of a model and give them the ids of a database.
 
     Raises:
         OptionError: when there is no such folder, or no model in it.
         AffrectError: when it does not fit the database.
     """
-    old, path = (
-        read_given_model(extension.model_path, "--extend "),
-        extension.model_path,
-    )
+    path = extension.model_path
+    old = read_given_model(path, "--extend ")
     with open_database(database_path) as database:
         options = pycolmap.DatabaseCacheOptions(load_all_images=True)
         cache = pycolmap.DatabaseCache.create(database, options)
     new = pycolmap.Reconstruction()
     new.load(cache)
     ids = {image.name: image_id for image_id, image in new.images.items()}
-    names = _known_names(old, path, ids)
+    _known_names(old, path, ids)
     images = [(image, new.image(ids[image.name])) for image in _registered(old)]
-    models = {camera_id: camera.model for camera_id, camera in new.cameras.items()}
     _take_cameras(images, old, new, path)
-    other_models = any(camera.model != models[i] for i, camera in new.cameras.items())
     _take_poses(images, new, path)
-    same = {mine.image_id: now.image_id for mine, now in images if _same_keypoints(mine, now)}
-    _take_points(old, new, same)
-    return ExistingModel(
-        new, tuple(names), extension.refine_existing, len(images) - len(same), other_models
-    )
+    return ExistingModel(new, extension.refine_existing)
 
 
 ImagePairs = list[tuple[pycolmap.Image, pycolmap.Image]]
@@ -256,41 +214,20 @@ def _take_poses(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) ->
             )
 
 
-def _same_keypoints(one: pycolmap.Image, other: pycolmap.Image) -> bool:
-    if one.num_points2D() != other.num_points2D():
-        return False
-    mine, theirs = (np.array([point.xy for point in image.points2D]) for image in (one, other))
-    return bool(np.allclose(mine, theirs, rtol=0.0, atol=SAME_KEYPOINTS_PX))
-
-
-def _take_points(
-    old: pycolmap.Reconstruction, new: pycolmap.Reconstruction, image_ids: dict[int, int]
-) -> None:
-    """Add the points that are seen in two images whose keypoints are the same."""
-    for _, point in sorted(old.points3D.items()):
-        elements = [
-            pycolmap.TrackElement(image_ids[element.image_id], element.point2D_idx)
-            for element in point.track.elements
-            if element.image_id in image_ids
-        ]
-        if len(elements) > 1:
-            new.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
-
-
 def _move_onto(model: pycolmap.Reconstruction, images: list[pycolmap.Image]) -> None:
     """Move a model by the similarity that brings its images onto their earlier poses."""
-    registered = set(model.reg_image_ids())
-    pairs = [(model.image(i.image_id), i) for i in images if i.image_id in registered]
-    centers = [
-        np.array([image.projection_center() for image in side]) for side in zip(*pairs, strict=True)
-    ]
-    product = sum(
-        then.cam_from_world().rotation.matrix().T @ now.cam_from_world().rotation.matrix()
-        for now, then in pairs
-    )
-    left, _, right = np.linalg.svd(product)
-    rotation: NDArray[np.float64] = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    spreads = [np.linalg.norm(side - side.mean(axis=0)) for side in centers]
-    scale = spreads[1] / spreads[0] if min(spreads) > 0 else 1.0
-    translation = centers[1].mean(axis=0) - scale * rotation @ centers[0].mean(axis=0)
-    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation))
+    registered = [image for image in images if model.image(image.image_id).has_pose]
+    now = _points_of([model.image(image.image_id) for image in registered])
+    if moved := pycolmap.estimate_sim3d(now, _points_of(registered)):
+        model.transform(moved)
+
+
+def _points_of(images: list[pycolmap.Image]) -> NDArray[np.float64]:
+    """Return (N, 3) points that tell poses: centres, and the ends of axes as long as they spread.
+
+    Centres alone tell no rotation where they lie on a line.
+    """
+    centers = np.array([image.projection_center() for image in images])
+    spread = np.linalg.norm(centers - centers.mean(axis=0)) or 1.0
+    axes = np.array([image.cam_from_world().rotation.matrix() for image in images])
+    return np.concatenate([centers, (centers[:, None] + spread * axes).reshape(-1, 3)])

@@ -27,7 +27,6 @@ FLAG = "--mapper-options"
 class PipelineOptions(MapperOptions):
     """Options of COLMAP's incremental pipeline."""
 
-    extends: ClassVar[bool] = True
     init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12
@@ -153,17 +152,16 @@ class _Call:
     def _extended(
         self, existing: ExistingModel, token: pycolmap.CancellationToken
     ) -> list[pycolmap.Reconstruction]:
-        start = existing.reconstruction
         existing.constrain(self.options)
-        self._add(len(existing.names))
+        self._add(len(existing.images))
         with tempfile.TemporaryDirectory(dir=self.output_path) as name:
             folder = Path(name)
-            self.database_path = existing.database(self.database_path, folder)
-            if existing.num_other_keypoints:
-                start = pycolmap.triangulate_points(
-                    start, self.database_path, self.task.colors_path, folder,
-                    clear_points=False, options=self.options, cancellation_token=token,
-                )  # fmt: skip
+            self.database_path = folder / "database.db"
+            existing.copy_database(self.task.database_path, self.database_path)
+            start = pycolmap.triangulate_points(
+                existing.reconstruction, self.database_path, self.task.colors_path, folder,
+                options=self.options, cancellation_token=token,
+            )  # fmt: skip
             start.write(folder)
             models = [m for m in self._map(token, folder) if existing.is_part_of(m)] or [start]
         for model in models:

@@ -14,7 +14,6 @@ from colmap_affrect.colmap.model_files import (
 from colmap_affrect.colmap.verification import inlier_matches, num_in_tracks
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
-from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.reliability import Judgement, judge
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.summaries import write_summary
@@ -48,10 +47,7 @@ def map_database(
     Raises:
         AffrectError: when COLMAP ends with an error.
         KeyboardInterrupt: after mapping has been stopped and what it wrote, but snapshots, removed.
-        OptionError: when the mapper cannot extend a model.
     """
-    if task.extend:
-        require_extends(mapper.options)
     partial = sparse_path.with_name(sparse_path.name + ".partial")
     remove_own([partial] if task.extend else [partial, sparse_path])
     num_images = len(image_ids(task.database_path))

@@ -1,6 +1,5 @@
 """Map: models of the verified pairs, into ``sparse/``."""
 
-import logging
 import time
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
@@ -12,7 +11,7 @@ from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import Mapper, MappingTask
-from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
+from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
@@ -24,8 +23,6 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import measured_inliers
 from colmap_affrect.stages.guide import inliers_by_guiding
 from colmap_affrect.stages.pairs import listed_pairs
-
-logger = logging.getLogger(__name__)
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
@@ -46,10 +43,8 @@ def map_images(
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("verify")
-    existing = None
-    if extend:
-        require_extends(mapper.options)
-        existing = read_existing(extend, workspace.database)  # it may be discarded now
+    # Read first: it may be discarded now.
+    existing = read_existing(extend, workspace.database) if extend else None
     inputs = _inputs(workspace, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
     known = workspace.made_from("map") if workspace.sparse.exists() else ""
@@ -68,16 +63,8 @@ def map_images(
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, _task(context, existing), workspace.sparse, advance)
     workspace.record_made_from(map=inputs)
-    warnings = {}
-    if extend and existing and existing.num_other_keypoints:
-        warning = (
-            f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "
-            "not those of the database: poses and cameras kept, points triangulated anew"
-        )
-        warnings[str(extend.model_path)] = warning
-        logger.warning("%s: %s", extend.model_path, warning)
     wall_s = time.perf_counter() - start
-    return StageReport("map", wall_s, len(models), warnings=warnings), models
+    return StageReport("map", wall_s, len(models)), models
 
 
 def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
