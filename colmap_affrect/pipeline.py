@@ -179,13 +179,15 @@ def map_and_report(
     page: bool = True,
 ) -> ReconstructionReport:
     """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
-    workspace, options = context.workspace, mapper.options
-    _require_photographs(context)
+    workspace, options, names = context.workspace, mapper.options, image_names(context)
+    if not workspace.is_foreign and (gone := set(context.features.names()) - set(names)):
+        path = context.inputs.image_path
+        raise ImageError(f"{path}: {min(gone)} has features, and is gone; run extract again")
     if extend and overwrite:
         extend.refuse_discarding(workspace.path)
-    before = existing_names(extend.model_path, image_names(context)) if extend else []
+    before = existing_names(extend.model_path, names) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
-    names, copied = image_names(context), workspace.is_foreign
+    copied = workspace.is_foreign
     pair_inliers = num_verified_inliers(context)
     missing = unregistered(context, names, models, pair_inliers)
     cameras = read_camera_records(workspace.cameras)
@@ -216,11 +218,3 @@ def map_and_report(
         image_path = workspace.photographs()
         write_run_page(workspace, result, names, pair_inliers, image_path, context.progress)
     return result
-
-
-def _require_photographs(context: Context) -> None:
-    """Refuse to map photographs that are not where they were when they were extracted."""
-    if not context.workspace.is_foreign:
-        path, names = context.inputs.image_path, set(context.inputs.names())
-        if gone := sorted(set(context.features.names()) - names):
-            raise ImageError(f"{path}: {gone[0]} has features, and is gone; run extract again")

@@ -85,14 +85,14 @@ class Inputs(Options):
 
         They are read only where they have changed since they held what is ``known``.
         """
-        return {name: content_of(self._files(name, options), known.get(name)) for name in names}
-
-    def _files(self, name: str, options: ExtractionOptions) -> list[Path]:
-        files = self.photographs.files(name)
-        if options.uses_depth:
-            depth = options.depth.file(name)
-            files += [*([depth] if depth else []), *self.camera_files]
-        return files
+        found = {}
+        for name in names:
+            files = self.photographs.files(name)
+            if options.uses_depth:
+                depth = options.depth.file(name)
+                files += [*([depth] if depth else []), *self.camera_files]
+            found[name] = content_of(files, known.get(name))
+        return found
 
     @property
     def camera_files(self) -> list[Path]:

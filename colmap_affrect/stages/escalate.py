@@ -44,9 +44,9 @@ from colmap_affrect.stages.escalation_graph import (
     insecure_images,
     weakly_connected_images,
 )
-from colmap_affrect.stages.extract import extract_images, write_images_and_keypoints
+from colmap_affrect.stages.extract import extract_images
 from colmap_affrect.stages.guide import restore_exact
-from colmap_affrect.stages.match import match_pairs, matched_at_level, write_batches
+from colmap_affrect.stages.match import match_pairs, matched_at_level, write_batches, write_matches
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers, verify_new
@@ -229,13 +229,7 @@ class Escalation:
 
     def write(self) -> None:
         """Bring the database up to what is stored."""
-        write_images_and_keypoints(self.context)
-        ids = colmap_database.image_ids(self.path)
-        if pairs := [pair for pair in self.pairs if pair[0] in ids and pair[1] in ids]:
-            with colmap_database.open_database(self.path) as database:
-                for found in self.matches.read(pairs):
-                    first, second = (ids[name] for name in found.names)
-                    colmap_database.replace_matches(database, first, second, found.indices)
+        write_matches(self.context, self.pairs, replaces=True)
         verify_new(self.context)
 
     def undo(self) -> None:

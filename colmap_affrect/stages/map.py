@@ -94,6 +94,7 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
 def image_names(context: Context) -> list[str]:
     """Return the names of the images of a run, or of the database that was copied."""
     if context.workspace.is_foreign:
+        context.workspace.require("verify")
         return sorted(colmap_database.image_ids(context.workspace.database))
     return context.inputs.names()
 
@@ -151,12 +152,11 @@ def advice(
     if not (missing or doubts):
         return ()
     is_foreign = workspace.is_foreign
-    recipes = [] if is_foreign else _other_recipes(workspace.recipe())
     texts = []
     if FOCAL_CONTRADICTED in doubts:
         texts.append("run again without the given focal lengths, or with others: they do not fit")
-    if missing:
-        texts += recipes
+    if not is_foreign:
+        texts += _other_recipes(workspace.recipe())
     if FOCAL_UNKNOWN in doubts and not (is_foreign or context.inputs.from_database):
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
@@ -170,8 +170,6 @@ def advice(
         )
     if missing:
         texts.append("more photographs that show the missing places")
-    else:
-        texts += recipes
     return tuple(texts)
 
 

@@ -144,18 +144,24 @@ def matched_at_level(
             yield stationary.filtered(found)
 
 
-def write_matches(context: Context, pairs: Sequence[Pair]) -> None:
-    """Put the raw matches that the database lacks into it, after images and keypoints."""
+def write_matches(context: Context, pairs: Sequence[Pair], *, replaces: bool = False) -> None:
+    """Put the raw matches that the database lacks into it, after images and keypoints.
+
+    ``replaces``: also those that are others there, whose two-view geometry goes.
+    """
     write_images_and_keypoints(context)
     path, listed = context.workspace.database, PairList.of(pairs)
     ids = colmap_database.image_ids(path)
     known_ids = np.array([ids.get(name, 0) for name in listed.names], np.int64)
+    ids_of_pairs = known_ids[listed.numbers]
     with colmap_database.open_database(path) as database:
-        lacking = listed.at(colmap_database.lack_matches(database, known_ids[listed.numbers]))
-        if not lacking:
-            return
-        for (first, second), found in zip(lacking, context.matches.read(lacking), strict=True):
-            colmap_database.write_matches(database, ids[first], ids[second], found.indices)
+        wanted = np.min(ids_of_pairs, axis=1, initial=1) > 0  # both images are there
+        if not replaces:
+            wanted = colmap_database.lack_matches(database, ids_of_pairs)
+        todo = listed.at(wanted)
+        for found in context.matches.read(todo) if todo else ():
+            first, second = (ids[name] for name in found.names)
+            colmap_database.replace_matches(database, first, second, found.indices)
 
 
 # What is done for one pair, in a thread of this process or on a worker of a cluster.
@@ -228,17 +234,20 @@ class ImageCache(Generic[Content]):
 class CachedMatcher:
     """Matches pairs, and keeps the images that it has prepared; a copy elsewhere has none."""
 
-    def __init__(self, matching: Matching) -> None:
+    def __init__(self, matching: Matching, sent: Mapping[str, str] | None = None) -> None:
+        """Load the networks; ``sent`` are the digests of the weights that they must have."""
         options, resources = matching.options, matching.resources
         options.require_extractor(matching.extractor)
         self._matching = matching
         self._weights = resolve(options.weights, resources.weights_path)
+        if sent is not None:
+            require_same_files(self._weights, sent)
         context = MatcherContext(self._weights, resources.device, matching.num_similarities)
         self._matcher = MATCHERS.make(options, context)
         self._images = ImageCache(self._prepare, lambda image: int(image.content.nbytes))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (self._matching, digests(self._weights))
+        return CachedMatcher, (self._matching, digests(self._weights))
 
     def __call__(self, names: Pair) -> PairMatches:
         """Match the stored features of two images."""
@@ -263,9 +272,3 @@ class CachedMatcher:
         features = store.read(name).select(indices)
         image = ImageFeatures(features, store.image_size(name), matching.extractor)
         return PreparedImage(self._matcher.prepare(image), features.lafs, indices)
-
-
-def _rebuilt(matching: Matching, sent: Mapping[str, str]) -> CachedMatcher:
-    matcher = CachedMatcher(matching)
-    require_same_files(matcher._weights, sent)
-    return matcher

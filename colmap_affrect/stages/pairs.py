@@ -1,6 +1,7 @@
 """Pairs: which photographs are matched, into ``pairs.txt``."""
 
 import logging
+import math
 import time
 from collections.abc import Collection, Sequence
 from itertools import combinations
@@ -36,14 +37,21 @@ def choose_pairs(
     by, StoreError when earlier pairs are missing in the list, or other options made them.
     """
     start = time.perf_counter()
-    workspace = context.workspace
-    options = options or context.pairing
-    if "exhaustive" in options.methods and not options.match_list_path:
-        return _all_pairs(context, options, start, overwrite=overwrite)
+    workspace, options = context.workspace, options or context.pairing
+    workspace.require("extract")
+    listed = options.match_list_path
+    if "exhaustive" in options.methods and not listed:
+        names = context.features.names()
+        count = math.comb(len(names), 2)
+        if len(names) > MANY_IMAGES:
+            logger.warning(MANY_PAIRS, len(names), count)
+        workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
+        write_pairs(workspace.pairs, combinations(names, 2), names)  # too many to keep in memory
+        workspace.record_made_from(pairs="")
+        return StageReport("pairs", time.perf_counter() - start, count)
     pairs = _given_pairs(context, options)
     workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
     there = kept = _pairs_there(context)
-    listed = options.match_list_path
     digest = content_of([Path(listed)]).digest if listed else ""
     if workspace.made_from("pairs") not in ("", digest):
         kept = set()
@@ -54,25 +62,8 @@ def choose_pairs(
     return StageReport("pairs", time.perf_counter() - start, len(pairs), warnings=warnings)
 
 
-def _all_pairs(
-    context: Context, options: PairOptions, start: float, *, overwrite: bool
-) -> StageReport:
-    """List every pair of images, of which there may be too many to be kept in memory."""
-    workspace = context.workspace
-    workspace.require("extract")
-    names = context.features.names()
-    count = len(names) * (len(names) - 1) // 2
-    if len(names) > MANY_IMAGES:
-        logger.warning(MANY_PAIRS, len(names), count)
-    workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
-    write_pairs(workspace.pairs, combinations(names, 2), names)
-    workspace.record_made_from(pairs="")
-    return StageReport("pairs", time.perf_counter() - start, count)
-
-
 def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
     """Return the pairs that are listed or chosen by names and positions."""
-    context.workspace.require("extract")
     names, pairs = context.features.names(), set[Pair]()
     known = set(names)
     if "sequence" in options.methods:
@@ -94,9 +85,8 @@ def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pai
     """Return the pairs chosen by features; none when all images have pairs already."""
     features, progress = context.features, context.progress
     names = [name for name, count in features.num_keypoints().items() if count]
-    if len(names) < 2 or {name for pair in there for name in pair}.issuperset(names):
-        return set()
-    if "retrieval" not in options.methods:
+    are_paired = {name for pair in there for name in pair}.issuperset(names)
+    if len(names) < 2 or are_paired or "retrieval" not in options.methods:
         return set()
     return set(retrieved_pairs(names, features.read, options.num_neighbors, progress))
 
