@@ -9,9 +9,9 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.report import (
+    Bridge,
     ModelSummary,
     ReconstructionReport,
-    Registration,
     StageReport,
 )
 from colmap_affrect.project.workspace import Workspace
@@ -30,12 +30,7 @@ def small_report(folder: Path) -> ReconstructionReport:
         0.25,
         doubtful={NAMES[3]: "hangs on few <points>"},
         probabilities=dict(zip(NAMES, (0.99, 0.95, 0.7, 0.4), strict=False)),
-        registrations={
-            NAMES[0]: Registration("tracks"),
-            NAMES[1]: Registration("guided"),
-            NAMES[2]: Registration("bridged", NAMES[0], 12, 15, 0.031),
-            NAMES[3]: Registration("tracks"),
-        },
+        bridges={NAMES[2]: Bridge(NAMES[0], 12, 15, 0.031)},
     )
     camera = {
         "id": 1, "num_images": 6, "names": list(NAMES), "source": "pairs", "focal_px": 200.0,

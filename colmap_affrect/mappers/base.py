@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
     from colmap_affrect.colmap.cameras import CameraRecord
     from colmap_affrect.mappers.existing import ExistingModel
-    from colmap_affrect.project.report import Registration
+    from colmap_affrect.project.report import Bridge
 
 
 class MapperOptions(PartOptions, PresetOptions):
@@ -49,7 +49,6 @@ class MappingTask:
         extend: register images into this model.
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
-        guided: (M, 2) features of pairs of image ids that only guided matching has matched.
         measured: (M, 2) inliers of measured frames, of pairs of image names that have others, too.
         cameras: what is known of the cameras, by id.
         may_share: images of one size may turn out to share a camera that nobody knows.
@@ -60,7 +59,6 @@ class MappingTask:
     extend: ExistingModel | None = None
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
-    guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
     measured: Mapping[tuple[str, str], NDArray[np.int64]] = field(default_factory=dict)
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
     may_share: bool = False
@@ -108,7 +106,7 @@ class MappedModel:
     """
 
     reconstruction: pycolmap.Reconstruction
-    bridges: Mapping[str, Registration] = field(default_factory=dict)
+    bridges: Mapping[str, Bridge] = field(default_factory=dict)
     taken_out: Mapping[str, str] = field(default_factory=dict)
     moves: tuple[str, ...] = ()
 

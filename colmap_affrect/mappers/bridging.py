@@ -30,7 +30,7 @@ from colmap_affrect.mappers.pair_graph import (
     inverse,
     poses_of,
 )
-from colmap_affrect.project.report import Registration
+from colmap_affrect.project.report import Bridge
 
 RADIUS_FRAC = 0.03
 """Places of known depth are neighbours up to this part of the longer side of the image."""
@@ -95,7 +95,7 @@ class Hypothesis:
         other: index of the model that comes in; None for a single image.
     """
 
-    bridge: Registration
+    bridge: Bridge
     poses: Mapping[int, Pose]
     cameras: CameraById
     share: float
@@ -232,8 +232,7 @@ class Bridges:
                 agreeing += pair.weight * self.graph.agreement(pair, all_poses, all_cameras)
         if weight and agreeing < MIN_SHARE * weight:
             return None
-        bridge = Registration(
-            "bridged",
+        bridge = Bridge(
             self.graph.names[ids[0]],
             scale.num_agreeing,
             scale.num_ratios,

@@ -13,7 +13,7 @@ from colmap_affrect.mappers.adjustment import FAST, FINAL, MEDIUM, Adjuster
 from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
 from colmap_affrect.mappers.evidence import Evidence
 from colmap_affrect.mappers.pair_graph import CameraById, PairGraph, PoseById
-from colmap_affrect.project.report import Registration
+from colmap_affrect.project.report import Bridge
 
 MIN_POINTS = 10  # of a first pair
 ALWAYS = 10  # images up to which everything is adjusted after each one
@@ -151,9 +151,9 @@ class Joiner:
 
     def join(
         self, model: pycolmap.Reconstruction, others: Models
-    ) -> tuple[pycolmap.Reconstruction, dict[str, Registration]]:
+    ) -> tuple[pycolmap.Reconstruction, dict[str, Bridge]]:
         """Bridge from a model to images and to others until nothing joins; return its bridges."""
-        built: dict[str, Registration] = {}
+        built: dict[str, Bridge] = {}
         score = self.evidence.of(model)
         while True:
             hypotheses = self.bridges.find(Part(model), [Part(other) for other in others])

@@ -4,27 +4,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import (
-    num_long_tracks,
-    seen_points,
     write_model,
 )
-from colmap_affrect.colmap.verification import inlier_matches, num_in_tracks
-from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.reliability import Judgement, judge
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.summaries import write_summary
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.report import DOUBTFUL, ModelSummary, Registration
+from colmap_affrect.project.report import DOUBTFUL, ModelSummary
 
 Judgements = Mapping[str, Judgement]
 """By the names of the images."""
 
-MIN_THREE_VIEW_POINTS = 12
-"""So many points tie an image to two others, as the sparse preset asks for."""
 WRONG = 0.1  # probability below which an image leaves its model: nine of ten are wrong
 
 
@@ -71,7 +64,7 @@ def map_database(
         summaries = []
         for index, (model, sure) in enumerate(sorted(kept, key=_size, reverse=True)):
             write_model(model.reconstruction, partial / str(index))
-            summaries.append(_summary(model, sure, task))
+            summaries.append(_summary(model, sure))
             write_summary(summaries[-1], partial / str(index))
         remove_own([sparse_path])
         partial.rename(sparse_path)
@@ -105,7 +98,7 @@ def _judged(mapped: MappedModel, task: MappingTask) -> tuple[MappedModel, Judgem
     return mapped, {}
 
 
-def _summary(mapped: MappedModel, found: Judgements, task: MappingTask) -> ModelSummary:
+def _summary(mapped: MappedModel, found: Judgements) -> ModelSummary:
     """Count what a model holds, and say how sure it is of each photograph."""
     model = mapped.reconstruction
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
@@ -117,33 +110,8 @@ def _summary(mapped: MappedModel, found: Judgements, task: MappingTask) -> Model
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
         probabilities={name: round(one.probability, 3) for name, one in found.items()},
         doubtful={name: one.reason for name, one in found.items() if one.probability < DOUBTFUL},
-        registrations=registrations(mapped, task),
+        bridges=dict(mapped.bridges),
         taken_out=dict(mapped.taken_out),
         focals_px=focals,
         moves=mapped.moves,
     )
-
-
-def registrations(model: MappedModel, task: MappingTask) -> dict[str, Registration]:
-    """Tell by what each registered image was registered."""
-    reconstruction = model.reconstruction
-    guided = _tied_by_guided_matches(reconstruction, task) if task.guided else set()
-    names = {i: reconstruction.images[i].name for i in reconstruction.reg_image_ids()}
-    return {
-        name: model.bridges.get(name, Registration("guided" if image_id in guided else "tracks"))
-        for image_id, name in sorted(names.items(), key=lambda item: item[1])
-    }
-
-
-def _tied_by_guided_matches(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:
-    """Return the images that too few three-view tracks would tie without guided matches."""
-    points = {i: seen_points(model.images[i]) for i in model.reg_image_ids()}
-    exact = {}
-    for ids, matches in inlier_matches(task.database_path, 1).items():
-        if points.keys() >= set(ids):
-            first, second = (points[i][matches[:, side]] for side, i in enumerate(ids))
-            seen_by_both = matches[(first == second) & (first >= 0)]
-            guided = task.guided.get(ids, seen_by_both[:0])
-            exact[ids] = seen_by_both[~rows_in(seen_by_both, guided)]
-    seen, tied = num_long_tracks(model), num_in_tracks(exact)
-    return {i for i in points if tied.get(i, 0) < MIN_THREE_VIEW_POINTS <= seen[i]}

@@ -36,7 +36,7 @@ from colmap_affrect.mappers.pair_graph import (
     graph_of,
     poses_of,
 )
-from colmap_affrect.project.report import Registration
+from colmap_affrect.project.report import Bridge
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 FREE_SIGMA = 1.0  # of the logarithm of a focal length that is given, where it is freed
@@ -87,7 +87,7 @@ class Measures:
     focal_px: float
     fitting_px: float
     turned: float
-    bridge: Registration | None
+    bridge: Bridge | None
     original: str
     zoom: float
 

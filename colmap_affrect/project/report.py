@@ -91,28 +91,23 @@ class StageReport:
 
 
 @dataclass(frozen=True)
-class Registration:
-    """How an image was registered.
+class Bridge:
+    """How an image was registered by one verified pair whose scale comes from neighbouring depths.
 
     Attributes:
-        how: by ``tracks`` through three images, by tracks that ``guided`` matching made, or
-            ``bridged``: by one verified pair whose scale comes from neighbouring depths.
-        by: of a bridge, the image that had been there; other fields are of bridges too.
+        by: the image of the pair that had been there.
         num_agreeing: depths that agree on the scale.
         num_ratios: depths compared.
         scale_error_frac: standard error of the scale.
     """
 
-    how: str
-    by: str = ""
-    num_agreeing: int = 0
-    num_ratios: int = 0
-    scale_error_frac: float = 0.0
+    by: str
+    num_agreeing: int
+    num_ratios: int
+    scale_error_frac: float
 
     def text(self) -> str:
         """Return a few words."""
-        if not self.by:
-            return f"by {self.how} matches"
         agreeing = f"{self.num_agreeing} of {self.num_ratios} depths agree"
         return f"bridged by {self.by}, {agreeing}, scale +-{self.scale_error_frac:.1%}"
 
@@ -124,7 +119,7 @@ class ModelSummary:
     Attributes:
         probabilities: how probable it is that an image stands right, within 5 degrees.
         doubtful: images that are rather wrong than right, with the reason.
-        registrations: by what each image was registered.
+        bridges: by what images were registered that came in by no track through three images.
         taken_out: images that were surely wrong, with the reason.
         focals_px: focal length of each image's camera.
         moves: what made the model, by the sparse mapper.
@@ -136,7 +131,7 @@ class ModelSummary:
     mean_reprojection_error_px: float
     probabilities: dict[str, float] = field(default_factory=dict)
     doubtful: dict[str, str] = field(default_factory=dict)
-    registrations: dict[str, Registration] = field(default_factory=dict)
+    bridges: dict[str, Bridge] = field(default_factory=dict)
     taken_out: dict[str, str] = field(default_factory=dict)
     focals_px: dict[str, float] = field(default_factory=dict)
     moves: tuple[str, ...] = ()
@@ -153,11 +148,7 @@ class ModelSummary:
 
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
-        lines = _some(
-            f"joined      {name} {item.text()}"
-            for name, item in self.registrations.items()
-            if item.how != "tracks"
-        )
+        lines = _some(f"joined      {name} {one.text()}" for name, one in self.bridges.items())
         lines += _some(f"doubtful    {line}" for line in by_story(self.doubtful))
         return [
             f"sure        {len(self.sure)}, right with a probability of {SURE:.0%} or more",
@@ -259,10 +250,7 @@ class ReconstructionReport:
             **{key: getattr(largest, key) for key in OF_LARGEST},
             **found,
             "points3D": largest.num_points3D,
-            "registrations": {
-                name: asdict(registration) if registration.by else {"how": registration.how}
-                for name, registration in largest.registrations.items()
-            },
+            "bridges": {name: asdict(bridge) for name, bridge in largest.bridges.items()},
             "num_models": len(self.models),
             "models": [list(model.registered_names) for model in self.models],
             "added": self.added,

@@ -25,7 +25,6 @@ from colmap_affrect.report.scene import read_view
 
 KINDS = {
     "tracks": "registered by common points",
-    "guided": "by guided matches",
     "bridged": "bridged by one pair",
     "existing": "was in the model",
     "doubtful": "doubtful",
@@ -33,7 +32,7 @@ KINDS = {
 """How cameras came in; each has a colour of this name."""
 FILTERS = {
     "all": "All", "missing": "Missing", "doubtful": "Doubtful", "added": "New",
-    "guided": "Guided", "bridged": "Bridged",
+    "bridged": "Bridged",
 }  # fmt: skip
 
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
@@ -105,9 +104,8 @@ def _card(number: int, name: str, report: ReconstructionReport, model: ModelSumm
         text = report.unregistered.get(name, "not registered")
         text += f": {report.failures[name]}" if name in report.failures else ""
         return Card(number, name, "missing", text, ("all", "missing"))
-    registration = model.registrations.get(name)
-    kind = registration.how if registration else "tracks"
-    text = "registered" if not registration or kind == "tracks" else registration.text()
+    bridge = model.bridges.get(name)
+    kind, text = ("bridged", bridge.text()) if bridge else ("tracks", "registered")
     if name in report.extended:
         kind, text = "existing", KINDS["existing"]
     groups = ["all", kind, *(["added"] if name in report.added else [])]

@@ -90,21 +90,6 @@ def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, 
     return {**verified_inliers(context), **exact}
 
 
-def inliers_by_guiding(context: Context) -> dict[tuple[int, int], Indices]:
-    """Return the inliers, by image ids, that only guided matching has found."""
-    guided = _gained(context)
-    if not guided:
-        return {}
-    verified = verified_inliers(context)
-    ids = colmap_database.image_ids(context.workspace.database)
-    found = {}
-    for pair in guided:
-        first, second = pair.names
-        inliers = verified[pair.names]
-        found[ids[first], ids[second]] = inliers[~rows_in(inliers, pair.exact)]
-    return found
-
-
 def current(context: Context) -> list[GuidedPair]:
     """Return the guided pairs whose geometry is still the one on record.
 

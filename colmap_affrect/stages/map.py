@@ -21,7 +21,6 @@ from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import measured_inliers
-from colmap_affrect.stages.guide import inliers_by_guiding
 from colmap_affrect.stages.pairs import listed_pairs
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
@@ -75,7 +74,6 @@ def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
         workspace.database,
         workspace.photographs(),
         existing,
-        guided={} if copied else inliers_by_guiding(context),
         measured={} if copied else measured_inliers(context),
         cameras=read_camera_records(workspace.cameras),
         may_share=not copied and context.inputs.may_share,

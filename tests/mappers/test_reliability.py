@@ -11,12 +11,10 @@ import pytest
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.geometry.parallax import mirrored_share
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.mapping import registrations
 from colmap_affrect.mappers.reliability import TERMS, judge, judged, measure
-from colmap_affrect.project.report import DOUBTFUL, SURE, Registration
+from colmap_affrect.project.report import DOUBTFUL, SURE, Bridge
 
 
 def scene(tmp_path: Path, num_images: int = 5) -> tuple[MappedModel, MappingTask]:
@@ -61,7 +59,7 @@ def test_image_that_contradicts_its_pairs_is_doubted_and_the_others_are_not(tmp_
 def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     good = measure(mapped, task)[last(mapped).name]
-    bridge = Registration("bridged", "a", 11, 39, 0.25)
+    bridge = Bridge("a", 11, 39, 0.25)
     bad = {
         "evidence": (replace(good, evidence=-20.0), "speak against"),
         "agreement": (replace(good, agreement=0.1), "only 10% of the matches"),
@@ -212,23 +210,3 @@ def test_given_focal_lengths_are_doubted_where_the_points_say_others(
     fitting = {one.fitting_px for one in found.values()}
     assert len(fitting) == 1
     assert fitting == {0.0} if factor == 1.0 else min(fitting) == pytest.approx(1500.0, rel=0.05)
-
-
-def test_how_images_came_in(tmp_path: Path) -> None:
-    mapped, task = scene(tmp_path)
-    name = last(mapped).name
-    bridge = Registration("bridged", "a.jpg", 32, 36, 0.031)
-    found = registrations(MappedModel(mapped.reconstruction, {name: bridge}), task)
-    assert found.pop(name) == bridge
-    assert set(found.values()) == {Registration("tracks")}
-
-
-def test_image_tied_by_guided_matches_only(tmp_path: Path) -> None:
-    mapped, task = scene(tmp_path, 4)
-    image = last(mapped)
-    pairs = inlier_matches(task.database_path, 1)
-    guided = {ids: matches for ids, matches in pairs.items() if image.image_id in ids}
-    found = registrations(mapped, replace(task, guided=guided))
-    assert [name for name, item in found.items() if item.how == "guided"] == [image.name]
-    few = {ids: matches[:5] for ids, matches in guided.items()}
-    assert {i.how for i in registrations(mapped, replace(task, guided=few)).values()} == {"tracks"}

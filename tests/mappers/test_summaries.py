@@ -11,7 +11,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import SUMMARY, read_given_model
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.summaries import read_summary, write_summary
-from colmap_affrect.project.report import ModelSummary, Registration
+from colmap_affrect.project.report import Bridge, ModelSummary
 
 MODEL = ModelSummary(
     registered_names=("a.jpg", "č.jpg"),
@@ -20,9 +20,8 @@ MODEL = ModelSummary(
     mean_reprojection_error_px=0.512,
     doubtful={"č.jpg": "held by only 9 points"},
     probabilities={"a.jpg": 0.98, "č.jpg": 0.4},
-    registrations={
-        "a.jpg": Registration("tracks"),
-        "č.jpg": Registration("bridged", "a.jpg", 32, 36, 0.031),
+    bridges={
+        "č.jpg": Bridge("a.jpg", 32, 36, 0.031),
     },
     taken_out={"d.jpg": "held by only 3 points"},
     focals_px={"a.jpg": 812.5, "č.jpg": 900.0},

@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 
 from colmap_affrect.project.report import (
+    Bridge,
     ModelSummary,
     ReconstructionReport,
-    Registration,
     StageReport,
 )
 
@@ -19,9 +19,8 @@ LARGE = ModelSummary(
     120,
     2.25,
     0.512,
-    registrations={
-        "a.png": Registration("tracks"),
-        "č d.png": Registration("bridged", "a.png", 32, 36, 0.031),
+    bridges={
+        "č d.png": Bridge("a.png", 32, 36, 0.031),
     },
 )
 SMALL = ModelSummary(("e.png", "f.png"), 50, 2.0, 0.25)
@@ -62,11 +61,9 @@ EMPTY = replace(REPORT, models=(), unregistered={"a.png": "no verified pair"}, i
 def test_report_has_the_promised_keys_and_reads_back() -> None:
     read = json.loads(REPORT.to_json())
     stages = read.pop("stages")
-    assert read.pop("registrations") == {
-        "a.png": {"how": "tracks"},
+    assert read.pop("bridges") == {
         "č d.png": {
-            "how": "bridged", "by": "a.png", "num_agreeing": 32, "num_ratios": 36,
-            "scale_error_frac": 0.031,
+            "by": "a.png", "num_agreeing": 32, "num_ratios": 36, "scale_error_frac": 0.031,
         },
     }  # fmt: skip
     assert read == {

@@ -56,7 +56,7 @@ def test_cameras_are_where_the_model_has_them_seen_from_the_front(html: str, fol
     assert data["names"][0] == NAMES[0]
     (view,) = data["views"]
     kinds = {camera["index"]: camera["kind"] for camera in view["cameras"]}
-    assert kinds == {0: "tracks", 1: "guided", 2: "bridged", 3: "doubtful"}
+    assert kinds == {0: "tracks", 1: "tracks", 2: "bridged", 3: "doubtful"}
     model = pycolmap.Reconstruction(folder / "out" / "sparse" / "0")
     centers = {image.name: image.projection_center() for image in model.images.values()}
     shown = np.array([camera["corners"][:3] for camera in view["cameras"]])

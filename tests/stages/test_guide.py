@@ -16,8 +16,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.project.stores import STATIONARY
 from colmap_affrect.project.workspace import Workspace
@@ -30,7 +28,6 @@ from colmap_affrect.stages.guide import (
     exact_inliers,
     guide,
     guided_counts,
-    inliers_by_guiding,
     restore_exact,
 )
 from colmap_affrect.stages.match import match
@@ -206,24 +203,6 @@ def test_command(context: Context, call: Call) -> None:
     assert "was run there with band_px=2.0" in refused.errors[0] or "enabled" in refused.errors[0]
     wrong = call("guide", *out, "--set", "matching.max_ratio=0.8")
     assert wrong.errors == ["error: --set: only options of guided can be changed here"]
-
-
-def mapper() -> object:
-    return MAPPERS.make(IncrementalOptions())
-
-
-def test_guided_matches_are_the_inliers_that_came_by_guiding(
-    context: Context, guided: Context
-) -> None:
-    assert inliers_by_guiding(context) == {}
-    ids = image_ids(guided.workspace.database)
-    exact, verified = exact_inliers(guided, current(guided)), verified_inliers(guided)
-    found = inliers_by_guiding(guided)
-    assert len(found) == guided_counts(guided)["pairs"]
-    for pair, inliers in verified.items():
-        new = {*map(tuple, inliers.tolist())} - {*map(tuple, exact[pair].tolist())}
-        rows = found.get((ids[pair[0]], ids[pair[1]]), np.zeros((0, 2)))
-        assert {*map(tuple, rows.tolist())} == new
 
 
 def test_ids_of_a_pair_are_in_order(context: Context) -> None:
