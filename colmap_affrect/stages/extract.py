@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from colmap_affrect.project.record import WEIGHTS
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import ExtractionOptions, Recipe
+from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.context import Context, Inputs
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
@@ -156,33 +156,26 @@ def extract_images(
     files = inputs.photographs.files(images[0][0])
     if extractor.options.depth.path:
         files.append(Path(extractor.options.depth.path))
-    tasks = _image_tasks(context.workspace, inputs, extractor.options, images)
+    path, initial = context.workspace.database, inputs.initial_cameras
+    known = colmap_database.read_cameras(path) if path.exists() else {}
+    names = inputs.names() if extractor.options.uses_depth else []
+
+    def task(name: str, level: int) -> ImageTask:
+        camera, intrinsics = known.get(name), None
+        if extractor.options.uses_depth:
+            intrinsics = (
+                colmap_database.camera_matrix(camera) if camera else initial.matrix(name, names)
+            )
+        size = (camera.width, camera.height) if camera else None
+        return ImageTask(inputs.photographs, name, level, intrinsics, size)
+
+    tasks = (task(*image) for image in images)
     for (name, level), found in zip(images, executor.map(extractor, tasks, files), strict=True):
         if isinstance(found, ExtractedImage):
             logger.debug("%s: %d features (level %d)", name, len(found.features), level)
             if found.warning:
                 logger.warning("%s: %s", name, found.warning)
         yield found
-
-
-def _image_tasks(
-    workspace: Workspace,
-    inputs: Inputs,
-    options: ExtractionOptions,
-    images: Sequence[tuple[str, int]],
-) -> Iterator[ImageTask]:
-    """Yield what is to be done for images; cameras are read where rectification depends on them."""
-    has_database, initial = workspace.database.exists(), inputs.initial_cameras
-    known = colmap_database.read_cameras(workspace.database) if has_database else {}
-    names = inputs.names() if options.uses_depth else []
-    for name, level in images:
-        camera, intrinsics = known.get(name), None
-        if options.uses_depth:
-            intrinsics = (
-                colmap_database.camera_matrix(camera) if camera else initial.matrix(name, names)
-            )
-        size = (camera.width, camera.height) if camera else None
-        yield ImageTask(inputs.photographs, name, level, intrinsics, size)
 
 
 def _start_database(workspace: Workspace, inputs: Inputs) -> None:

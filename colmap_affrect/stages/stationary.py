@@ -44,16 +44,14 @@ class StationaryFilter:
         """Name the files; what is known of places is read now."""
         self._features, self._matches = features, matches
         self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
-        self._places = {size: _mask(cells) for size, cells in self._known().items()}
+        kept = matches.note(STATIONARY) or []  # the (N, 2) cells, column and row, by size
+        self._places: dict[Size, Mask] = {
+            tuple(size): _mask(np.array(cells, np.int64).reshape(-1, 2)) for size, cells in kept
+        }
 
     @cached_property
     def _sizes(self) -> dict[str, Size]:
         return self._features.image_sizes()
-
-    def _known(self) -> dict[Size, Indices]:
-        """Return the (N, 2) cells, column and row, on record by size."""
-        kept = self._matches.note(STATIONARY) or []
-        return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in kept}
 
     def filtered(self, found: PairMatches) -> PairMatches:
         """Return the matches of a pair without those of captions, frames and watermarks."""
@@ -80,14 +78,13 @@ class StationaryFilter:
 
         A call that was killed may have dropped some: what it found is on record and counts too.
         """
-        known = self._known()
-        found = {size: cells for size, cells in self._find(pairs).items() if len(cells)}
-        if not (found or known):
+        for size, places in self._find(pairs).items():
+            if places.any():
+                self._places[size] = places | self._places.get(size, places)
+        if not self._places:
             return ""
-        for size, cells in found.items():
-            known[size] = np.unique(np.concatenate([known.get(size, cells), cells]), axis=0)
-            self._places[size] = _mask(known[size])
-        self._matches.keep_note(STATIONARY, [(s, c.tolist()) for s, c in known.items()])
+        kept = [(size, np.argwhere(found.T).tolist()) for size, found in self._places.items()]
+        self._matches.keep_note(STATIONARY, kept)
         num_pairs = num_matches = 0
         for pair in pairs:
             (before,) = self._matches.read([pair])
@@ -104,8 +101,8 @@ class StationaryFilter:
             "them)"
         )
 
-    def _find(self, pairs: Sequence[Pair]) -> dict[Size, Indices]:
-        """Return the (N, 2) cells, column and row, in which nothing moves, by size."""
+    def _find(self, pairs: Sequence[Pair]) -> dict[Size, Mask]:
+        """Return a mask of the cells in which nothing moves, by size."""
         numbers = {name: number for number, name in enumerate(self._sizes)}
         cells = NUM_CELLS, NUM_CELLS
         # By size and cell: numbers of pairs with a match, and with one that does not move; images.
@@ -120,10 +117,7 @@ class StationaryFilter:
             still[size] += unmoved
             for name in found.names:
                 images[size][unmoved, numbers[name]] = True
-        return {
-            size: np.argwhere(_places(matched[size], still[size], images[size].sum(2)))[:, ::-1]
-            for size in matched
-        }
+        return {size: _places(matched[size], still[size], images[size].sum(2)) for size in matched}
 
     def _still(self, names: Pair, indices: Indices, size: Size) -> tuple[Mask, Indices, Indices]:
         """Return which matches do not move; also the (M, 2) cells, column and row, of both ends."""
