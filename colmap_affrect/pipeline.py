@@ -88,6 +88,9 @@ def run(
 ) -> ReconstructionReport:
     """Extract, match, verify and map; go on where an earlier run stopped.
 
+    Returns the report that is also written to ``report.json``. Raises AffrectError for anything
+    that the caller can mend; what is done stays.
+
     Args:
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder for all results, made if missing.
@@ -98,12 +101,6 @@ def run(
         overwrite: discard results that are there.
         page: also write ``report.html``.
         progress: where to show progress.
-
-    Returns:
-        The report that is also written to ``report.json``.
-
-    Raises:
-        AffrectError: for anything that the caller can mend; what is done stays.
     """
     options = options or RunOptions()
     mapper = MAPPERS.make(options.mapping)
