@@ -93,10 +93,8 @@ def extract(
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
     if len(failures) == len(names):
-        first = failures[names[0]]
-        raise ImageError(
-            f"{folder}: none of the {len(names)} images can be used; the first: {first}"
-        )
+        why = f"none of the {len(names)} images can be used; the first: {failures[names[0]]}"
+        raise ImageError(f"{folder}: {why}")
     failures |= write_images_and_keypoints(context)
     new, kept = set(missing) - failures.keys(), done - failures.keys()
     wall_s = time.perf_counter() - start
