@@ -70,6 +70,8 @@ class ScaleEstimate:
 
 TOLERANCE = 0.08  # of logarithms of ratios that agree: neighbours are not at one depth
 NUM_NEIGHBORS = 5  # known places looked at beside each place of a pair
+NUM_ON_PLANE = 12  # known places to which a plane is fitted
+MAX_PLANE_ERROR = 0.04  # relative, of a predicted inverse depth and of those it is fitted to
 NUM_INDEPENDENT = 10  # ratios that count at most: all share the errors of the same poses
 
 
@@ -82,9 +84,36 @@ def scale_between(
     known ones within a radius; the scale is where most logarithms of ratios gather. None without
     neighbours.
     """
-    rows, columns, distances = _nearest_known(known[0], places[0], radius_px)
+    rows, columns, distances = _nearest_known(known[0], places[0], radius_px, NUM_NEIGHBORS)
     ratios = np.log(known[1][columns] / places[1][rows])
     return _densest(rows, ratios, np.exp(-((2 * distances / radius_px) ** 2)))
+
+
+def scale_by_planes(
+    known: tuple[Array, Array], places: tuple[Array, Array], radius_px: float
+) -> ScaleEstimate | None:
+    """Estimate the scale as :func:`scale_between`, where no known depth lies beside a place.
+
+    The inverse depth of a plane is affine in the image: it is fitted to the ``NUM_ON_PLANE`` known
+    depths nearest to each place, within the radius, and taken where it is certain enough. None
+    where no place counts.
+    """
+    rows, columns, _ = _nearest_known(known[0], places[0], radius_px, NUM_ON_PLANE)
+    full = np.flatnonzero(np.bincount(rows, minlength=len(places[0])) == NUM_ON_PLANE)
+    columns = columns[np.isin(rows, full)].reshape(-1, NUM_ON_PLANE)
+    offsets = (known[0][columns] - places[0][full, None]) / radius_px
+    system = np.concatenate([np.ones((*columns.shape, 1)), offsets], axis=2)
+    inverse_depths = 1.0 / known[1][columns]
+    normal = system.transpose(0, 2, 1) @ system + 1e-9 * np.eye(3)
+    fitted = np.linalg.solve(normal, system.transpose(0, 2, 1) @ inverse_depths[..., None])
+    residuals = inverse_depths - (system @ fitted)[..., 0]
+    variances = (residuals**2).sum(axis=1) / (NUM_ON_PLANE - 3)
+    predicted = fitted[:, 0, 0]
+    errors = np.sqrt(variances * np.linalg.inv(normal)[:, 0, 0])
+    spreads = np.sqrt(variances)
+    certain = (predicted > 0) & (np.maximum(errors, spreads) < MAX_PLANE_ERROR * predicted)
+    ratios = -np.log(predicted[certain] * places[1][full[certain]])
+    return _densest(full[certain], ratios, np.ones(len(ratios)))
 
 
 def _densest(rows: Indices, ratios: Array, weights: Array) -> ScaleEstimate | None:
@@ -106,15 +135,14 @@ def _densest(rows: Indices, ratios: Array, weights: Array) -> ScaleEstimate | No
     )
 
 
-def _nearest_known(known: Array, places: Array, radius_px: float) -> tuple[Indices, Indices, Array]:
-    """Return (place, known point, distance) of the nearest ones of each place."""
+def _nearest_known(
+    known: Array, places: Array, radius_px: float, count: int
+) -> tuple[Indices, Indices, Array]:
+    """Return (place, known point, distance) of the ``count`` nearest of each place."""
     if not len(known) or not len(places):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
     distances, columns = cv2.batchDistance(
-        places.astype(np.float32),
-        known.astype(np.float32),
-        cv2.CV_32F,
-        K=min(NUM_NEIGHBORS, len(known)),
+        places.astype(np.float32), known.astype(np.float32), cv2.CV_32F, K=min(count, len(known))
     )
     near = distances <= radius_px
     return np.nonzero(near)[0], columns[near].astype(np.int64), distances[near].astype(np.float64)

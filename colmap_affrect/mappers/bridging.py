@@ -19,6 +19,7 @@ from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.two_views import (
     ScaleEstimate,
     scale_between,
+    scale_by_planes,
 )
 from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
@@ -34,6 +35,9 @@ from colmap_affrect.project.report import Bridge
 
 RADIUS_FRAC = 0.03
 """Places of known depth are neighbours up to this part of the longer side of the image."""
+
+PLANE_RADIUS = 4.0
+"""Known depths on a plane may be so many times farther away."""
 
 MIN_AGREEING = 10
 MIN_AGREEING_SHARE = 0.5
@@ -210,7 +214,9 @@ class Bridges:
         places = self.graph.keypoints[image_id][relative.matches[in_front, side]]
         known = part.known_depths(image_id)
         positive = depths[in_front]
-        return _trusted(scale_between(known, (places, positive), radius))
+        return _trusted(scale_between(known, (places, positive), radius)) or _trusted(
+            scale_by_planes(known, (places, positive), PLANE_RADIUS * radius)
+        )
 
     def _judged(
         self,

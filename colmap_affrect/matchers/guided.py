@@ -5,18 +5,27 @@ these few many more pass the ratio test, which gives more tracks through three i
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
 
 from colmap_affrect.geometry.affine import project
-from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
-from colmap_affrect.geometry.epipolar import HomographyModel, PairModel, epipolar_lines
+from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles, rows_in
+from colmap_affrect.geometry.epipolar import (
+    EpipolarModel,
+    HomographyModel,
+    PairModel,
+    epipolar_lines,
+)
 from colmap_affrect.geometry.two_views import homogeneous
 from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
 
+BANDS_BESIDE = 6.0  # distance, in bands, of the geometry beside that counts accidental matches
+MAX_ACCIDENTAL = 0.5  # share of guided matches that are found beside, above which none counts
 GROUP_ROWS = 48  # compared at once: more take longer in products, fewer in Python
+TINY = np.finfo(float).tiny
 BANDS_OF_HOMOGRAPHY = 2.0  # radius round the place of a homography: planes are never quite plane
 
 
@@ -45,7 +54,8 @@ def guided_matches(
 ) -> Indices:
     """Return the (M, 2) inliers of a pair and its guided matches, one to one, as (K, 2).
 
-    They rise by features of image 1; all inliers stay.
+    They rise by features of image 1; all inliers stay. There are no others where too many are
+    found beside the geometry (:data:`MAX_ACCIDENTAL`): they are accidental.
 
     Args:
         descriptors: (N, D) float32 rows of unit length of both images.
@@ -54,6 +64,12 @@ def guided_matches(
         options: what counts as a match.
     """
     found = nearest_allowed(descriptors, model, options)
+    beside = (
+        nearest_allowed(descriptors, other, options) for other in _beside(model, options.band_px)
+    )
+    num_accidental = min(np.count_nonzero(~rows_in(matches, found)) for matches in beside)
+    if num_accidental > MAX_ACCIDENTAL * len(found):
+        return inliers
     free = ~(np.isin(found[:, 0], inliers[:, 0]) | np.isin(found[:, 1], inliers[:, 1]))
     both = np.concatenate([inliers, found[free]])
     return np.asarray(both[np.argsort(both[:, 0], kind="stable")])
@@ -95,6 +111,23 @@ def nearest_allowed(
     kept = np.flatnonzero(accepted)
     kept = kept[backward[forward[kept]] == kept]
     return np.stack([kept, forward[kept]], axis=1)
+
+
+def _beside(model: PairModel, band_px: float) -> list[PairModel]:
+    """Return geometries that are moved away in image 2: in one of them nothing is right.
+
+    Across most epipolar lines; of a homography along both axes, for what lies before or behind its
+    plane is along one direction only.
+    """
+    points1, points2 = model.points
+    across = np.eye(2)
+    if isinstance(model, EpipolarModel):
+        normals = epipolar_lines(model.fundamental, points1, points2)[1][:, :2]
+        normals = normals[np.isfinite(normals).all(axis=1)]
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), TINY)
+        across = np.linalg.eigh(normals.T @ normals)[1][:, 1:].T
+    steps = BANDS_BESIDE * band_px * across
+    return [replace(model, points=(points1, points2 + step)) for step in steps]
 
 
 def _allowed(model: PairModel, band_px: float) -> Iterator[tuple[Indices, Bools]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from colmap_affrect.geometry.two_views import (
     essential_matrix,
     homogeneous,
     scale_between,
+    scale_by_planes,
     triangulated_depths,
 )
 
@@ -59,10 +62,25 @@ def test_scale_is_found_between_features_that_lie_beside_each_other(share_wrong:
     assert found.error_frac < 0.01
 
 
-def test_without_known_depths_or_places_there_is_no_scale() -> None:
+def test_plane_carries_depths_to_where_nothing_is_known_and_only_a_plane_does() -> None:
+    random = np.random.default_rng(3)
+    known = random.uniform((0, 0), (400, 1000), (400, 2))
+    places = random.uniform((440, 100), (520, 900), (60, 2))
+    given = places, depth_at(places) / SCALE
+    assert scale_between((known, depth_at(known)), given, 30.0) is None
+    found = scale_by_planes((known, depth_at(known)), given, 160.0)
+    assert found is not None
+    assert found.scale == pytest.approx(SCALE, rel=1e-6)
+    assert found.num_agreeing == found.num_ratios > 30
+    rough = depth_at(known) * np.exp(random.normal(0, 0.3, len(known)))
+    assert scale_by_planes((known, rough), given, 160.0) is None
+
+
+@pytest.mark.parametrize("estimate", [scale_between, scale_by_planes])
+def test_without_known_depths_or_places_there_is_no_scale(estimate: Callable[..., object]) -> None:
     nothing, something = (np.zeros((0, 2)), np.zeros(0)), (np.zeros((20, 2)), np.ones(20))
     for known, places in ((nothing, something), (something, nothing)):
-        assert scale_between(known, places, 10.0) is None
+        assert estimate(known, places, 10.0) is None
 
 
 SIZES: tuple[Size, Size] = ((640, 480), (640, 480))

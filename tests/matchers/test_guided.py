@@ -94,19 +94,33 @@ def test_points_without_a_place_match_nothing() -> None:
         assert np.isfinite(points2[found[:, 1]]).all()
 
 
+def plane() -> tuple[Arrays, HomographyModel]:
+    """200 features of a plane that two photographs see, with descriptors of their own."""
+    rng = np.random.default_rng(8)
+    descriptors, points1 = rng.normal(size=(200, 64)), rng.uniform(0, (640, 480), (200, 2))
+    descriptors = descriptors / np.linalg.norm(descriptors, axis=1)[:, None]
+    same = descriptors.astype(np.float32)
+    return (same, same), HomographyModel(HOMOGRAPHY, (points1, project(HOMOGRAPHY, points1)))
+
+
 def test_inliers_stay_and_matches_are_one_to_one() -> None:
-    descriptors, points = random_pair(3)
-    model = EpipolarModel(fundamental((1, 0.2, 0.1)), points)
-    exact = nearest_allowed(descriptors, model, OPTIONS)
-    inliers = exact[:10].copy()
-    inliers[[0, 1], 1] = inliers[[1, 0], 1]  # an older match says otherwise
+    descriptors, model = plane()
+    inliers = np.array([[0, 1], [1, 0], [7, 7]])  # older matches say otherwise
     found = guided_matches(descriptors, model, inliers, OPTIONS)
     assert {*map(tuple, inliers)} <= {*map(tuple, found)}
-    assert len(found) == len(exact) == len(np.unique(found[:, 0])) == len(np.unique(found[:, 1]))
+    assert len(found) == 200 == len(np.unique(found[:, 0])) == len(np.unique(found[:, 1]))
     assert_array_equal(np.sort(found[:, 0]), found[:, 0])
-    nothing = EpipolarModel(model.fundamental, (points[0], points[1][:0]))
-    without = guided_matches((descriptors[0], descriptors[1][:0]), nothing, NONE, OPTIONS)
-    assert not len(without)
+    nothing = HomographyModel(HOMOGRAPHY, (model.points[0], model.points[1][:0]))
+    assert not len(guided_matches((descriptors[0], descriptors[1][:0]), nothing, NONE, OPTIONS))
+
+
+@pytest.mark.parametrize("kind", [EpipolarModel, HomographyModel])
+def test_where_as_much_is_found_beside_a_geometry_nothing_is_proven(kind: type[PairModel]) -> None:
+    descriptors, points = random_pair(4, (2000, 2500))
+    model = kind(HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1)), points)
+    options, inliers = GuidedOptions(band_px=6.0), np.array([[3, 7], [9, 1]])
+    assert len(nearest_allowed(descriptors, model, options)) > 20
+    assert_array_equal(guided_matches(descriptors, model, inliers, options), inliers)
 
 
 @pytest.mark.parametrize("kind", [EpipolarModel, HomographyModel])

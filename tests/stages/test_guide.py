@@ -78,7 +78,7 @@ def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, contex
     assert guide(context, ALWAYS).num_done == len(exact) == 6
     verified = verified_inliers(context)
     counts = guided_counts(context)
-    assert counts["pairs"] > 3
+    assert counts["pairs"] > 1
     assert counts["matches_after"] > 1.05 * counts["matches_before"]
     for pair, indices in exact.items():
         assert len(verified[pair]) >= len(indices)
