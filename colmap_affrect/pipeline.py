@@ -31,7 +31,6 @@ from colmap_affrect.stages.extract import extract, write_descriptors
 from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.map import (
     advice,
-    contradicting_pairs,
     image_names,
     map_images,
     unregistered,
@@ -200,7 +199,6 @@ def map_and_report(
         preset=options.preset_name,
         verification=context.verification.to_mapping(),
         mapping=options.to_mapping(),
-        contradicting_pairs={} if copied else contradicting_pairs(context),
         guided={} if copied else guided_counts(context),
         cameras=tuple(
             record.to_report(camera_id, models[0] if models else None)

@@ -169,8 +169,6 @@ class ReconstructionReport:
         preset: of mapping: ``sparse``, ``colmap`` or ``custom``.
         verification: options of two-view geometry.
         mapping: the mapper and its options.
-        contradicting_pairs: verified pairs that do not fit the largest model, by the level of an
-            escalating recipe that decided them; empty for other recipes.
         extended: names of the images of the model that was extended; empty where none was.
         advice: what to try for the images that are missing.
         guided: ``pairs`` that guided matching gave more inliers, and these inliers
@@ -189,7 +187,6 @@ class ReconstructionReport:
     preset: str
     verification: dict[str, Any]
     mapping: dict[str, Any]
-    contradicting_pairs: dict[str, int] = field(default_factory=dict)
     extended: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     guided: dict[str, int] = field(default_factory=dict)
@@ -272,9 +269,6 @@ class ReconstructionReport:
             lines += [f"            new {name}" for name in self.added]
         lines += _some(f"        not {line}" for line in by_story(self.unregistered))
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
-        if self.contradicting_pairs:
-            total = sum(self.contradicting_pairs.values())
-            lines += [f"            the model contradicts {total} of the verified ones"]
         if self.guided:
             before, after = self.guided["matches_before"], self.guided["matches_after"]
             pairs = f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"

@@ -121,9 +121,6 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     """Return what cannot be trusted."""
     texts = [] if report.models else _why_no_model(report)
     texts += by_story(model.doubtful)
-    if report.contradicting_pairs:
-        total = sum(report.contradicting_pairs.values())
-        texts.append(f"The model contradicts {total} of the verified pairs.")
     return texts
 
 

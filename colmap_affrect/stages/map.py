@@ -1,11 +1,10 @@
 """Map: models of the verified pairs, into ``sparse/``."""
 
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
@@ -13,7 +12,6 @@ from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.mappers.summaries import read_summaries
 from colmap_affrect.pairs.base import Pair
@@ -21,7 +19,6 @@ from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import measured_inliers
-from colmap_affrect.stages.pairs import listed_pairs
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
@@ -183,16 +180,3 @@ def _other_recipes(recipe: str) -> list[str]:
     if recipe != learned:
         texts.append(f"run again with --recipe {learned}, if light or age differ")
     return texts
-
-
-def contradicting_pairs(context: Context) -> dict[str, int]:
-    """Return how many verified pairs of each level of a recipe the largest model contradicts."""
-    names = [level.name for level in context.extraction.levels]
-    path = context.workspace.sparse / "0"
-    if len(names) < 2 or not path.exists():
-        return {}
-    graph, model = PairGraph.read(context.workspace.database), pycolmap.Reconstruction(path)
-    found = {frozenset(graph.names[i] for i in ids) for ids in graph.contradicted(model)}
-    pairs = [pair for pair in listed_pairs(context) if frozenset(pair) in found]
-    levels = Counter(context.matches.levels(pairs).values())
-    return {names[level]: levels[level] for level in sorted(levels)}

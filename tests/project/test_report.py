@@ -74,7 +74,6 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "cameras": list(REPORT.cameras), "points3D": 120, "mean_track_length": 2.25,
         "mean_reprojection_error_px": 0.512, "models": [["a.png", "č d.png"], ["e.png", "f.png"]],
         "extended": [], "added": [], "num_pairs": 10, "num_verified_pairs": 3,
-        "contradicting_pairs": {},
         "recipe": "default", "preset": "sparse", "mapper": "incremental",
         "mapper_options": {"mapper.init_max_error": 3.0}, "verification": {"min_num_inliers": 20},
         "mapping": {"min_model_size": 2}, "random_seed": 7, "versions": {"pycolmap": "4.2.1"},

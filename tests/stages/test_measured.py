@@ -244,14 +244,3 @@ def test_images_that_other_pairs_alone_tie_come_in(context: Context) -> None:
     assert image
     assert image.num_points3D > 50
     assert not models[0].doubtful
-
-
-def test_report_counts_pairs_that_the_model_contradicts(context: Context) -> None:
-    workspace = context.workspace
-    stage.map_images(context, MAPPERS.make(MAPPERS.options("sparse")))
-    model = pycolmap.Reconstruction(workspace.sparse / "0")
-    frames = [model.frames[image.frame_id] for image in model.images.values()][:2]
-    swapped = [frame.rig_from_world for frame in frames][::-1]
-    frames[0].rig_from_world, frames[1].rig_from_world = swapped
-    model.write(workspace.sparse / "0")
-    assert stage.contradicting_pairs(context) == {"identity shapeless": 3}
