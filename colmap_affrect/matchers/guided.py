@@ -16,6 +16,7 @@ from colmap_affrect.geometry.epipolar import (
     EpipolarModel,
     HomographyModel,
     PairModel,
+    common_sign,
     epipolar_lines,
 )
 from colmap_affrect.geometry.two_views import homogeneous
@@ -47,10 +48,17 @@ class GuidedOptions(Options):
     """Largest ratio of first to second descriptor distance, the second one inside the band."""
     min_contrast_distance_px: Annotated[float, within(0.1, 1000.0)] = 10.0
     """The second neighbour must be this far from the first (FGINN)."""
+    max_angle_deg: Annotated[float, within(0.0, 180.0)] = 20.0
+    """Largest angle between a frame and the one that the geometry carries over (Barath, Hajder,
+    Matas): of epipolar directions; frames of right matches are off by 5 to 10 degrees."""
 
 
 def guided_matches(
-    descriptors: tuple[Singles, Singles], model: PairModel, inliers: Indices, options: GuidedOptions
+    descriptors: tuple[Singles, Singles],
+    shapes: tuple[Array, Array] | None,
+    model: PairModel,
+    inliers: Indices,
+    options: GuidedOptions,
 ) -> Indices:
     """Return the (M, 2) inliers of a pair and its guided matches, one to one, as (K, 2).
 
@@ -59,14 +67,23 @@ def guided_matches(
 
     Args:
         descriptors: (N, D) float32 rows of unit length of both images.
+        shapes: (N, 2, 2) linear parts of their frames, up to a factor; None without directions.
         model: geometry of the pair, with the points of all features; those with NaN match nothing.
         inliers: (M, 2) features that are matched already.
         options: what counts as a match.
     """
-    found = nearest_allowed(descriptors, model, options)
-    beside = (
-        nearest_allowed(descriptors, other, options) for other in _beside(model, options.band_px)
-    )
+    sign = 1.0
+    if shapes and model.has_sign:
+        sign = common_sign(model.cosines(inliers[:, 0], inliers[:, 1], shapes))
+
+    def matched(model: PairModel) -> Indices:
+        matches = nearest_allowed(descriptors, model, options)
+        if not shapes:
+            return matches
+        cosines = sign * model.cosines(matches[:, 0], matches[:, 1], shapes)
+        return np.asarray(matches[cosines >= np.cos(np.radians(options.max_angle_deg))])
+
+    found, beside = matched(model), map(matched, _beside(model, options.band_px))
     num_accidental = min(np.count_nonzero(~rows_in(matches, found)) for matches in beside)
     if num_accidental > MAX_ACCIDENTAL * len(found):
         return inliers

@@ -17,8 +17,9 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import CALIBRATED, pair_model
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
-from colmap_affrect.geometry.arrays import Indices, rows_in
+from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
+from colmap_affrect.geometry.tilts import vary_singly
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import ordered_for_reuse
@@ -144,21 +145,27 @@ class GuidedTask:
 
 
 class GuidedMatcher:
-    """Matches pairs again, with the descriptors that it keeps of some images."""
+    """Matches pairs again, with the features that it keeps of some images."""
 
     def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
         self._store, self._options = store, options
-        self._descriptors = ImageCache(
-            lambda name: store.read(name).descriptors, lambda found: found.nbytes
-        )
+        self._images = ImageCache(self._read, lambda arrays: sum(x.nbytes for x in arrays))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return GuidedMatcher, (self._store, self._options)
 
     def __call__(self, task: GuidedTask) -> Indices:
         """Return the (K, 2) inliers of a pair and its guided matches."""
-        first, second = map(self._descriptors.get, task.names)
-        return guided_matches((first, second), task.model, task.inliers, self._options)
+        (first, shapes1), (second, shapes2) = map(self._images.get, task.names)
+        shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
+        both = first, second
+        return guided_matches(both, shapes, task.model, task.inliers, self._options)
+
+    def _read(self, name: str) -> tuple[Singles, Array]:
+        """Return descriptors and, where frames were measured one by one, their linear parts."""
+        features = self._store.read(name)
+        shapes = features.lafs[:, :, :2]
+        return features.descriptors, shapes if len(shapes) and vary_singly(shapes) else shapes[:0]
 
 
 class Guiding:

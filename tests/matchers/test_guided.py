@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.epipolar import EpipolarModel, HomographyModel, PairModel
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches, nearest_allowed
 
@@ -106,12 +106,14 @@ def plane() -> tuple[Arrays, HomographyModel]:
 def test_inliers_stay_and_matches_are_one_to_one() -> None:
     descriptors, model = plane()
     inliers = np.array([[0, 1], [1, 0], [7, 7]])  # older matches say otherwise
-    found = guided_matches(descriptors, model, inliers, OPTIONS)
+    found = guided_matches(descriptors, None, model, inliers, OPTIONS)
     assert {*map(tuple, inliers)} <= {*map(tuple, found)}
     assert len(found) == 200 == len(np.unique(found[:, 0])) == len(np.unique(found[:, 1]))
     assert_array_equal(np.sort(found[:, 0]), found[:, 0])
     nothing = HomographyModel(HOMOGRAPHY, (model.points[0], model.points[1][:0]))
-    assert not len(guided_matches((descriptors[0], descriptors[1][:0]), nothing, NONE, OPTIONS))
+    assert not len(
+        guided_matches((descriptors[0], descriptors[1][:0]), None, nothing, NONE, OPTIONS)
+    )
 
 
 @pytest.mark.parametrize("kind", [EpipolarModel, HomographyModel])
@@ -120,7 +122,18 @@ def test_where_as_much_is_found_beside_a_geometry_nothing_is_proven(kind: type[P
     model = kind(HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1)), points)
     options, inliers = GuidedOptions(band_px=6.0), np.array([[3, 7], [9, 1]])
     assert len(nearest_allowed(descriptors, model, options)) > 20
-    assert_array_equal(guided_matches(descriptors, model, inliers, options), inliers)
+    assert_array_equal(guided_matches(descriptors, None, model, inliers, options), inliers)
+
+
+def test_frames_that_turn_otherwise_match_nothing() -> None:
+    descriptors, model = plane()
+    shapes = np.eye(2) + 0.3 * np.random.default_rng(3).normal(size=(200, 2, 2))
+    frames = np.concatenate([shapes, model.points[0][:, :, None]], axis=2)
+    carried = transform_frames(HOMOGRAPHY, frames)[:, :, :2]
+    turn = np.array([[np.cos(0.9), -np.sin(0.9)], [np.sin(0.9), np.cos(0.9)]])
+    carried[:60] = turn @ carried[:60]
+    found = guided_matches(descriptors, (shapes, carried), model, NONE, OPTIONS)
+    assert_array_equal(found, np.stack([np.arange(60, 200)] * 2, axis=1))
 
 
 @pytest.mark.parametrize("kind", [EpipolarModel, HomographyModel])
