@@ -27,7 +27,7 @@ _PUBLIC = {
     "CameraOptions": "colmap_affrect.images.photographs",
     "CompareOptions": "colmap_affrect.comparison.compare",
     "Comparison": "colmap_affrect.comparison.results",
-    "EvaluateOptions": "colmap_affrect.evaluation.runner",
+    "EvaluateOptions": "colmap_affrect.evaluation.evaluate",
     "Evaluation": "colmap_affrect.evaluation.results",
     "Extension": "colmap_affrect.mappers.existing",
     "ExtractionOptions": "colmap_affrect.recipes",

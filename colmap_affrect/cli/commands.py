@@ -19,7 +19,7 @@ from colmap_affrect.comparison.method_run import CompareOptions
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.errors import AffrectError, ImageError, NoModelError, OptionError, such_as
 from colmap_affrect.evaluation import evaluate as evaluating
-from colmap_affrect.evaluation.runner import EvaluateOptions
+from colmap_affrect.evaluation.evaluate import EvaluateOptions
 from colmap_affrect.evaluation.truths import ScoreOptions
 from colmap_affrect.features import weights as files
 from colmap_affrect.images.conversion import convert_images

@@ -1,24 +1,221 @@
 """Evaluate recipes on a dataset by a protocol: features, matches, scores, tables.
 
-``features/`` are by recipe and a digest of what decides them: only what changed is made again.
+``features/`` are by recipe and a digest of what decides them: only what changed is made again. A
+pair is matched as a run of its two images alone would match it, with cameras unknown. Of levels of
+escalation the one with most inliers of COLMAP's verification counts.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean
+from threading import Lock
+from typing import Any
 
-from colmap_affrect.comparison.methods import parse_methods
-from colmap_affrect.errors import OptionError
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import colmap_keypoints
+from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
+from colmap_affrect.comparison.methods import Method, parse_methods
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.evaluation import datasets, truths
-from colmap_affrect.evaluation.datasets import Pairs
+from colmap_affrect.evaluation.datasets import EvaluationPair, Pairs
 from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, published
-from colmap_affrect.evaluation.runner import EvaluateOptions, RecipeRun
-from colmap_affrect.evaluation.truths import PairResult
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
+from colmap_affrect.features.weights import digests
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
+from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
+from colmap_affrect.options import digest_of
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.progress import SILENT, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import installed_versions
+from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.match import CachedMatcher, Matching
+from colmap_affrect.stages.one_image import prepare
+
+logger = logging.getLogger(__name__)
+
+NOTHING = np.zeros((0, 2)), np.zeros((0, 2))  # points of a pair that could not be matched
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Everything an evaluation depends on beside protocol, dataset and output folder."""
+
+    recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")  # also by name
+    max_num_keypoints: int | None = None  # of each image the strongest are matched; None: all
+    scores: ScoreOptions = field(default_factory=ScoreOptions)
+    resources: Resources = field(default_factory=Resources)
+
+
+class _StrongestFeatures(FeatureStore):
+    """Features of which the strongest of each image are matched."""
+
+    budget: int | None = None  # how many of each level; None for all
+
+    def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
+        indices = super().level_indices(name, level, base)
+        if self.budget is None:
+            return indices
+        order = np.argsort(-self.read(name).responses[indices], kind="stable")
+        return indices[np.sort(order[: self.budget])]
+
+
+class RecipeRun:
+    """One recipe on the pairs of a dataset."""
+
+    def __init__(
+        self,
+        method: Method,
+        pairs: Sequence[EvaluationPair],
+        output_path: Path,
+        inputs: Mapping[str, Any],
+        options: EvaluateOptions,
+        *,
+        overwrite: bool,
+    ) -> None:
+        """Find everything that the recipe needs before any image is worked on.
+
+        Features depend on recipe and ``inputs``.
+        """
+        if method.recipe is None:
+            raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
+        self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
+        self._options, resources = options.scores, options.resources
+        extraction, matching = self.recipe.extraction, self.recipe.matching
+        images = {name for pair in pairs for name in pair.images}
+        self._extractor = prepare(extraction, resources, sorted(images))
+        if overwrite:
+            remove_own(output_path.glob(f"features/{method.folder_name}-????????.h5"))
+        made = digest_of([inputs, extraction.to_mapping(), digests(self._extractor.weights)])
+        features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
+        features.parent.mkdir(parents=True, exist_ok=True)
+        self._store = _StrongestFeatures(features)
+        self._store.budget = options.max_num_keypoints
+        self._matchings = []
+        for level, chosen in enumerate(extraction.levels):
+            of, kind = chosen.matching or matching, chosen.features.kind
+            task = Matching(self._store, of, level, chosen.base, kind, resources)
+            self._matchings.append(task)
+        self.failures: dict[str, str] = {}  # images that could not be used in this run: why
+        self._lock = Lock()  # of extraction and of the store
+
+    def results(self, progress: Progress) -> list[PairResult]:
+        """Match and score all pairs; images whose features are there are not read again."""
+        results = []
+        with progress.stage(self.label, len(self._pairs), "pairs") as advance:
+            work = partial(self._result, [CachedMatcher(task) for task in self._matchings])
+            for result in map_ordered(work, self._pairs, available_cores()):
+                results.append(result)
+                advance(1)
+        return results
+
+    def _result(self, matchers: Sequence[CachedMatcher], pair: EvaluationPair) -> PairResult:
+        """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
+        watch = Stopwatch("extract", "match", "estimate")
+        result, points = self._matched(matchers, pair, watch)
+        if result.failure:
+            return result
+        try:
+            with watch.step("estimate"):
+                score = pair.truth.score(*points, self._options)
+        except Exception as error:
+            logger.exception("%s: %s cannot be scored", self.label, pair.name)
+            return self._failed(pair, f"{type(error).__name__}: {error}")
+        steps = watch.seconds
+        return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
+
+    def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
+        score = pair.truth.score(*NOTHING, self._options)
+        return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
+
+    def _matched(
+        self, matchers: Sequence[CachedMatcher], pair: EvaluationPair, watch: Stopwatch
+    ) -> tuple[PairResult, tuple[Array, Array]]:
+        """Return a result without score, and (M, 2) and (M, 2) points of the best level.
+
+        The result has a failure where an image cannot be used.
+        """
+        best, points, most = None, NOTHING, 0
+        for level, matcher in enumerate(matchers):
+            with self._lock, watch.step("extract"):
+                if not self._extract(pair, level):
+                    break
+                first, second = map(matcher.prepared, pair.images)
+            with watch.step("match"):
+                rows1, rows2 = matcher.match(first, second).indices.T
+                frames = first.frames[rows1], second.frames[rows2]
+                count, decided = 0, ""
+                if len(matchers) > 1:
+                    count = self._verified_inliers(pair, frames, level)
+                    decided = self.recipe.extraction.levels[level].name if count else "none"
+            if count > most or not most:
+                most, points = count, (frames[0][:, :, 2], frames[1][:, :, 2])
+                best = PairResult(
+                    math.inf,
+                    0,
+                    name=pair.name,
+                    category=pair.category,
+                    num_matches=len(rows1),
+                    num_keypoints=(len(first.frames), len(second.frames)),
+                    level=decided,
+                )
+            if most >= max(1, self.recipe.escalate.strong_num_inliers):
+                break
+        failures = (self.failures.get(name, "") for name in pair.images)
+        return best or self._failed(pair, "; ".join(filter(None, failures))), points
+
+    def _extract(self, pair: EvaluationPair, level: int) -> bool:
+        """Extract what the images lack up to a level; tell whether both can be used."""
+        images = zip(pair.images, pair.paths, pair.intrinsics, strict=True)
+        usable = [self._extract_image(*image, level) for image in images]
+        return all(usable)
+
+    def _extract_image(self, name: str, path: Path, intrinsics: Array | None, level: int) -> bool:
+        store = self._store
+        num_levels = len(store.level_ends(name)) if name in store.names() else 0
+        for missing in range(num_levels, level + 1):
+            if name in self.failures:
+                return False
+            try:
+                found = self._extractor.extract_file(path, name, intrinsics, missing)
+            except AffrectError as error:
+                logger.warning("%s", error)
+                self.failures[name] = str(error)
+                return False
+            if found.warning:
+                logger.warning("%s: %s", name, found.warning)
+            if missing:
+                store.extend(name, found.features)
+            else:
+                store.write(name, found.features, found.image_size)
+        return True
+
+    def _verified_inliers(self, pair: EvaluationPair, frames: Sequence[Floats], level: int) -> int:
+        """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it."""
+        with self._lock:
+            sizes = [self._store.image_size(name) for name in pair.images]
+        # What COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus.
+        # The id matters: two images of one camera are verified in another way.
+        model, make = "SIMPLE_RADIAL", pycolmap.Camera.create_from_model_name
+        focal_px = [DEFAULT_FOCAL_RATIO * max(size) for size in sizes]
+        first, second = (
+            Side(make(k + 1, model, focal_px[k], *sizes[k]), colmap_keypoints(frames[k]))
+            for k in (0, 1)
+        )
+        rows = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
+        options = VerificationOptions(random_seed=0)
+        extracted_px = self.recipe.extraction.levels[level].max_image_size_px
+        return len(estimate_geometry((first, second), rows, options, extracted_px).inlier_matches)
+
 
 PROTOCOLS: dict[str, Callable[[Path], Pairs]] = {
     "evd": datasets.load_evd,

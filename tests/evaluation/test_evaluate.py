@@ -20,10 +20,10 @@ from colmap_affrect.evaluation.datasets import load_evd
 from colmap_affrect.evaluation.evaluate import (
     PROTOCOLS,
     EvaluateOptions,
+    RecipeRun,
     evaluate,
 )
 from colmap_affrect.evaluation.results import Evaluation, RecipeResult
-from colmap_affrect.evaluation.runner import RecipeRun
 from colmap_affrect.evaluation.truths import ScoreOptions, TrueHomography
 from colmap_affrect.stages.one_image import ImageExtractor
 
