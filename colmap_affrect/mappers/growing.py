@@ -161,7 +161,7 @@ class Joiner:
                 grown = self.grower.applied(hypothesis, model)
                 new_score = self.evidence.of(grown)
                 new = set(grown.reg_image_ids()) - set(model.reg_image_ids())
-                if new and new_score > score and self.graph.supports(grown, new):
+                if new and new_score > score:
                     break
             else:
                 return model, built

@@ -232,16 +232,6 @@ class PairGraph:
         some = pair.some_matches()
         return float(_agrees(pose, (camera1, camera2), self.points(some))[0].mean())
 
-    def supports(self, model: pycolmap.Reconstruction, image_ids: Iterable[int]) -> bool:
-        """Tell whether of the pairs of each of some images most agree with a model."""
-        poses, cameras = poses_of(model), cameras_of(model)
-        for image_id in image_ids:
-            pairs = [pair for pair in self.pairs_inside(poses) if image_id in pair.ids]
-            agreeing = sum(pair.weight * self.agreement(pair, poses, cameras) for pair in pairs)
-            if agreeing < MIN_SHARE * sum(pair.weight for pair in pairs):
-                return False
-        return True
-
     def is_explained_by(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model has all images of all pairs, and no pair contradicts it."""
         poses, cameras = poses_of(model), cameras_of(model)

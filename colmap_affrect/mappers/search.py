@@ -24,7 +24,6 @@ SHARED_SIGMA = 0.1
 """Deviation of the logarithm of those that several images share, while models grow: two or three of
 these images do not tell it, and models that are to be joined must agree."""
 SAME_FOCAL = 0.03  # of the logarithm: bridges built with one are right with the other
-FACTORS = 1.25, 0.8  # of a focal length, from which another adjustment starts
 NUM_STARTS = 3
 
 
@@ -69,8 +68,10 @@ class Search:
             found = self.joined(graph, adjuster, self._grown(graph, grower), self.num_starts)
             if not found:
                 continue
-            model, evidence = self._with_free_cameras(graph, found[0].reconstruction, most)
-            found = [replace(found[0], reconstruction=model), *found[1:]]
+            model = found[0].reconstruction
+            if self.unknown:
+                self.grower(graph).finish(model, MEDIUM)
+            evidence = self.evidence.of(model)
             agrees = self._agrees(adjuster, model)
             evidence += MIN_GAIN * agrees  # with others, bridges are of the wrong length
             if evidence > most:
@@ -137,10 +138,10 @@ class Search:
         }
         return replace(self.adjuster, priors={**self.adjuster.priors, **near})
 
-    def _as_found(self, model: pycolmap.Reconstruction, factor: float = 1.0) -> Adjuster:
-        """Return what keeps unknown focal lengths near those of a model, times a factor."""
+    def _as_found(self, model: pycolmap.Reconstruction) -> Adjuster:
+        """Return what keeps unknown focal lengths near those of a model."""
         near = {
-            key: FocalPrior(factor * model.cameras[key].mean_focal_length(), SHARED_SIGMA)
+            key: FocalPrior(model.cameras[key].mean_focal_length(), SHARED_SIGMA)
             for key in self._unknown_in(model)
         }
         return replace(self.adjuster, priors={**self.adjuster.priors, **near})
@@ -157,31 +158,6 @@ class Search:
         """Return the cameras of the registered images that nobody knows."""
         used = {camera.camera_id for camera in cameras_of(model).values()}
         return used & self.unknown.keys()
-
-    def _with_free_cameras(
-        self, graph: PairGraph, model: pycolmap.Reconstruction, least: float
-    ) -> tuple[pycolmap.Reconstruction, float]:
-        """Adjust a model; from other focal lengths, too, if it has more evidence than ``least``.
-
-        Returns:
-            The best one and its evidence.
-        """
-        free = self.grower(graph)
-        if self.unknown:
-            free.finish(model, MEDIUM)
-        most = self.evidence.of(model)
-        if len(self.unknown) != 1 or most <= least or self.evidence.is_confirmed(model):
-            return model, most  # several cameras: there are too many other focal lengths
-        for factor in FACTORS:
-            other = pycolmap.Reconstruction(model)
-            near = self._as_found(model, factor)
-            near.begin(other)
-            self.grower(graph, near).finish(other, MEDIUM)
-            free.finish(other, MEDIUM)
-            evidence = self.evidence.of(other)
-            if evidence > most:
-                model, most = other, evidence
-        return model, most
 
     def joined(
         self, graph: PairGraph, adjuster: Adjuster, models: Models, num_starts: int
