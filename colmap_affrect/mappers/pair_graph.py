@@ -234,10 +234,8 @@ class PairGraph:
 
     def is_explained_by(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model has all images of all pairs, and no pair contradicts it."""
-        poses, cameras = poses_of(model), cameras_of(model)
-        return poses.keys() >= self.keypoints.keys() and all(
-            self.agreement(pair, poses, cameras) >= MIN_SHARE for pair in self.pairs
-        )
+        has_all = self.keypoints.keys() <= set(model.reg_image_ids())
+        return has_all and not self.contradicted(model)
 
     def contradicted(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
         """Return the pairs most of whose inliers disagree with a model that has both images."""
