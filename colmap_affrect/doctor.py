@@ -20,7 +20,7 @@ from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_ne
 from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
-from colmap_affrect.mappers.summaries import model_folders, read_summary
+from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.record import STAGES
 from colmap_affrect.project.report import installed_versions

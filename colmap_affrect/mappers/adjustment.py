@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyceres
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
 from colmap_affrect.colmap.model_files import num_long_tracks
-from colmap_affrect.errors import AffrectError
 
 USUAL_FOCAL = 1.15  # longer sides: the median of usual lenses, which are of 25 to 70 mm on film
 USUAL_SIGMA = 0.4  # deviation of the logarithm of a focal length of which nothing is known
@@ -103,7 +103,6 @@ class Adjuster:
         Of some images only, the others stay, and so do the cameras that they share. The cost is in
         nats.
         """
-        pyceres = _pyceres()
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
         options.refine_focal_length = self.refining.refine_focal_length
         options.refine_principal_point = self.refining.refine_principal_point
@@ -154,23 +153,15 @@ class Adjuster:
         mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
         # Reprojection errors are in px, priors in units of their deviation times the noise.
         covariance = np.diag((sigma / self.noise_px) ** 2)
-        normal = _pyceres().factors.NormalPrior(mean, covariance)
+        normal = pyceres.factors.NormalPrior(mean, covariance)
         problem.add_residual_block(normal, None, [camera.params])
 
 
 def _refine_distortion_only(problem: Any, camera: pycolmap.Camera) -> None:
     if problem.has_parameter_block(camera.params):
         fixed = [*camera.focal_length_idxs(), *camera.principal_point_idxs()]
-        manifold = _pyceres().SubsetManifold(len(camera.params), fixed)
+        manifold = pyceres.SubsetManifold(len(camera.params), fixed)
         problem.set_manifold(camera.params, manifold)
-
-
-def _pyceres() -> Any:
-    try:
-        import pyceres
-    except ImportError as error:
-        raise AffrectError(f"this mapper needs pyceres ({error}): pip install pyceres") from error
-    return pyceres
 
 
 def has_long_tracks(model: pycolmap.Reconstruction) -> bool:

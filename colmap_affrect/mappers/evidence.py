@@ -9,7 +9,7 @@ agree are more evidence.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,21 +38,13 @@ class Evidence:
     def of(self, model: pycolmap.Reconstruction) -> float:
         """Return the evidence of a model."""
         poses, cameras = poses_of(model), cameras_of(model)
-        total = self.of_three_views(model)
+        total = sum(self.three_view_ratios(model).values())
         for pair in self.graph.pairs_inside(poses):
             num = self.num_cells(pair)
             total += pair_evidence(self.graph.agreement(pair, poses, cameras) * num, num)
         used = {camera.camera_id: camera for camera in cameras.values()}
         costs = (self.priors[key].cost(camera.mean_focal_length()) for key, camera in used.items())
         return total - sum(costs)
-
-    def of_best(self, models: Iterable[pycolmap.Reconstruction]) -> float:
-        """Return the evidence of the best of some models, 0 without any."""
-        return max(map(self.of, models), default=0.0)
-
-    def of_three_views(self, model: pycolmap.Reconstruction) -> float:
-        """Return what the features that are matched in two other images add to the evidence."""
-        return sum(self.three_view_ratios(model).values())
 
     def is_confirmed(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether features of three images confirm each image of a model."""

@@ -45,7 +45,7 @@ class Search:
 
     def evidence_of(self, models: Sequence[MappedModel]) -> float:
         """Return the evidence of the best of some models."""
-        return self.evidence.of_best(model.reconstruction for model in models)
+        return max((self.evidence.of(model.reconstruction) for model in models), default=0.0)
 
     def best(
         self, graph: PairGraph, start: pycolmap.Reconstruction | None = None

@@ -11,9 +11,8 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
-from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.mapping import map_database, read_summaries
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
-from colmap_affrect.mappers.summaries import read_summaries
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace

@@ -263,12 +263,12 @@ def test_features_of_three_images_confirm_a_model_until_their_points_are_gone(
 ) -> None:
     evidence = Evidence(PairGraph.read(scene[0]), {})
     assert evidence.is_confirmed(model)
-    before = evidence.of_three_views(model)
+    before = sum(evidence.three_view_ratios(model).values())
     last = max(model.reg_image_ids())
     for index in model.images[last].get_observation_point2D_idxs():
         model.delete_observation(last, index)
     assert not evidence.is_confirmed(model)
-    assert evidence.of_three_views(model) < before - 2 * MIN_GAIN
+    assert sum(evidence.three_view_ratios(model).values()) < before - 2 * MIN_GAIN
 
 
 def test_a_token_stops_the_search(scene: Scene, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import SUMMARY, read_given_model
 from colmap_affrect.errors import StoreError
-from colmap_affrect.mappers.summaries import read_summary, write_summary
+from colmap_affrect.mappers.mapping import read_summary, write_summary
 from colmap_affrect.project.report import Bridge, ModelSummary
 
 MODEL = ModelSummary(

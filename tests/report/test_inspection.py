@@ -13,8 +13,7 @@ from synthetic import texture, write_image
 from colmap_affrect.data import Photograph, Rectification, RectificationPlan
 from colmap_affrect.errors import ImageError
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.report.inspection import inspect_image, inspect_level
-from colmap_affrect.report.sheet import PALETTE, WIDTH_PX, tinted
+from colmap_affrect.report.inspection import PALETTE, WIDTH_PX, inspect_image, inspect_level, tinted
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
 SIZE = (300, 200)
