@@ -35,7 +35,7 @@ _PUBLIC = {
     "IncrementalOptions": "colmap_affrect.mappers.incremental",
     "SparseOptions": "colmap_affrect.mappers.sparse",
     "NearestOptions": "colmap_affrect.matchers.nearest",
-    "PairOptions": "colmap_affrect.pairs.base",
+    "PairOptions": "colmap_affrect.pairs.lists",
     "ReconstructionReport": "colmap_affrect.project.report",
     "RunOptions": "colmap_affrect.pipeline",
     "VerificationOptions": "colmap_affrect.colmap.verification",

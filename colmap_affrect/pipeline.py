@@ -16,8 +16,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
-from colmap_affrect.pairs.base import PairOptions
-from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
 from colmap_affrect.project.atomic_files import replace_text

@@ -13,7 +13,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.comparison.pose_scores import PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")
 IMAGE_SIZE = (160, 120)

@@ -16,7 +16,7 @@ from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.options import Options, flat
-from colmap_affrect.pairs.base import PairOptions
+from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.workspace import Workspace

@@ -43,8 +43,8 @@ from colmap_affrect.images.exif import (
     exif_focal,
     read_camera_tags,
 )
-from colmap_affrect.images.headers import is_too_large
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.images.reading import is_too_large
 from colmap_affrect.project.outputs import remove_database, temporary_folder
 
 MAX_LINES = 5  # that are logged; report.json says all

@@ -21,7 +21,7 @@ from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import digest_of
-from colmap_affrect.pairs.base import Pair, PairOptions
+from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import content_of

@@ -27,8 +27,7 @@ from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.pairs.base import Pair, PairList
-from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
+from colmap_affrect.pairs.lists import Pair, PairList, exhaustive_pairs, read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Progress, Stopwatch

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from colmap_affrect.colmap.model_files import Poses, pose_errors, relative_pose
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 
 PairErrors = Mapping[Pair, tuple[float, float]]
 """By the sorted names of two images: the errors of their relative pose in degrees, of the rotation

@@ -7,7 +7,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.images.photographs import MaskOptions, Photographs
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import temporary_folder
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from colmap_affrect.errors import ImageError
-from colmap_affrect.images.headers import pages
 from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files, require_folder
-from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format, pages
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import new_results

@@ -19,8 +19,7 @@ from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, OptionError
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.conventions import resized_from_original
-from colmap_affrect.images.headers import header_size
-from colmap_affrect.images.reading import decode
+from colmap_affrect.images.reading import decode, header_size
 from colmap_affrect.options import Options
 
 SUFFIXES = (".npy", ".png", ".tif", ".tiff")  # in the order in which they are looked for

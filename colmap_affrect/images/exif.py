@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from PIL import ExifTags
 
-from colmap_affrect.images.headers import opened, read_header, stored_size
+from colmap_affrect.images.reading import opened, read_header, stored_size
 
 FILM_DIAGONAL_MM = 43.27  # of 35 mm film, to which equivalents refer (by COLMAP's rounding)
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}

@@ -12,8 +12,14 @@ import numpy as np
 
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError, OptionError, StoreError, one_line, such_as
-from colmap_affrect.images.headers import header_size, pages, require_possible
-from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, read_mask
+from colmap_affrect.images.reading import (
+    IMAGE_SUFFIXES,
+    OTHER_IMAGE_SUFFIXES,
+    header_size,
+    pages,
+    read_mask,
+    require_possible,
+)
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.outputs import is_output_folder
 from colmap_affrect.project.stores import pair_key

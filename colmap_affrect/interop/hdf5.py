@@ -45,7 +45,7 @@ from colmap_affrect.geometry.conventions import (
     pixel_from_colmap,
 )
 from colmap_affrect.images.photographs import CameraOptions, list_images, refuse_colliding_keys
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import leads_outside, new_results

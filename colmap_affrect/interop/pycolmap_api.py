@@ -23,8 +23,7 @@ from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.base import MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.pairs.base import Pair
-from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
+from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.progress import SILENT, Advance, Progress

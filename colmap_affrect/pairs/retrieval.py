@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.arrays import Indices, Singles
-from colmap_affrect.pairs.base import Pair
-from colmap_affrect.pairs.lists import most_similar_pairs
+from colmap_affrect.pairs.lists import Pair, most_similar_pairs
 from colmap_affrect.progress import Progress
 
 NUM_WORDS = 256

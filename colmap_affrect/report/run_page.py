@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.errors import such_as
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import (
     MAX_LINES,

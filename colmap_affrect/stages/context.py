@@ -22,7 +22,7 @@ from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import Options, Registry
-from colmap_affrect.pairs.base import PairOptions
+from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.contents import Content, content_of, file_sha256

@@ -34,7 +34,7 @@ from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import STEP, PairMatches
 from colmap_affrect.recipes import EscalateOptions

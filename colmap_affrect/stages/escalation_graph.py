@@ -8,7 +8,7 @@ from functools import cached_property
 
 from colmap_affrect.colmap.verification import connected_parts, num_in_tracks
 from colmap_affrect.geometry.arrays import Indices
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.recipes import EscalateOptions
 
 

@@ -21,8 +21,7 @@ from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
 from colmap_affrect.geometry.tilts import vary_singly
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
-from colmap_affrect.pairs.base import Pair
-from colmap_affrect.pairs.lists import ordered_for_reuse
+from colmap_affrect.pairs.lists import Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore, GuidedPair

@@ -13,7 +13,7 @@ from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, read_summaries
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context

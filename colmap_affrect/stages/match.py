@@ -23,8 +23,7 @@ from colmap_affrect.matchers.base import (
     MatcherOptions,
     Matches,
 )
-from colmap_affrect.pairs.base import Pair, PairList
-from colmap_affrect.pairs.lists import ordered_for_reuse
+from colmap_affrect.pairs.lists import Pair, PairList, ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.contents import file_sha256
 from colmap_affrect.project.record import WEIGHTS

@@ -9,8 +9,14 @@ from pathlib import Path
 
 from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.pairs.base import Pair, PairList, PairOptions
-from colmap_affrect.pairs.lists import read_pairs, sequence_pairs, write_pairs
+from colmap_affrect.pairs.lists import (
+    Pair,
+    PairList,
+    PairOptions,
+    read_pairs,
+    sequence_pairs,
+    write_pairs,
+)
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport

@@ -15,7 +15,7 @@ import numpy as np
 from colmap_affrect.data import Mask
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.images.reading import grown
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.stores import STATIONARY, FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)

@@ -29,7 +29,7 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
-from colmap_affrect.pairs.base import PairOptions
+from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.stages.context import Resources
 
 CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)

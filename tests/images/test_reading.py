@@ -16,10 +16,10 @@ from synthetic import blobs, centroid, png_of_size, write_image
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.conventions import resized_from_original
-from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.reading import (
     IMAGE_SUFFIXES,
     decode,
+    header_size,
     in_eight_bits,
     read_color,
     read_gray,

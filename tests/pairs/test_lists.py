@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import (
+    Pair,
     exhaustive_pairs,
     most_similar_pairs,
     ordered_for_reuse,

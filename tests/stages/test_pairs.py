@@ -15,7 +15,7 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, nearest_positions, open_database
 from colmap_affrect.errors import OptionError
-from colmap_affrect.pairs.base import PairOptions
+from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages import pairs as stage
 from colmap_affrect.stages.context import Context
