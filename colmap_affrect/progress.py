@@ -134,20 +134,17 @@ def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
 
 
 class Stopwatch:
-    """Adds up the seconds of named steps; while one runs inside another, only the inner counts."""
+    """Adds up the seconds of named steps."""
 
     def __init__(self, *steps: str) -> None:
         # by step; those named beforehand come first and may stay 0
         self.seconds: dict[str, float] = dict.fromkeys(steps, 0.0)
-        self._within = 0.0
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
         """Time a block, also if it fails."""
-        start, before, self._within = time.perf_counter(), self._within, 0.0
+        start = time.perf_counter()
         try:
             yield
         finally:
-            whole = time.perf_counter() - start
-            self.seconds[name] = self.seconds.get(name, 0.0) + whole - self._within
-            self._within = before + whole
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start

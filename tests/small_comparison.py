@@ -11,8 +11,7 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.comparison.pose_scores import PoseScores
-from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
+from colmap_affrect.comparison.results import Comparison, MethodResult, PoseScores, SeedResult
 from colmap_affrect.pairs.lists import Pair
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")

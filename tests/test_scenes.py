@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap.model_files import read_poses
-from colmap_affrect.comparison.pose_scores import pose_scores
+from colmap_affrect.comparison.results import pose_scores
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext

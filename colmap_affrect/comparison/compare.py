@@ -13,8 +13,7 @@ from colmap_affrect.colmap.model_files import Poses, read_poses
 from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.page import write_page
-from colmap_affrect.comparison.pose_scores import pose_scores
-from colmap_affrect.comparison.results import Comparison, MethodResult
+from colmap_affrect.comparison.results import Comparison, MethodResult, pose_scores
 from colmap_affrect.comparison.tables import to_json
 from colmap_affrect.comparison.worker import run_alone
 from colmap_affrect.errors import AffrectError, OptionError
@@ -24,7 +23,7 @@ from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.contents import content_of
+from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Inputs

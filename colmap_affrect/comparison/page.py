@@ -5,8 +5,7 @@ import string
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_affrect.comparison.pose_scores import MAX_CORRECT_ERROR_DEG
-from colmap_affrect.comparison.results import Comparison, MethodResult
+from colmap_affrect.comparison.results import MAX_CORRECT_ERROR_DEG, Comparison, MethodResult
 from colmap_affrect.comparison.tables import headline, notes, table
 from colmap_affrect.options import flat
 from colmap_affrect.progress import SILENT, Progress

@@ -132,7 +132,9 @@ def _sampler(
     from colmap_affrect.features.networks import PatchSampler
 
     pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
-    samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
+    samplers = [
+        PatchSampler(image.astype(np.float32) / np.float32(255), device) for image, _ in pairs
+    ]
     ends = np.cumsum([count for _, count in pairs])
 
     def sample(lafs: Array) -> Tensor:
@@ -158,8 +160,3 @@ def _is_sound(shapes: Array) -> Bools:
 def _frames(shapes: Array, radii_px: Array, centers: Array) -> Array:
     """Return (N, 2, 3) frames of shapes of determinant 1, geometric mean radii and centres."""
     return np.concatenate([radii_px[:, None, None] * shapes, centers[:, :, None]], axis=2)
-
-
-def _unit_range(image: GrayImage) -> Singles:
-    """Return an (H, W) image as float32 in [0, 1]."""
-    return image.astype(np.float32) / np.float32(255)

@@ -24,7 +24,7 @@ from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.options import suggestion
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_bytes
-from colmap_affrect.project.contents import file_sha256
+from colmap_affrect.project.record import file_sha256
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # need no network

@@ -89,13 +89,6 @@ class ExistingModel:
             for camera_id in {image.camera_id for image in self.images}:
                 database.update_camera(self.reconstruction.camera(camera_id))
 
-    def is_part_of(self, model: pycolmap.Reconstruction) -> bool:
-        """Tell whether a model that was made from this one has all its images, posed or not.
-
-        COLMAP drops those that no pair ties to others.
-        """
-        return all(image.frame_id in model.frames for image in self.images)
-
     def restore(self, model: pycolmap.Reconstruction) -> None:
         """Give an extended model the poses that it had before, to the bit, and images it lost.
 

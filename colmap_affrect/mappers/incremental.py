@@ -163,7 +163,10 @@ class _Call:
                 options=self.options, cancellation_token=token,
             )  # fmt: skip
             start.write(folder)
-            models = [m for m in self._map(token, folder) if existing.is_part_of(m)] or [start]
+            frames = {image.frame_id for image in existing.images}
+            # COLMAP drops a model of which no pair ties some images to others.
+            found = self._map(token, folder)
+            models = [m for m in found if frames <= set(m.frames)] or [start]
         for model in models:
             existing.restore(model)
         return models

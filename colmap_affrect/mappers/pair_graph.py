@@ -280,7 +280,7 @@ class PairGraph:
         return allowed
 
 
-@lru_cache(maxsize=2)  # the task of all attempts, and that of one
+@lru_cache(maxsize=1)
 def graph_of(task: MappingTask, min_num_matches: int = MIN_NUM_MATCHES) -> PairGraph:
     """Return the graph of what is to be mapped; of one task it is read once."""
     return PairGraph.read(task.database_path, min_num_matches)

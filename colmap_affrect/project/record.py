@@ -2,18 +2,71 @@
 
 The record is read once, when a command begins; what is made of photographs and pairs is in the
 stores.
+
+What files hold is known by SHA-256 digests, with sizes and times so that an idle run reads none.
 """
 
+import hashlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict
 
 from colmap_affrect.errors import WorkspaceError, damage
 from colmap_affrect.options import flat
+
+
+class Content(NamedTuple):
+    """What files hold."""
+
+    digest: str = ""  # sha256 of the digests of the files; empty if not known
+    stamp: str = ""  # their sizes and times: while these stay, nobody has to read the files
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal digits; read once while it stays as it is."""
+    return _sha256(path, _stamp(path))
+
+
+@lru_cache(maxsize=64)
+def _sha256(path: Path, _: str) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _stamp(path: Path) -> str:
+    there = path.stat()
+    return f"{there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
+
+
+def stamp_of(paths: Iterable[Path]) -> str:
+    """Return sizes and times of files: while these stay, nobody has to read them."""
+    return ", ".join(_or_empty(_stamp, path) for path in paths)
+
+
+def content_of(paths: Iterable[Path], known: Content | None = None) -> Content:
+    """Return what files hold, without reading them if sizes and times are those that are known.
+
+    One that cannot be read counts as empty.
+    """
+    files = list(paths)
+    stamp = stamp_of(files)
+    if known and known.stamp == stamp:
+        return known
+    digests = "\n".join(_or_empty(file_sha256, path) for path in files)
+    return Content(hashlib.sha256(digests.encode()).hexdigest() if files else "", stamp)
+
+
+def _or_empty(read: Callable[[Path], str], path: Path) -> str:
+    try:
+        return read(path)
+    except OSError:
+        return ""
+
 
 Stage = Literal["copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"]
 STAGES: tuple[str, ...] = get_args(Stage)
@@ -26,7 +79,7 @@ PLACES = {
     "masks.camera_path", "depth.path", "match_list_path", "database",
 }  # fmt: skip
 """Options that say where files are: other places are no other options, what the files hold counts
-(:mod:`colmap_affrect.project.contents`). But none at all is another option."""
+(:mod:`colmap_affrect.project.record`). But none at all is another option."""
 WEIGHTS = "weights"  # of a stage: the digests of files, beside its options
 
 

@@ -137,11 +137,6 @@ class ModelSummary:
     moves: tuple[str, ...] = ()
 
     @property
-    def is_trustworthy(self) -> bool:
-        """Whether two images or more are left that are not doubtful."""
-        return len(self.registered_names) - len(self.doubtful) > 1
-
-    @property
     def sure(self) -> tuple[str, ...]:
         """Names of the images that are right with a probability of ``SURE`` or more."""
         return tuple(name for name, share in self.probabilities.items() if share >= SURE)
@@ -197,7 +192,7 @@ class ReconstructionReport:
         """``ok`` (all in one model), ``partial``, ``doubtful`` (no two to trust), ``no_model``."""
         if not self.models:
             return "no_model"
-        if not self.models[0].is_trustworthy:
+        if len(self.models[0].registered_names) - len(self.models[0].doubtful) < 2:
             return "doubtful"
         return "partial" if self.unregistered else "ok"
 

@@ -23,8 +23,8 @@ from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.project.contents import Content, stamp_of
 from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
+from colmap_affrect.project.record import Content, stamp_of
 
 MAX_INT16 = 32767
 NOT_KNOWN = Content()

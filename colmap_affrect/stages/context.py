@@ -25,8 +25,8 @@ from colmap_affrect.options import Options, Registry
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.contents import Content, content_of, file_sha256
 from colmap_affrect.project.outputs import database_files
+from colmap_affrect.project.record import Content, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions

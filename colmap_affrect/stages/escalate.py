@@ -10,7 +10,7 @@ record, so that a killed run goes on in the same way:
 - First pairs between images that no verified pairs connect, then those of an image that is not
   secure: without a strong pair, or with few features in tracks through three images.
 - Of pairs that are not verified only those whose matches hint at a common surface
-  (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside.
+  (:mod:`colmap_affrect.geometry.neighbors`), and the best few of an image that is left outside.
 - Then the verified pairs of the images that gained, while one of the two is not secure: new
   features that two images alone have cannot be tied to the rest.
 - When nothing else is left to do, the best pairs of each image that is still not secure, ten at
@@ -32,7 +32,7 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import PairVerifier, connected_parts
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
-from colmap_affrect.geometry.consistency import num_consistent_matches
+from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import StageReport

@@ -22,8 +22,7 @@ from colmap_affrect.features.weights import digests
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
-from colmap_affrect.project.contents import Content, content_of
-from colmap_affrect.project.record import WEIGHTS
+from colmap_affrect.project.record import WEIGHTS, Content, content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace

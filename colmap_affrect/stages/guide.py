@@ -112,12 +112,6 @@ def _gained(context: Context) -> list[GuidedPair]:
     return [pair for pair in current(context) if pair.num_inliers]
 
 
-def weak_images(exact: Mapping[Pair, Indices], min_num_tracks: int) -> set[str]:
-    """Return the images with few features in tracks through three images, where there are three."""
-    num_images = len({name for pair in exact for name in pair})
-    return weakly_connected_images(exact, min_num_tracks) if num_images > 2 else set()
-
-
 def guided_counts(context: Context) -> dict[str, int]:
     """Return what the report says: pairs with more inliers, and these before and after."""
     gained = _gained(context)
@@ -187,8 +181,11 @@ class Guiding:
         if self.options.enabled == "never":
             images = ()
         elif images is None:
-            is_auto = self.options.enabled == "auto"
-            images = weak_images(exact, self.options.min_num_tracks) if is_auto else self.ids
+            images = self.ids
+            if self.options.enabled == "auto":  # of two images alone there are no longer tracks
+                has_three = len({name for pair in exact for name in pair}) > 2
+                min_num_tracks = self.options.min_num_tracks
+                images = weakly_connected_images(exact, min_num_tracks) if has_three else ()
         chosen = [pair for pair in exact if not set(pair).isdisjoint(images)]
         done = {pair.names for pair in known}
         return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)

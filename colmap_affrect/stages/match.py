@@ -25,8 +25,7 @@ from colmap_affrect.matchers.base import (
 )
 from colmap_affrect.pairs.lists import Pair, PairList, ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
-from colmap_affrect.project.contents import file_sha256
-from colmap_affrect.project.record import WEIGHTS
+from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FINISHED, FeatureStore, PairMatches
 from colmap_affrect.stages.context import Context, Resources, require_same_files

@@ -17,8 +17,8 @@ from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.contents import stamp_of
 from colmap_affrect.project.outputs import database_files
+from colmap_affrect.project.record import stamp_of
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate

@@ -18,7 +18,7 @@ from colmap_affrect.pairs.lists import (
     write_pairs,
 )
 from colmap_affrect.pairs.retrieval import retrieved_pairs
-from colmap_affrect.project.contents import content_of
+from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import write_images_and_keypoints

@@ -22,7 +22,7 @@ from colmap_affrect.colmap.verification import (
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.contents import content_of
+from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context, source_files
 from colmap_affrect.stages.match import write_matches

@@ -23,7 +23,7 @@ import numpy as np
 from machine import describe_machine, parser_of, table
 
 from colmap_affrect.colmap.model_files import read_poses
-from colmap_affrect.comparison.pose_scores import pose_scores
+from colmap_affrect.comparison.results import pose_scores
 from colmap_affrect.parallel.executor import available_cores
 
 sys.path.append(str(Path(__file__).parents[2] / "sample_scenes"))

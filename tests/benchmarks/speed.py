@@ -23,8 +23,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.comparison.method_run import extract_sift, match_sift
 from colmap_affrect.comparison.methods import SIFT, Method, parse_method
-from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.recipes import Recipe

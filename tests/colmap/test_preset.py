@@ -16,7 +16,7 @@ from colmap_affrect.colmap.verification import (
     two_view_options,
     verify,
 )
-from colmap_affrect.comparison.pose_scores import pair_errors
+from colmap_affrect.comparison.results import pair_errors
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
-from colmap_affrect.comparison.pose_scores import (
+from colmap_affrect.comparison.results import (
     PoseScores,
     correct_images,
     pair_errors,

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from colmap_affrect.comparison.pose_scores import PoseScores
-from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
+from colmap_affrect.comparison.results import Comparison, MethodResult, PoseScores, SeedResult
 from colmap_affrect.comparison.tables import headline, notes, summary, table, to_json
 
 NAMES = tuple("abcdef")

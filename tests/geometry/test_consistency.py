@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import Array
 
-from colmap_affrect.geometry.consistency import num_consistent_matches
-from colmap_affrect.geometry.neighbors import neighbors_within
+from colmap_affrect.geometry.neighbors import neighbors_within, num_consistent_matches
 from colmap_affrect.geometry.significance import (
     log10_bayes_factor,
     log10_choose,

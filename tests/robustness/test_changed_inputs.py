@@ -168,7 +168,7 @@ def test_photograph_that_was_only_touched_is_read_once_more(
     stage("extract")
     (tmp_path / "photos" / FIRST).touch()
     assert stage("extract") == ["extract: 0 done, 3 already there"]
-    monkeypatch.setattr("colmap_affrect.project.contents.file_sha256", None)
+    monkeypatch.setattr("colmap_affrect.project.record.file_sha256", None)
     assert stage("extract") == ["extract: 0 done, 3 already there"]
 
 
