@@ -16,16 +16,15 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
-    "lines of the package": 26_800,
+    "lines of the package": 22_000,
     "lines of the tests": 22_000,
     "lines of the longest file": 400,
     "lines of the longest function": 60,
-    "imports between folders": 164,
+    "imports between folders": 163,
     "words of ARCHITECTURE.md": 2_500,
     "words of BENCHMARKS.md": 2_500,
 }
-"""As it is now, rounded up: these numbers only go down. The goal is 22,000 lines each, files of 400
-lines, functions of 60, and 180 imports."""
+"""These numbers only go down. A new feature pays for its lines: before you add, ask what goes."""
 
 
 def imported_rooms(tree: ast.Module) -> Iterator[str]:
