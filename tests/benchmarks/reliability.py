@@ -41,7 +41,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
-from colmap_affrect.comparison import pose_scores
+from colmap_affrect.comparison import results
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MappingTask
 from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS, measure
 from colmap_affrect.project.report import DOUBTFUL, SURE
@@ -203,7 +203,7 @@ def correct_images(poses: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[s
         if first and second and first[0] == second[0]:
             relative = relative_pose(poses[one], poses[two])
             errors[one, two] = pose_errors(relative, relative_pose(first[1], second[1]))
-    right = pose_scores.correct_images(errors)
+    right = results.correct_images(errors)
     return {name: name in right for name in names}
 
 
