@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from colmap_affrect.geometry.arrays import Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within, without_duplicates
 from colmap_affrect.matchers.base import (
     ImageFeatures,
@@ -20,10 +20,17 @@ from colmap_affrect.matchers.base import (
     Matches,
     distance_ratios,
 )
-from colmap_affrect.matchers.nearest_8bit import CoarseDescriptors, coarse_pays, may_match
+from colmap_affrect.matchers.nearest_8bit import (
+    CoarseDescriptors,
+    ShortList,
+    coarse_pays,
+    short_lists,
+)
 from colmap_affrect.options import within
 
 CHUNK_ELEMENTS = 1 << 22  # similarities held at once, which bounds memory
+CHUNK_ROWS = 1 << 12  # pairs of descriptors held at once, which bounds memory
+NO_LIMIT = 2.0  # no ratio is larger than 1
 
 
 class NearestOptions(MatcherOptions):
@@ -65,36 +72,90 @@ class NearestNeighbors:
         self.options, self._is_coarse = options, coarse_pays(context.num_similarities)
 
     def prepare(self, image: ImageFeatures) -> MatchableImage:
-        """Find the rivals of each feature, and round the descriptors where that pays."""
-        descriptors = np.ascontiguousarray(image.features.descriptors, dtype=np.float32)
-        keypoints = image.features.keypoints
-        rivals = neighbors_within(keypoints, self.options.min_contrast_distance_px)
-        coarse = CoarseDescriptors.of(descriptors) if self._is_coarse else None
-        return MatchableImage(descriptors, keypoints, rivals, coarse)
+        """Make the features of an image ready for matching."""
+        descriptors, keypoints = image.features.descriptors, image.features.keypoints
+        return matchable(descriptors, keypoints, self.options, is_coarse=self._is_coarse)
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
-        """Match two images; scores are 1 - the larger ratio of distances."""
-        if not len(first.descriptors) or not len(second.descriptors):
-            return Matches.none()
-        rows = np.arange(len(first.descriptors))
-        if first.coarse and second.coarse:
-            rows = may_match(first.coarse, second.coarse, second.rivals, self.options.max_ratio)
-        forward, ratios = _nearest(first.descriptors[rows], second)
-        passing = ratios < self.options.max_ratio
-        rows, worst = rows[passing], ratios[passing]
-        targets, back = np.unique(forward[passing], return_inverse=True)
-        backward, back_ratios = _nearest(second.descriptors[targets], first)
-        if self.options.ratio_both_ways:
-            worst = np.maximum(worst, back_ratios[back])
-        keep = (backward[back] == rows) & (worst < self.options.max_ratio)
-        rows, columns, worst = rows[keep], targets[back][keep], worst[keep]
-        order = np.argsort(worst, kind="stable")
-        places = first.keypoints[rows[order]], second.keypoints[columns[order]]
-        kept = np.sort(order[without_duplicates(*places, self.options.duplicate_radius_px)])
-        return Matches(np.stack([rows, columns], axis=1)[kept], 1.0 - worst[kept])
+        """Match two images."""
+        return match_features(first, second, self.options)
 
 
-def _nearest(queries: Singles, image: MatchableImage) -> tuple[Indices, Singles]:
+def matchable(
+    descriptors: Floats, keypoints: Floats, options: NearestOptions, *, is_coarse: bool = False
+) -> MatchableImage:
+    """Prepare (N, D) unit descriptors at (N, 2) px; all images are coarse, or none."""
+    descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
+    rivals = neighbors_within(keypoints, options.min_contrast_distance_px)
+    coarse = CoarseDescriptors.of(descriptors) if is_coarse else None
+    return MatchableImage(descriptors, keypoints, rivals, coarse)
+
+
+def match_features(
+    image1: MatchableImage, image2: MatchableImage, options: NearestOptions
+) -> Matches:
+    """Match two images, with or without features; scores are 1 - the larger ratio of distances."""
+    if not len(image1.descriptors) or not len(image2.descriptors):
+        return Matches.none()
+    everything = np.arange(len(image1.descriptors))
+    forward, ratios = _nearest(image1, everything, image2, options.max_ratio)
+    rows = np.flatnonzero(ratios < options.max_ratio)
+    targets, back = np.unique(forward[rows], return_inverse=True)
+    back_limit = options.max_ratio if options.ratio_both_ways else NO_LIMIT
+    backward, back_ratios = _nearest(image2, targets, image1, back_limit)
+    worst = ratios[rows]
+    if options.ratio_both_ways:
+        worst = np.maximum(worst, back_ratios[back])
+    keep = (backward[back] == rows) & (worst < options.max_ratio)
+    rows, columns, worst = rows[keep], targets[back][keep], worst[keep]
+    order = np.argsort(worst, kind="stable")
+    places = image1.keypoints[rows[order]], image2.keypoints[columns[order]]
+    kept = np.sort(order[without_duplicates(*places, options.duplicate_radius_px)])
+    return Matches(np.stack([rows, columns], axis=1)[kept], 1.0 - worst[kept])
+
+
+def _nearest(
+    image1: MatchableImage, rows: Indices, image2: MatchableImage, max_ratio: float
+) -> tuple[Indices, Singles]:
+    """Return nearest features and ratios to non-rivals; perhaps -1 and infinite from the limit."""
+    queries = image1.descriptors[rows]
+    if image1.coarse is None or image2.coarse is None:
+        return _nearest_of_all(queries, image2)
+    nearest, doubtful = np.full(len(rows), -1), np.zeros(len(rows), bool)
+    ratios = np.full(len(rows), np.inf, np.float32)
+    for short in short_lists(image1.coarse, image2.coarse, rows, image2.rivals, max_ratio):
+        at = short.rows
+        nearest[at], ratios[at], doubtful[at] = _nearest_of_listed(queries, image2, short)
+    nearest[doubtful], ratios[doubtful] = _nearest_of_all(queries[doubtful], image2)
+    return nearest, ratios
+
+
+def _nearest_of_listed(
+    queries: Singles, image: MatchableImage, short: ShortList
+) -> tuple[Indices, Singles, Bools]:
+    """Return nearest and ratio among the listed features, and where these are doubtful."""
+    similarity = np.empty(len(short.entry_rows), np.float32)
+    for begin in range(0, len(similarity), CHUNK_ROWS):
+        part = slice(begin, begin + CHUNK_ROWS)
+        query = queries[short.rows[short.entry_rows[part]]]
+        candidates = image.descriptors[short.entry_columns[part]]
+        similarity[part] = np.einsum("ij,ij->i", query, candidates)
+    starts = np.searchsorted(short.entry_rows, np.arange(len(short.rows)))
+    first = np.maximum.reduceat(similarity, starts)
+    highest = np.flatnonzero(similarity == first[short.entry_rows])
+    _, lowest_column = np.unique(short.entry_rows[highest], return_index=True)
+    nearest = short.entry_columns[highest[lowest_column]]
+    rows, rivals = image.rivals.of(nearest)
+    count = len(image.descriptors)
+    listed = short.entry_rows * count + short.entry_columns
+    similarity[np.isin(listed, rows * count + rivals)] = -1.0
+    doubtful = short.doubtful.copy()
+    doubtful[rows[rivals == short.runners_up[rows]]] = True
+    second = np.maximum.reduceat(similarity, starts)
+    return nearest, distance_ratios(first, second), doubtful
+
+
+def _nearest_of_all(queries: Singles, image: MatchableImage) -> tuple[Indices, Singles]:
     """Return the nearest feature of each query and the ratio to the nearest non-rival."""
     count = len(image.descriptors)
     nearest = np.empty(len(queries), np.int64)

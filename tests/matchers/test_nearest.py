@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from colmap_affrect.data import LocalFeatures
-from colmap_affrect.geometry.affine import lafs_from_keypoints
-from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
-from colmap_affrect.matchers.nearest import NearestNeighbors, NearestOptions
+from colmap_affrect.matchers.base import Matches
+from colmap_affrect.matchers.nearest import NearestOptions, match_features, matchable
 
 RATIO_ERROR = 2e-3
 """Ratios are roots of differences of float32 cosines near 1: sqrt(1e-7) where a distance is 0."""
@@ -87,16 +85,7 @@ def slow_matches(
 
 def run(first: Features, second: Features, options: NearestOptions) -> Matches:
     """Match two sets of (descriptors, keypoints)."""
-    matcher = NearestNeighbors(options, MatcherContext())
-    return matcher.match(*(matcher.prepare(as_image(*features)) for features in (first, second)))
-
-
-def as_image(descriptors: NDArray[np.float32], keypoints: NDArray[np.float64]) -> ImageFeatures:
-    """Features of one size at these places."""
-    ones = np.ones(len(keypoints))
-    lafs = lafs_from_keypoints(keypoints, ones, 0 * ones)
-    features = LocalFeatures(lafs, ones.astype(np.float32), descriptors)
-    return ImageFeatures(features, (1000, 1000), "any")
+    return match_features(matchable(*first, options), matchable(*second, options), options)
 
 
 @given(

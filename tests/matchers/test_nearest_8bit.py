@@ -9,10 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.matchers import nearest_8bit as coarse
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
-from colmap_affrect.matchers.nearest import NearestNeighbors, NearestOptions
+from colmap_affrect.matchers.nearest import (
+    NearestNeighbors,
+    NearestOptions,
+    match_features,
+    matchable,
+)
 from colmap_affrect.matchers.nearest_8bit import coarse_pays, has_fast_8_bit_products
 
 
@@ -28,14 +32,6 @@ def similarity_codes(
 ) -> NDArray[np.uint8]:
     products = codes1.astype(np.int32) @ codes2.astype(np.int32).T
     return np.clip(np.rint(unit / coarse.CODE_STEP * products), 0, 255).astype(np.uint8)
-
-
-def as_image(descriptors: NDArray[np.float32], keypoints: NDArray[np.float64]) -> ImageFeatures:
-    ones = np.ones(len(keypoints))
-    lafs = lafs_from_keypoints(keypoints, ones, 0 * ones)
-    return ImageFeatures(
-        LocalFeatures(lafs, ones.astype(np.float32), descriptors), (200, 200), "any"
-    )
 
 
 def unit_rows(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -58,11 +54,9 @@ def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArra
 
 def require_exact(views: list[tuple[NDArray, NDArray]], options: NearestOptions) -> int:
     """Compare with the matches of exact similarities; return how many there are."""
-    matcher = NearestNeighbors(options, MatcherContext())
-    images = [as_image(*view) for view in views]
-    exact = matcher.match(*map(matcher.prepare, images))
-    matcher._is_coarse = True
-    found = matcher.match(*map(matcher.prepare, images))
+    exact = match_features(*(matchable(*view, options) for view in views), options)
+    images = (matchable(*view, options, is_coarse=True) for view in views)
+    found = match_features(*images, options)
     np.testing.assert_array_equal(found.indices, exact.indices)
     np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
     return len(exact.indices)
