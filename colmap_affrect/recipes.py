@@ -102,7 +102,7 @@ class ExtractionOptions(Options):
         """
         found = tuple(level.matching or matching for level in self.levels)
         for level, matcher in zip(self.levels, found, strict=True):
-            matcher.require_extractor(level.features.kind)
+            matcher.require_extractor(level.features.name)
         return found
 
     @property

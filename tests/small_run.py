@@ -33,8 +33,8 @@ def small_report(folder: Path) -> ReconstructionReport:
         bridges={NAMES[2]: Bridge(NAMES[0], 12, 15, 0.031)},
     )
     camera = {
-        "id": 1, "num_images": 6, "names": list(NAMES), "source": "pairs", "focal_px": 200.0,
-        "refined_px": 204.4, "spread_px": [180.0, 230.0], "why": "they vote",
+        "id": 1, "num_images": 6, "names": list(NAMES), "source": "exif", "focal_px": 200.0,
+        "refined_px": 204.4, "why": "one of them",
     }  # fmt: skip
     failure = f"{folder / 'photographs' / 'f.png'}: not a readable image"
     return ReconstructionReport(

@@ -18,9 +18,9 @@ from colmap_affrect.rectifiers.base import CoverOptions
 NAMES = [
     "affnet-shapes", "aliked-lightglue", "asift", "asift-recommended", "default", "dense-affnet",
     "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended", "depth-planes",
-    "depth-planes-recommended", "disk-lightglue", "dog-affnet-hardnet-lightglue", "on-demand",
-    "on-demand-learned", "second-moment-shapes", "sift-lightglue", "unrectified",
-    "unrectified-rootsift", "xfeat-lighterglue",
+    "depth-planes-recommended", "disk-lightglue", "on-demand", "on-demand-learned",
+    "second-moment-shapes",
+    "sift-lightglue", "unrectified", "unrectified-rootsift", "xfeat-lighterglue",
 ]  # fmt: skip
 
 OF_THE_PAPER = {

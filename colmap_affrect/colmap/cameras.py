@@ -29,9 +29,8 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.tables import read_table
 
-Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
-"""By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
-verified pairs (older versions); or COLMAP's usual guess."""
+Source = Literal["given", "exif", "exif-rescaled", "guess"]
+"""By the user; by EXIF as it is, or scaled to a photograph that was shrunk; or COLMAP's guess."""
 
 Given = Literal["focal", "principal-point", "distortion"]
 """Parts of intrinsics; a model without distortion counts as given once its focal length is."""

@@ -65,7 +65,8 @@ def compare(
         for number, run in enumerate(runs, 1):
             title = f"method {number} of {len(runs)}, {run.method.label}: "
             failed = "" if run.finished() else run_alone(run, title, progress)
-            results.append(run.finished() or replace(run.result, seeds=(), failed=failed))
+            found = run.finished() or replace(run.result, seeds=())
+            results.append(replace(found, failed=failed or found.failed))
         if truth:
             results = [_measured(result, output_path, truth, names) for result in results]
         comparison = Comparison(

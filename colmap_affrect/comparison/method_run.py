@@ -9,8 +9,7 @@ COLMAP's own SIFT goes another way to features and matches.
 import json
 import math
 import shutil
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -148,7 +147,6 @@ class MethodRun:
             self.mapping = Recipe().mapper_options("colmap")
         self.workspace = Workspace(self.output_path / METHODS / self.method.folder_name)
         self.database = self.workspace.database
-        self.failure = self.workspace.path / "failed.txt"  # why its process ended
         self.result = self._read_result()
 
     def _read_result(self) -> MethodResult:
@@ -186,68 +184,61 @@ class MethodRun:
             )
         self.workspace.begin()
         replace_text(record, json.dumps(asked, indent=1))
-        self.failure.unlink(missing_ok=True)
 
     def run(self) -> None:
         """Extract, match, verify and map; what is there is kept."""
-        if self.method.recipe:
-            self._match_recipe(self.method.recipe)
-        else:
-            self._stage("extract", self._extract_sift)
-            self._stage("match", self._match_sift)
+        self.result = replace(self.result, failed="")
+        if not self.result.wall_s:  # time that a killed run took does not count
+            watch = Stopwatch()
+            find = self._match_recipe if self.method.recipe else self._match_sift
+            self.keep(failures=find(watch), wall_s=watch.seconds)
         done = {result.seed: result for result in self.result.seeds}
         for seed in self.options.seeds:
             if seed not in done:
                 done[seed] = self._run_seed(seed)
-                self._keep(seeds=tuple(done.values()))
-        self._keep(seeds=tuple(done[seed] for seed in self.options.seeds))
+                self.keep(seeds=tuple(done.values()))
+        self.keep(seeds=tuple(done[seed] for seed in self.options.seeds))
 
-    def _keep(self, **values: Any) -> None:
+    def keep(self, **values: Any) -> None:
+        """Put what is new of the result on disk."""
         peak = max(self.result.peak_memory_bytes, peak_memory_bytes())
         self.result = replace(self.result, peak_memory_bytes=peak, **values)
         replace_bytes(self.workspace.path / "result.json", RESULT.dump_json(self.result, indent=1))
 
-    def _stage(self, name: str, work: Callable[[], object]) -> None:
-        """Do what is not done; a stage that was killed counts from where it went on."""
-        if name not in self.result.wall_s:
-            start = time.perf_counter()
-            work()
-            self._keep(wall_s={**self.result.wall_s, name: time.perf_counter() - start})
-
-    def _extract_sift(self) -> None:
+    def _match_sift(self, watch: Stopwatch) -> dict[str, str]:
+        """Extract and match as COLMAP does; return why images cannot be used."""
         inputs = self.options.inputs(self.image_path)
-        names = inputs.names()
-        with self.progress.stage("extract", len(names), "images") as advance:
+        names, progress = inputs.names(), self.progress
+        with watch.step("extract"), progress.stage("extract", len(names), "images") as advance:
             failures = add_images(self.workspace, inputs, names)
             taken = [name for name in names if name not in failures]
             if not taken:
                 raise AffrectError(f"COLMAP cannot use any of the {len(names)} images")
-            images = self.image_path, taken, self.options.masks
-            self._keep(failures=failures | extract_sift(self.database, *images))
+            failures |= extract_sift(self.database, self.image_path, taken, self.options.masks)
             advance(len(names))
-
-    def _match_sift(self) -> None:
-        taken, pairs = image_ids(self.database).keys(), None
+        taken, pairs = list(image_ids(self.database)), None
         if self.options.pairs.match_list_path:
-            names = self.options.inputs(self.image_path).names()
-            pairs = [pair for pair in self.options.pairs_of(names) if taken >= set(pair)]
+            pairs = [p for p in self.options.pairs_of(names) if set(taken) >= set(p)]
         num_pairs = math.comb(len(taken), 2) if pairs is None else len(pairs)
-        with self.progress.stage("match", num_pairs, "pairs") as advance:
+        with watch.step("match"), progress.stage("match", num_pairs, "pairs") as advance:
             match_sift(self.database, pairs)
             advance(num_pairs)
+        return failures
 
-    def _match_recipe(self, recipe: Recipe) -> None:
+    def _match_recipe(self, watch: Stopwatch) -> dict[str, str]:
         context = Context(self.workspace, self.options.resources, None, self.progress)
-        inputs = self.options.inputs(self.image_path)
-        self._stage(
-            "extract", lambda: self._keep(failures=extract(context, inputs, recipe).failures)
-        )
+        inputs, recipe = self.options.inputs(self.image_path), self.method.recipe or Recipe()
+        with watch.step("extract"):
+            failures = extract(context, inputs, recipe).failures
         choose_pairs(context, self.options.pairs)
-        self._stage("match", lambda: match(context))
+        with watch.step("match"):
+            match(context)
         if self.method.escalates:
             verification = self.verification.changed(random_seed=self.options.seeds[0])
             verify_matches(replace(context, progress=SILENT), verification)
-            self._stage("escalate", lambda: escalate(context))
+            with watch.step("escalate"):
+                escalate(context)
+        return failures
 
     def _run_seed(self, seed: int) -> SeedResult:
         """Verify and map a copy of the database of the method, in a folder of the seed."""

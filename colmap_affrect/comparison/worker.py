@@ -16,11 +16,10 @@ from colmap_affrect.comparison.method_run import MethodRun
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.parallel.subprocesses import end_with
 from colmap_affrect.progress import Progress
-from colmap_affrect.project.atomic_files import replace_text
 
 
 def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
-    """Run a method in another process; return why it failed, empty if it did not.
+    """Run a method in another process; return how that was lost, empty if it was not.
 
     What it prints goes to ``run.log`` in its folder. The process is killed where this raises, also
     for Ctrl-C.
@@ -44,7 +43,7 @@ def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
             process.kill()
             raise
     if not code:
-        return run.failure.read_text(encoding="utf-8") if run.failure.exists() else ""
+        return ""
     ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
     memory = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
     return f"its process ended {ending}{memory}; {log_path} may say why"
@@ -62,10 +61,10 @@ def main() -> None:
         with run.workspace.locked():
             run.run()
     except AffrectError as error:
-        replace_text(run.failure, str(error))
+        run.keep(failed=str(error))
     except Exception as error:
         logging.exception("failed")
-        replace_text(run.failure, f"{type(error).__name__}: {error}")
+        run.keep(failed=f"{type(error).__name__}: {error}")
 
 
 if __name__ == "__main__":

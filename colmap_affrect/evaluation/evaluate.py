@@ -102,7 +102,7 @@ class RecipeRun:
         self._store.budget = options.max_num_keypoints
         self._matchings = []
         for level, chosen in enumerate(extraction.levels):
-            of, kind = chosen.matching or matching, chosen.features.kind
+            of, kind = chosen.matching or matching, chosen.features.name
             task = Matching(self._store, of, level, chosen.base, kind, resources)
             self._matchings.append(task)
         self.failures: dict[str, str] = {}  # images that could not be used in this run: why

@@ -38,11 +38,6 @@ class AffNetHardNetOptions(DogOptions):
     descriptor: Literal["hardnet", "hardtfeat"] = "hardnet"
 
     @property
-    def kind(self) -> str:
-        """Name of the chain with this descriptor."""
-        return f"dog-affnet-{self.descriptor}"
-
-    @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights that the networks read."""
         return ("affnet", "orinet", self.descriptor)

@@ -49,11 +49,6 @@ class FeatureOptions(NetworkOptions):
     max_num_rectified_features: Annotated[int, within(1, 1_000_000)] = 6144
     """Most features of all warps together, by response."""
 
-    @property
-    def kind(self) -> str:
-        """What matchers that were trained know such features by: by default the extractor."""
-        return self.name
-
 
 class FeatureExtractor(Protocol):
     """Detection and description; called with its ``Options`` and a :class:`NetworkContext`."""

@@ -11,7 +11,6 @@ from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import MapperOptions, MappingTask
 from colmap_affrect.options import digest_of
-from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 
 logger = logging.getLogger(__name__)
@@ -22,8 +21,6 @@ nothing but the attempt that made it can be gone on with."""
 
 NUM_KEPT = 2
 """A snapshot may be half written when a run is killed; the one before it is complete."""
-
-INPUTS = "inputs.sha256"
 
 
 def snapshots_of(sparse_path: Path) -> Path:
@@ -45,16 +42,13 @@ def with_snapshots(
         return
     given = {str(key): record.given for key, record in task.cameras.items()}
     made_from = [rows_digest(task.database_path), options.to_mapping(), given]
-    digest = digest_of(made_from)
-    record = folder / INPUTS
-    if not (record.exists() and record.read_bytes() == digest.encode()):
-        remove_own([folder])
-        folder.mkdir(parents=True)
-        replace_text(record, digest)
+    own = folder / digest_of(made_from)
+    remove_own(path for path in folder.glob("*") if path != own)
+    own.mkdir(parents=True, exist_ok=True)
     try:
-        yield replace(task, snapshot_path=folder)
+        yield replace(task, snapshot_path=own)
     except BaseException:
-        if not any(path.is_dir() for path in folder.iterdir()):
+        if not any(own.iterdir()):
             remove_own([folder])
         raise
     remove_own([folder])

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 MIN_VIEW_FEATURES = 8  # of a view: no geometry could be verified by what fewer add
 TRAINING_SIZE_PX = 1024  # longer side in training, whose pixels scales of features are in
-KORNIA_SIGMAS = 12.0  # radius of kornia's frames of DoG features, in units of sigma
 CHUNK_ROWS = 1 << 10  # features whose similarities are held at once, which bounds memory
 DUPLICATE_RADIUS_PX = 2.0  # of nearer matches of several views, at both ends, the best stays
 
@@ -58,9 +57,6 @@ TRAININGS = {
     "disk": Training("lightglue-disk", "disk", "disk-lightglue"),
     "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat-lighterglue"),
     "sift": Training("lightglue-sift", "rootsift", "sift-lightglue", False),
-    "dog-affnet-hardnet": Training(
-        "lightglue-dog-affnet-hardnet", "dog-affnet-hardnet", "dog-affnet-hardnet-lightglue", False
-    ),
 }
 
 
@@ -68,7 +64,7 @@ class LightGlueOptions(MatcherOptions):
     """LightGlue, and LighterGlue for XFeat; defaults are those of LightGlue's authors."""
 
     name: Literal["lightglue"] = "lightglue"
-    trained_for: Literal["aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet"] = "aliked"
+    trained_for: Literal["aliked", "disk", "xfeat", "sift"] = "aliked"
     """Features that the weights were trained for."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of each view that are matched, those of the largest responses."""
@@ -197,7 +193,7 @@ def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
     from kornia.feature import LightGlue as Network
 
     configuration = {
-        **Network.features[options.trained_for.replace("-", "_")],
+        **Network.features[options.trained_for],
         "weights": None,
         "depth_confidence": options.depth_confidence,
         "width_confidence": options.width_confidence,
@@ -252,18 +248,14 @@ def network_inputs(
     """Return what the network reads of (N, 2, 3) frames in a view of (width, height).
 
     Pixel-centre px, as in training. Scales are those of images of ``TRAINING_SIZE_PX``, of which
-    only larger ones were shrunk; orientations have range and sense of training: COLMAP's of SIFT,
-    else kornia's.
+    only larger ones were shrunk; orientations are COLMAP's.
     """
     values = {"keypoints": np.clip(lafs[:, :, 2], 0.0, size), "image_size": size}
-    if trained_for not in ("sift", "dog-affnet-hardnet"):
+    if trained_for != "sift":
         return values
     sigmas = np.sqrt(determinants(lafs[:, :, :2])) / MEASUREMENT_SIGMAS
     sigmas = sigmas * min(1.0, TRAINING_SIZE_PX / longer_side_px)
-    if trained_for == "sift":
-        return values | {"scales": sigmas, "oris": np.arctan2(lafs[:, 1, 0], lafs[:, 0, 0])}
-    oris = np.arctan2(lafs[:, 0, 1], lafs[:, 0, 0]) % (2.0 * np.pi)
-    return values | {"scales": KORNIA_SIGMAS * sigmas, "oris": oris}
+    return values | {"scales": sigmas, "oris": np.arctan2(lafs[:, 1, 0], lafs[:, 0, 0])}
 
 
 def promising(

@@ -13,7 +13,7 @@ from colmap_affrect.errors import such_as
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {
-    "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size", "pairs": "from matches",
+    "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size",
     "guess": "not known beforehand",
 }  # fmt: skip
 """How a summary calls where focal lengths are from; others are called by their own names."""

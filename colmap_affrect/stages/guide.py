@@ -9,6 +9,7 @@ to be told from it. The raw matches stay as they are, as with COLMAP's own guide
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore, GuidedPair
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalation_graph import weakly_connected_images
-from colmap_affrect.stages.match import PAIRS_PER_WRITE, ImageCache
+from colmap_affrect.stages.match import IMAGES_IN_MEMORY, PAIRS_PER_WRITE
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (
     extracted_px,
@@ -37,7 +38,6 @@ from colmap_affrect.stages.verify import (
 
 MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
 NOTHING: Indices = np.zeros((0, 2), np.int64)
-IMAGES_IN_MEMORY = 40  # of 13,000 features; pairs come in an order that reads these seldom
 
 
 def guide(
@@ -142,14 +142,14 @@ class GuidedMatcher:
 
     def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
         self._store, self._options = store, options
-        self._images = ImageCache(self._read, lambda arrays: sum(x.nbytes for x in arrays))
+        self._images = lru_cache(IMAGES_IN_MEMORY)(self._read)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return GuidedMatcher, (self._store, self._options)
 
     def __call__(self, task: GuidedTask) -> Indices:
         """Return the (K, 2) inliers of a pair and its guided matches."""
-        (first, shapes1), (second, shapes2) = map(self._images.get, task.names)
+        (first, shapes1), (second, shapes2) = map(self._images, task.names)
         shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
         both = first, second
         return guided_matches(both, shapes, task.model, task.inliers, self._options)

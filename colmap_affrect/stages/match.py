@@ -3,12 +3,12 @@
 import logging
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,7 @@ PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
 
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
+IMAGES_IN_MEMORY = 40  # of 13,000 features
 BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
 
 Found = TypeVar("Found")
@@ -134,7 +135,7 @@ def matched_at_level(
     ``options`` count where the level has none of its own.
     """
     features, chosen = context.features, context.extraction.levels[level]
-    options, extractor = chosen.matching or options, chosen.features.kind
+    options, extractor = chosen.matching or options, chosen.features.name
     matching = Matching(features, options, level, chosen.base, extractor, context.resources)
     stationary = StationaryFilter(features, context.matches)
     with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
@@ -176,6 +177,7 @@ class Matching:
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     num_similarities: float = 0  # about how many pairs of features there will be to compare
+    num_kept: int = IMAGES_IN_MEMORY
 
 
 def iterate_matches(
@@ -192,7 +194,9 @@ def iterate_matches(
     counts = matching.store.num_keypoints()
     num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    matcher = CachedMatcher(replace(matching, num_similarities=num_similarities))
+    matcher = CachedMatcher(
+        replace(matching, num_similarities=num_similarities, num_kept=max(2, num_kept))
+    )
     ordered = ordered_for_reuse(pairs, max(1, num_kept // 2))
     yield from executor.map(matcher, ordered, [matching.store.path])
 
@@ -204,29 +208,6 @@ class PreparedImage:
     content: Any  # what the matcher made of it
     frames: Floats  # (N, 2, 3) local affine frames in pixel-centre px
     indices: Indices  # (N,) int64 that its features have in the store
-
-
-Content = TypeVar("Content")
-
-
-class ImageCache(Generic[Content]):
-    """Keeps what is made of images, those used last, as many as ``CACHE_BYTES`` hold."""
-
-    def __init__(self, make: Callable[[str], Content], nbytes: Callable[[Content], int]) -> None:
-        """Say how to make what is missing, of the name of an image, and what memory it takes."""
-        self._make, self._nbytes, self._lock = make, nbytes, threading.Lock()
-        self._images: OrderedDict[str, Content] = OrderedDict()
-
-    def get(self, name: str) -> Content:
-        """Return what there is of an image; made one at a time."""
-        with self._lock:
-            if name not in self._images:
-                self._images[name] = self._make(name)
-            self._images.move_to_end(name)
-            nbytes = sum(map(self._nbytes, self._images.values()))
-            while nbytes > CACHE_BYTES and len(self._images) > 1:
-                nbytes -= self._nbytes(self._images.popitem(last=False)[1])
-            return self._images[name]
 
 
 class CachedMatcher:
@@ -242,7 +223,7 @@ class CachedMatcher:
             require_same_files(self._weights, sent)
         context = MatcherContext(self._weights, resources.device, matching.num_similarities)
         self._matcher = MATCHERS.make(options, context)
-        self._images = ImageCache(self._prepare, lambda image: int(image.content.nbytes))
+        self._images, self._lock = lru_cache(matching.num_kept)(self._prepare), threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return CachedMatcher, (self._matching, digests(self._weights))
@@ -261,8 +242,9 @@ class CachedMatcher:
         return self._matcher.match(first.content, second.content)
 
     def prepared(self, name: str) -> PreparedImage:
-        """Return an image ready for matching."""
-        return self._images.get(name)
+        """Return an image ready for matching; made one at a time."""
+        with self._lock:
+            return self._images(name)
 
     def _prepare(self, name: str) -> PreparedImage:
         matching, store = self._matching, self._matching.store

@@ -126,14 +126,14 @@ def test_cameras_of_a_model_are_read(tmp_path: Path, write: str) -> None:
 
 
 FROM_EXIF = CameraRecord(("a č.jpg", "b.jpg"), "exif", 812.5, size=(640, 480))
-VOTED = CameraRecord(("c.jpg",), "pairs", 500.0, "40 pairs agree", (300, 400))
+RESCALED = CameraRecord(("c.jpg",), "exif-rescaled", 500.0, "shrunk", (300, 400))
 
 
 def test_records_come_back(tmp_path: Path) -> None:
     path = tmp_path / "cameras.json"
     assert read_camera_records(path) == {}
-    write_camera_records(path, {12: VOTED, 3: FROM_EXIF})
-    assert read_camera_records(path) == {3: FROM_EXIF, 12: VOTED}
+    write_camera_records(path, {12: RESCALED, 3: FROM_EXIF})
+    assert read_camera_records(path) == {3: FROM_EXIF, 12: RESCALED}
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -147,9 +147,9 @@ def test_damaged_records_are_one_clear_line(tmp_path: Path, text: str) -> None:
 
 def test_report_has_the_focal_length_in_longer_sides_and_the_refined_one() -> None:
     model = ModelSummary((), 0, 0.0, 0.0, focals_px={"c.jpg": 470.0, "z": 9.0})
-    entry = VOTED.to_report(12, model)
+    entry = RESCALED.to_report(12, model)
     assert entry["refined_px"] == 470.0
-    assert (entry["id"], entry["num_images"], entry["source"]) == (12, 1, "pairs")
+    assert (entry["id"], entry["num_images"], entry["source"]) == (12, 1, "exif-rescaled")
     assert entry["focal_longer_sides"] == pytest.approx(1.25)
     known = FROM_EXIF.to_report(3, None)
     assert known["refined_px"] is None

@@ -282,7 +282,7 @@ def test_mapping_that_was_stopped_goes_on_from_its_snapshot(
     task = MappingTask(path, None, cancellation=token)
     with pytest.raises(KeyboardInterrupt):
         map_database(mapper_of(), task, tmp_path / "sparse", stop_after(8, token))
-    folder = tmp_path / "sparse.snapshots"
+    (folder,) = (tmp_path / "sparse.snapshots").iterdir()
     left = snapshots.largest_snapshot(folder)
     names = set(snapshots.registered_names(left))
     assert 4 <= len(names) < NUM_IMAGES
@@ -308,7 +308,7 @@ def test_snapshots_of_other_options_are_dropped(
         with snapshots.with_snapshots(task, mapper_of(**options).options, folder, num_images) as it:
             assert (it.snapshot_path is None) == (num_images == 1)
             if it.snapshot_path and not options:
-                (folder / "1").mkdir()
+                (it.snapshot_path / "1").mkdir()
             raise OSError("full")
 
     monkeypatch.setattr(snapshots, "SNAPSHOT_FRAMES", 2)
@@ -316,8 +316,8 @@ def test_snapshots_of_other_options_are_dropped(
         assert not folder.exists()
         with pytest.raises(OSError, match="full"):
             fail(num_images)
-    with snapshots.with_snapshots(task, mapper_of().options, folder, 10):
-        assert (folder / "1").exists()
+    with snapshots.with_snapshots(task, mapper_of().options, folder, 10) as it:
+        assert (it.snapshot_path / "1").exists()
     assert not folder.exists()
     with pytest.raises(OSError, match="full"):
         fail(10)
@@ -337,9 +337,9 @@ def test_snapshots_of_other_cameras_are_dropped(
 
     def is_gone_on_with(task: MappingTask) -> bool:
         found = []
-        with suppress(OSError), snapshots.with_snapshots(task, options, folder, 10):
-            found.append((folder / "1").exists())
-            (folder / "1").mkdir(exist_ok=True)
+        with suppress(OSError), snapshots.with_snapshots(task, options, folder, 10) as it:
+            found.append((it.snapshot_path / "1").exists())
+            (it.snapshot_path / "1").mkdir(exist_ok=True)
             raise OSError("full")
         return found[0]
 

@@ -107,15 +107,12 @@ def test_scales_and_orientations_are_those_of_training() -> None:
     angles = np.array([0.2, 3.0, -2.5, 5.9])
     lafs = lafs_from_keypoints(np.ones((4, 2)), np.array([6.0, 12.0, 18.0, 7.5]), angles)
     size = np.array([512.0, 300.0])
-    for kornia, radii in (("sift", 1.0), ("dog_affnet_hardnet", 2.0)):  # of their frames in ours
-        given = lafs.copy()
-        given[:, :, :2] *= radii
-        scales, oris = _lightglue_keypoint_scale_ori(torch.from_numpy(given)[None], kornia)
-        values = network_inputs(lafs, size, 512, kornia.replace("_", "-"))
-        assert_allclose(values["scales"], scales[0], rtol=1e-9)
-        assert_allclose(values["oris"], oris[0], rtol=1e-9)
-        shrunk = network_inputs(lafs, size, 4096, kornia.replace("_", "-"))["scales"]
-        assert_allclose(shrunk, values["scales"] / 4.0)
+    scales, oris = _lightglue_keypoint_scale_ori(torch.from_numpy(lafs)[None], "sift")
+    values = network_inputs(lafs, size, 512, "sift")
+    assert_allclose(values["scales"], scales[0], rtol=1e-9)
+    assert_allclose(values["oris"], oris[0], rtol=1e-9)
+    shrunk = network_inputs(lafs, size, 4096, "sift")["scales"]
+    assert_allclose(shrunk, values["scales"] / 4.0)
 
 
 def test_strongest_features_are_matched_and_keep_their_indices(comparing: Path) -> None:
@@ -191,7 +188,7 @@ def test_threads_find_the_same(matcher: LightGlue) -> None:
 @pytest.mark.parametrize("trained_for", TRAININGS)
 def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_path: Path) -> None:
     training = TRAININGS[trained_for]
-    path = write_comparing_lightglue(tmp_path / "lightglue.pth", trained_for.replace("-", "_"))
+    path = write_comparing_lightglue(tmp_path / "lightglue.pth", trained_for)
     options = LightGlueOptions.from_mapping({"trained_for": trained_for}, "")
     matcher = LightGlue(options, MatcherContext({training.weights: path}, "cpu"))
     dimension = 64 if trained_for == "xfeat" else 128

@@ -31,7 +31,7 @@ def test_everything_of_the_report_is_told(html: str) -> None:
         "d.png: hangs on few &lt;points&gt;", "right with a probability of 40%; doubtful: hangs",
         "--camera-mode single", "no verified pair", "unreadable: f.png: not a readable image",
         "12 of 15 depths agree, scale +-3.1%",
-        "1 camera, focal lengths: 1 from matches.", "they vote",
+        "1 camera, focal lengths: 1 from EXIF.", "one of them",
         "15 pairs are verified", "model: an &lt;old&gt; one",
     ):  # fmt: skip
         assert text in html

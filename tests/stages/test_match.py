@@ -55,6 +55,6 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
         return read(cache, name)
 
     monkeypatch.setattr(CachedMatcher, "_prepare", counted)
-    monkeypatch.setattr(stage, "CACHE_BYTES", 3 * 800 * NUM_FEATURES)
+    monkeypatch.setattr(stage, "CACHE_BYTES", 5 * stage.BYTES_PER_FEATURE * NUM_FEATURES)
     assert matches(store) == expected
     assert len(NAMES) < len(reads) <= 3 * len(NAMES)
