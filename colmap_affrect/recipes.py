@@ -139,7 +139,7 @@ class EscalateOptions(Options):
     such matches, are escalated all the same."""
     num_blind_pairs: Annotated[int, within(0, 1_000_000)] = 10
     """In the end so many pairs of an image that is still weakly connected get the first level
-    whose frames are not measured (ALIKED, DISK, XFeat), without any hint at a common surface:
+    whose frames are not measured (ALIKED, XFeat), without any hint at a common surface:
     where light or age differ, gradients do."""
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
-    "lines of the package": 22_113,
+    "lines of the package": 22_000,
     "lines of the tests": 22_000,
     "lines of the longest file": 400,
     "lines of the longest function": 60,

@@ -32,8 +32,7 @@ def write_random_weights(folder: Path) -> dict[str, Path]:
     }
     for name, network in networks.items():
         torch.save({"state_dict": network.state_dict()}, folder / name)
-    torch.save({"extractor": feature.DISK().state_dict()}, folder / "disk")
-    return {name: folder / name for name in (*networks, "disk")}
+    return {name: folder / name for name in networks}
 
 
 def write_comparing_lightglue(

@@ -18,7 +18,7 @@ from colmap_affrect.rectifiers.base import CoverOptions
 NAMES = [
     "affnet-shapes", "aliked-lightglue", "asift", "asift-recommended", "default", "dense-affnet",
     "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended", "depth-planes",
-    "depth-planes-recommended", "disk-lightglue", "on-demand", "on-demand-learned",
+    "depth-planes-recommended", "on-demand", "on-demand-learned",
     "second-moment-shapes",
     "sift-lightglue", "unrectified", "unrectified-rootsift", "xfeat-lighterglue",
 ]  # fmt: skip
@@ -75,8 +75,8 @@ def test_matcher_must_be_trained_for_the_features() -> None:
 
 
 def test_matching_of_a_level_must_take_its_features() -> None:
-    values = {"escalation": [{"features": "disk", "matching": {"name": "lightglue"}}]}
-    with pytest.raises(OptionError, match="takes features of aliked, not of disk"):
+    values = {"escalation": [{"features": "xfeat", "matching": {"name": "lightglue"}}]}
+    with pytest.raises(OptionError, match="takes features of aliked, not of xfeat"):
         Recipe.from_mapping(values, "mine")
 
 

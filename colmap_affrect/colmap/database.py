@@ -73,12 +73,6 @@ def image_ids(path: Path) -> dict[str, int]:
         return {image.name: image.image_id for image in database.read_all_images()}
 
 
-def all_cameras(path: Path) -> list[pycolmap.Camera]:
-    """Return the cameras of a database."""
-    with open_database(path) as database:
-        return list(database.read_all_cameras())
-
-
 def nearest_positions(
     path: Path, num_neighbors: int, max_distance_m: float
 ) -> list[tuple[str, str]]:

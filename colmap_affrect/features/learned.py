@@ -1,4 +1,4 @@
-"""Features ``aliked``, ``disk`` and ``xfeat``: networks that detect and describe in one pass.
+"""Features ``aliked`` and ``xfeat``: networks that detect and describe in one pass.
 
 Frames are upright circles of RADIUS_PX in the view, which a warp makes ellipses in the image.
 """
@@ -23,16 +23,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 RADIUS_PX = 12.0
-"""Radius of all frames: a sigma of 2 px, within which all three networks find a point again, so
+"""Radius of all frames: a sigma of 2 px, within which both networks find a point again, so
 that a point that warps show again is known as the same."""
-MIN_NETWORK_PX = 32  # views are filled up to it: DISK normalises over a sixteenth of it
 
 Found = tuple["Tensor", "Tensor", Callable[["Tensor"], "Tensor"]]
 """(N, 2) points in pixel-centre px, (N,) responses, and what describes those of some indices."""
 
 
 class LearnedOptions(FeatureOptions):
-    """What the three networks have in common."""
+    """What both networks have in common."""
 
     in_color: ClassVar[bool] = True
     bytes_per_px: ClassVar[int] = 1600
@@ -61,14 +60,6 @@ class AlikedOptions(LearnedOptions):
         return (f"aliked-{self.model}",)
 
 
-class DiskOptions(LearnedOptions):
-    """Features ``disk`` (Tyszkiewicz et al. 2020), trained with depth maps."""
-
-    name: Literal["disk"] = "disk"
-    score_threshold: Annotated[float, within(0.0, 1e6)] = 0.0
-    """Scores are above it."""
-
-
 class XFeatOptions(LearnedOptions):
     """Features ``xfeat`` (Potje et al. 2024)."""
 
@@ -80,9 +71,7 @@ class XFeatOptions(LearnedOptions):
 class LearnedFeatures(FeatureExtractor):
     """A network on one view after another; its class says how it is called."""
 
-    def __init__(
-        self, options: AlikedOptions | DiskOptions | XFeatOptions, context: NetworkContext
-    ) -> None:
+    def __init__(self, options: AlikedOptions | XFeatOptions, context: NetworkContext) -> None:
         """Load the network; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import load_extractor, resolve_device
 
@@ -128,28 +117,6 @@ class Aliked(LearnedFeatures):
         points = (places + 1) / 2 * size
         head = self.network.desc_head
         return points, responses, lambda chosen: head(features, [places[chosen]])[0][0]
-
-
-class Disk(LearnedFeatures):
-    """DISK: maxima of a heat map at whole pixels, with the descriptor of that pixel.
-
-    Pixel i stands for the corner coordinate i, as the cameras have it that it was trained with:
-    compared with shrunk photographs it finds points 0.4 px right of and below where they are.
-    """
-
-    Options = DiskOptions
-    descriptor_size = 128
-
-    def _run(self, pixels: Tensor) -> Found:
-        from torch.nn.functional import pad
-
-        height, width = pixels.shape[2:]
-        missing = max(MIN_NETWORK_PX - width, 0), max(MIN_NETWORK_PX - height, 0)
-        filled = pad(pixels, (0, missing[0], 0, missing[1]))
-        threshold = self.options.score_threshold
-        (found,) = self.network(filled, score_threshold=threshold, pad_if_not_divisible=True)
-        points = found.keypoints - HALF_PIXEL
-        return points, found.detection_scores, found.descriptors.__getitem__
 
 
 class XFeat(LearnedFeatures):

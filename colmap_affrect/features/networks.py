@@ -91,12 +91,8 @@ def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
 
 
 def load_extractor(key: str, score_threshold: float, path: Path, device: str) -> nn.Module:
-    """Build ALIKED, DISK or XFeat by the key of its file; maxima above the threshold are kept."""
+    """Build ALIKED or XFeat by the key of its file; maxima above the threshold are kept."""
     state = load_state_dict(path)
-    if key == "disk":  # whose threshold is given with each image
-        if not isinstance(inner := state.get("extractor"), Mapping):
-            raise unusable(path, "not the weights of disk (no extractor)")
-        return _ready(_with_state(feature.DISK(), inner, path, key), device)
     if key == "xfeat":
         xfeat = feature.XFeat(detection_threshold=score_threshold)
         _with_state(xfeat.net, state, path, key)

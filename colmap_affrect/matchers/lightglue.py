@@ -54,7 +54,6 @@ class Training(NamedTuple):
 
 TRAININGS = {
     "aliked": Training("lightglue-aliked", "aliked", "aliked-lightglue"),
-    "disk": Training("lightglue-disk", "disk", "disk-lightglue"),
     "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat-lighterglue"),
     "sift": Training("lightglue-sift", "rootsift", "sift-lightglue", False),
 }
@@ -64,7 +63,7 @@ class LightGlueOptions(MatcherOptions):
     """LightGlue, and LighterGlue for XFeat; defaults are those of LightGlue's authors."""
 
     name: Literal["lightglue"] = "lightglue"
-    trained_for: Literal["aliked", "disk", "xfeat", "sift"] = "aliked"
+    trained_for: Literal["aliked", "xfeat", "sift"] = "aliked"
     """Features that the weights were trained for."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of each view that are matched, those of the largest responses."""

@@ -1,6 +1,5 @@
 """Pages that need nothing beside them, made from the parts in ``templates`` (home of jinja2)."""
 
-import base64
 import hashlib
 import os
 import re
@@ -13,7 +12,7 @@ import jinja2
 from colmap_affrect.errors import shown
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.report.pictures import thumbnails
+from colmap_affrect.report.pictures import base64_text, thumbnails
 from colmap_affrect.report.scene import View3D
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -62,7 +61,7 @@ def write_page(
     environment.globals |= {
         "inlier_colors": INLIER_COLORS,
         "script": script,
-        "script_digest": base64.b64encode(digest).decode("ascii"),
+        "script_digest": base64_text(digest),
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
     }
     index = {name: number for number, name in enumerate(names)}

@@ -15,11 +15,6 @@ MAX_TOTAL_PX, MAX_SIDE_PX = 12_000_000, 640  # of all thumbnails of a page, and 
 MAX_NUM_THUMBNAILS = 1000
 
 
-def thumbnail_size_px(count: int) -> int:
-    """Return the longer side of so many thumbnails, with which a page stays below some MB."""
-    return int(min(MAX_SIDE_PX, (4 / 3 * MAX_TOTAL_PX / max(1, count)) ** 0.5))
-
-
 class Picture(NamedTuple):
     """An image of some px as text: a ``data:`` address with the whole file."""
 
@@ -37,7 +32,8 @@ def thumbnails(
     folder: Path, names: Sequence[str], progress: Progress = SILENT
 ) -> dict[str, Picture]:
     """Read photographs as stored, shrunk for a page of that many; unreadable ones are left out."""
-    size_px, shown = thumbnail_size_px(len(names)), names[:MAX_NUM_THUMBNAILS]
+    shown = names[:MAX_NUM_THUMBNAILS]
+    size_px = int(min(MAX_SIDE_PX, (4 / 3 * MAX_TOTAL_PX / max(1, len(names))) ** 0.5))
 
     def picture(name: str) -> Picture | None:
         try:

@@ -118,22 +118,12 @@ def _card(number: int, name: str, report: ReconstructionReport, model: ModelSumm
 
 
 def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
-    """Return what cannot be trusted."""
-    texts = [] if report.models else _why_no_model(report)
-    texts += by_story(model.doubtful)
-    return texts
-
-
-def _why_no_model(report: ReconstructionReport) -> list[str]:
-    """Return the reason, and what became of the photographs, those of one fate together."""
-    names: dict[str, list[str]] = {}
-    for name, why in report.unregistered.items():
-        names.setdefault(why.partition(";")[0], []).append(name)
+    """Return what cannot be trusted, or why there is no model and what became of photographs."""
+    if report.models:
+        return by_story(model.doubtful)
     why = report.why_no_model
-    return [
-        f"{why[0].upper()}{why[1:]}.",
-        *(f"{reason}: {such_as(alike)}" for reason, alike in names.items()),
-    ]
+    fates = {name: fate.partition(";")[0] for name, fate in report.unregistered.items()}
+    return [f"{why[0].upper()}{why[1:]}.", *by_story(fates)]
 
 
 def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:

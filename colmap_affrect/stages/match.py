@@ -194,9 +194,8 @@ def iterate_matches(
     counts = matching.store.num_keypoints()
     num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    matcher = CachedMatcher(
-        replace(matching, num_similarities=num_similarities, num_kept=max(2, num_kept))
-    )
+    known = replace(matching, num_similarities=num_similarities, num_kept=max(2, num_kept))
+    matcher = CachedMatcher(known)
     ordered = ordered_for_reuse(pairs, max(1, num_kept // 2))
     yield from executor.map(matcher, ordered, [matching.store.path])
 

@@ -217,13 +217,13 @@ def test_records_are_kept_and_follow_the_images_that_come_later(
     record_cameras(path, records_path, initial)
     (record,) = read_camera_records(records_path).values()
     assert (record.names, record.source, record.size) == (("a.jpg",), "exif", (90, 60))
-    voted = CameraRecord(("a.jpg",), "pairs", 70.0, "", (90, 60))
-    write_camera_records(records_path, {1: voted})
+    given = CameraRecord(("a.jpg",), "given", 70.0, "", (90, 60))
+    write_camera_records(records_path, {1: given})
     imported(path, photos, NAMES)
     record_cameras(path, records_path, initial)
     records = read_camera_records(records_path)
     assert [(r.names, r.source) for r in records.values()] == [
-        (("a.jpg", "b.jpg"), "pairs"),
+        (("a.jpg", "b.jpg"), "given"),
         (("c.jpg",), "exif"),
         (("side/d.jpg", "side/e.jpg"), "exif"),
         (("side/f.png",), "guess"),

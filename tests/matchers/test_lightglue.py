@@ -202,8 +202,8 @@ def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_pa
 
 
 def test_features_of_another_extractor_are_refused_in_one_line(matcher: LightGlue) -> None:
-    with pytest.raises(OptionError, match="'aliked' takes features of aliked, not of disk"):
-        matcher.prepare(image(features(20, 1), "disk"))
+    with pytest.raises(OptionError, match="'aliked' takes features of aliked, not of xfeat"):
+        matcher.prepare(image(features(20, 1), "xfeat"))
     matcher.prepare(image(features(20, 1), ""))
 
 

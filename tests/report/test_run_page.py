@@ -83,7 +83,7 @@ def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
     for text in (
         "Why there is no model",
         "No model was found: no pair of images is verified.",
-        "c.png and 3 more</li>",
+        "f.png: no features",
         "There is no model.",
         "No pair of photographs is verified",
     ):
