@@ -89,9 +89,7 @@ class Search:
     ) -> pycolmap.Reconstruction:
         """Return a model with the cameras of the graph that begins with those of another one."""
         grower = self.grower(graph)
-        own = grower.placed(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
-        grower.finish(own)
-        return own
+        return grower.placed(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
 
     def _beyond(self, graph: PairGraph, start: pycolmap.Reconstruction) -> list[MappedModel]:
         near = replace(self, adjuster=self._as_found(start))

@@ -143,10 +143,8 @@ class SparseMapper(IncrementalMapper):
             moves = (*(best[0].moves if best else ()), name, *models[0].moves)
             best, most = [replace(model, moves=moves) for model in models], evidence
             if is_sharing:
-                model = own[1].with_own_cameras(
-                    move(own[0], measured) or own[0], best[0].reconstruction
-                )
-                if own[1].evidence.of(model) > most + MIN_GAIN:
+                model = _with_own_cameras(own[1], move(own[0], measured) or own[0], search, best[0])
+                if model and own[1].evidence.of(model) > most + MIN_GAIN:
                     is_sharing, (graph, search) = False, own
                     first = replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))
                     inside = set(model.reg_image_ids())
@@ -158,6 +156,21 @@ class SparseMapper(IncrementalMapper):
         return best or (
             self._best(replace(task, may_share=False), own[0], native, show) if is_sharing else []
         )
+
+
+def _with_own_cameras(
+    own: Search, graph: PairGraph, shared: Search, found: MappedModel
+) -> pycolmap.Reconstruction | None:
+    """Return a model with a camera for each image; None where some tracks already tell against."""
+    thin, model = graph.thinned(), found.reconstruction
+    if thin is not graph:
+        trial = own.with_own_cameras(thin, model)
+        before, after = (replace(s.evidence, graph=thin) for s in (shared, own))
+        if after.of(trial) <= before.of(model) + MIN_GAIN:
+            return None
+    model = own.with_own_cameras(graph, model)
+    own.grower(graph).finish(model)
+    return model
 
 
 def _of_some_tracks(search: Search, reduced: PairGraph, graph: PairGraph) -> list[MappedModel]:
