@@ -116,8 +116,8 @@ def run(
             options.extend.refuse_discarding(output_path)
         existing_names(options.extend.model_path, names)
     options.recipe.extraction.check_depth()
-    resolve(options.recipe.weights, options.resources.weights_path, progress=progress)
-    load_matchers(context, options.recipe.extraction.matchers(options.recipe.matching))
+    resolve(options.recipe.required_weights, options.resources.weights_path, progress=progress)
+    load_matchers(context, options.recipe.extraction, options.recipe.matching)
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         reports = [

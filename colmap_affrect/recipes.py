@@ -55,6 +55,19 @@ class Level:
         """Name in reports."""
         return f"{self.rectifier.name} {self.features.name}" if self.base else self.rectifier.name
 
+    @property
+    def network_parts(self) -> tuple[NetworkOptions, ...]:
+        """Options of what may run on torch when features are extracted."""
+        if isinstance(self.rectifier, CoverOptions):
+            return (self.features, self.rectifier.shape_source)
+        return (self.features,)
+
+    @property
+    def weights(self) -> set[str]:
+        """Keys of the files of weights that it reads, with those of its own matcher."""
+        parts = (*self.network_parts, *([self.matching] if self.matching else []))
+        return {key for part in parts for key in part.weights}
+
 
 class ExtractionOptions(Options):
     """Everything that decides the features of an image."""
@@ -106,20 +119,19 @@ class ExtractionOptions(Options):
         return found
 
     @property
-    def _network_parts(self) -> tuple[NetworkOptions, ...]:
-        covers = (level.rectifier for level in self.levels)
-        sources = [item.shape_source for item in covers if isinstance(item, CoverOptions)]
-        return (*(level.features for level in self.levels), *sources)
+    def required_weights(self) -> tuple[str, ...]:
+        """Keys of the files of weights that every image needs; other levels wait for theirs."""
+        return tuple(sorted(self.levels[0].weights))
 
     @property
     def weights(self) -> tuple[str, ...]:
-        """Keys of the files of weights that are read, sorted."""
-        return tuple(sorted({key for part in self._network_parts for key in part.weights}))
+        """Keys of the files of weights of all levels, sorted."""
+        return tuple(sorted(set[str]().union(*(level.weights for level in self.levels))))
 
     @property
     def uses_networks(self) -> bool:
         """Whether anything runs on torch."""
-        return any(part.uses_network for part in self._network_parts)
+        return any(part.uses_network for level in self.levels for part in level.network_parts)
 
 
 class EscalateOptions(Options):
@@ -171,10 +183,14 @@ class Recipe(ExtractionOptions):
         return ExtractionOptions(**{key: getattr(self, key) for key in fields})
 
     @property
+    def required_weights(self) -> tuple[str, ...]:
+        """The same, with those of the matcher."""
+        return tuple(sorted({*super().required_weights, *self.matching.weights}))
+
+    @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights of all parts, sorted."""
-        matchers = self.matchers(self.matching)
-        return tuple(sorted({*super().weights}.union(*(item.weights for item in matchers))))
+        return tuple(sorted({*super().weights, *self.matching.weights}))
 
     @property
     def later_stages(self) -> dict[str, Options]:

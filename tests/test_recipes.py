@@ -18,8 +18,7 @@ from colmap_affrect.rectifiers.base import CoverOptions
 NAMES = [
     "affnet-shapes", "aliked-lightglue", "asift", "asift-recommended", "default", "dense-affnet",
     "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended", "depth-planes",
-    "depth-planes-recommended", "on-demand", "on-demand-learned",
-    "second-moment-shapes",
+    "depth-planes-recommended", "on-demand", "rectified", "second-moment-shapes",
     "sift-lightglue", "unrectified", "unrectified-rootsift", "xfeat-lighterglue",
 ]  # fmt: skip
 
@@ -55,7 +54,7 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
 
 
 def test_levels_build_on_the_lowest_one_with_their_features() -> None:
-    recipe = load_recipe("on-demand-learned")
+    recipe = load_recipe("default")
     levels = recipe.extraction.levels
     matchers = [level.matching and level.matching.name for level in levels]
     assert [level.base for level in levels] == [0, 0, 2, 3, 2]

@@ -55,14 +55,14 @@ def facade_view(recipe_name, view):
 def test_facade_matches_follow_the_true_homography(view, low, high):
     homography = np.loadtxt(SCENES / "facade" / f"H_1_{view}.txt")
     correct = {}
-    for name in ("default", "unrectified-rootsift"):
+    for name in ("rectified", "unrectified-rootsift"):
         first, second = facade_view(name, 1), facade_view(name, view)
         matches = MATCHER.match(first, second).indices
         expected = project(homography, first.keypoints[matches[:, 0]])
         errors = np.linalg.norm(expected - second.keypoints[matches[:, 1]], axis=1)
         correct[name] = int((errors < 3.0).sum())
-    assert low < correct["default"] < high
-    assert correct["default"] > 1.5 * correct["unrectified-rootsift"]
+    assert low < correct["rectified"] < high
+    assert correct["rectified"] > 1.5 * correct["unrectified-rootsift"]
 
 
 def test_scene_images_are_photographs_without_exif():

@@ -283,12 +283,14 @@ def recipes(options: argparse.Namespace) -> None:
     if options.name:
         show(described_toml(load_recipe(options.name)), end="")
         return
-    for name in recipe_names():
+    for name in sorted(recipe_names(), key=lambda name: name not in ("default", "rectified")):
         recipe = load_recipe(name)
-        needs = list(recipe.weights)
+        needs = list(recipe.required_weights)
+        uses = [key for key in recipe.weights if key not in needs]
         needs += ["depth"] if recipe.extraction.uses_depth else []
+        more = f", and uses {', '.join(uses)} if it can" if uses else ""
         show(f"{name:28s} {recipe.summary}")
-        show(f"{'':28s} needs {', '.join(needs) or 'nothing'}")
+        show(f"{'':28s} needs {', '.join(needs) or 'nothing'}{more}")
 
 
 def weights(options: argparse.Namespace) -> None:

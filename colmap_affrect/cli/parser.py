@@ -12,7 +12,7 @@ from colmap_affrect.errors import OptionError
 
 EXAMPLES = (
     "run --image-path photos --output-path out",
-    "run --image-path photos --output-path out --recipe on-demand --camera-mode single",
+    "run --image-path photos --output-path out --recipe rectified --camera-mode single",
     "extract --image-path photos --output-path out",
     "pairs --output-path out --pairs retrieval,sequence --num-neighbors 30",
     "match --output-path out",
@@ -23,7 +23,7 @@ EXAMPLES = (
     "map --output-path out --from-database any.db --image-path photos",
     "compare --image-path photos --output-path out --methods sift,default --seeds 0",
     "evaluate evd --dataset-path EVD --output-path out \\\n"
-    "      --recipes unrectified-rootsift,default,on-demand",
+    "      --recipes unrectified-rootsift,rectified,default",
     "convert --image-path scans --output-path photos",
     "inspect photos/a.jpg --output-path out",
     "recipes on-demand",

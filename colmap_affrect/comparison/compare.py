@@ -56,7 +56,7 @@ def compare(
     given = output_path.resolve(), image_path.resolve(), options, same
     runs = [MethodRun(method, *given) for method in methods]
     recipes = [run.method.recipe for run in runs if overwrite or not run.finished()]
-    keys = {key for recipe in recipes if recipe for key in recipe.weights}
+    keys = {key for recipe in recipes if recipe for key in recipe.required_weights}
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
     with Workspace(output_path).locked():
         for run in runs:

@@ -100,11 +100,12 @@ class RecipeRun:
         features.parent.mkdir(parents=True, exist_ok=True)
         self._store = _StrongestFeatures(features)
         self._store.budget = options.max_num_keypoints
-        self._matchings = []
-        for level, chosen in enumerate(extraction.levels):
+        self._matchings: dict[int, Matching] = {}
+        for level in self._extractor.extractors:
+            chosen = extraction.levels[level]
             of, kind = chosen.matching or matching, chosen.features.name
             task = Matching(self._store, of, level, chosen.base, kind, resources)
-            self._matchings.append(task)
+            self._matchings[level] = task
         self.failures: dict[str, str] = {}  # images that could not be used in this run: why
         self._lock = Lock()  # of extraction and of the store
 
@@ -112,13 +113,14 @@ class RecipeRun:
         """Match and score all pairs; images whose features are there are not read again."""
         results = []
         with progress.stage(self.label, len(self._pairs), "pairs") as advance:
-            work = partial(self._result, [CachedMatcher(task) for task in self._matchings])
+            matchers = {level: CachedMatcher(task) for level, task in self._matchings.items()}
+            work = partial(self._result, matchers)
             for result in map_ordered(work, self._pairs, available_cores()):
                 results.append(result)
                 advance(1)
         return results
 
-    def _result(self, matchers: Sequence[CachedMatcher], pair: EvaluationPair) -> PairResult:
+    def _result(self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair) -> PairResult:
         """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
         watch = Stopwatch("extract", "match", "estimate")
         result, points = self._matched(matchers, pair, watch)
@@ -138,14 +140,14 @@ class RecipeRun:
         return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
 
     def _matched(
-        self, matchers: Sequence[CachedMatcher], pair: EvaluationPair, watch: Stopwatch
+        self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair, watch: Stopwatch
     ) -> tuple[PairResult, tuple[Array, Array]]:
         """Return a result without score, and (M, 2) and (M, 2) points of the best level.
 
         The result has a failure where an image cannot be used.
         """
         best, points, most = None, NOTHING, 0
-        for level, matcher in enumerate(matchers):
+        for level, matcher in matchers.items():
             with self._lock, watch.step("extract"):
                 if not self._extract(pair, level):
                     break
@@ -174,15 +176,15 @@ class RecipeRun:
         return best or self._failed(pair, "; ".join(filter(None, failures))), points
 
     def _extract(self, pair: EvaluationPair, level: int) -> bool:
-        """Extract what the images lack up to a level; tell whether both can be used."""
+        """Extract what the images lack of a level; tell whether both can be used."""
         images = zip(pair.images, pair.paths, pair.intrinsics, strict=True)
         usable = [self._extract_image(*image, level) for image in images]
         return all(usable)
 
     def _extract_image(self, name: str, path: Path, intrinsics: Array | None, level: int) -> bool:
-        store = self._store
-        num_levels = len(store.level_ends(name)) if name in store.names() else 0
-        for missing in range(num_levels, level + 1):
+        store, base = self._store, self.recipe.extraction.levels[level].base
+        there = store.level_ranges(name) if name in store.names() else {}
+        for missing in sorted({0, base, level} - there.keys()):
             if name in self.failures:
                 return False
             try:
@@ -194,7 +196,7 @@ class RecipeRun:
             if found.warning:
                 logger.warning("%s: %s", name, found.warning)
             if missing:
-                store.extend(name, found.features)
+                store.extend(name, found.features, missing)
             else:
                 store.write(name, found.features, found.image_size)
         return True

@@ -1,7 +1,8 @@
 """Features and matches of a run in HDF5, in hloc's layout (docs/formats.md).
 
-The features of level k of escalation follow those of level k - 1 and end at ``level_ends[k]``;
-descriptors of several sizes are filled up with zeros, which change no distance. Matches have the
+Features of the levels of escalation follow each other in the order in which they were asked for:
+those of ``levels[k]`` end at ``level_ends[k]``. Descriptors of several sizes are filled up with
+zeros, which change no distance. Matches have the
 attributes ``level``, whose features were matched together with those of level 0, and
 ``tried_level``, the highest that was tried. ``guided.h5`` has a group per pair that was matched
 again by its geometry. Files are opened for one image or one batch of pairs and closed again; what
@@ -65,6 +66,11 @@ def _content(group: h5py.Group) -> Content:
     return Content(str(group.attrs.get("content", "")), str(group.attrs.get("stamp", "")))
 
 
+def _level_ends(group: h5py.Group) -> dict[int, int]:
+    levels, ends = (checked(group, key).tolist() for key in ("levels", "level_ends"))
+    return dict(zip(levels, ends, strict=True))
+
+
 def frame_datasets(lafs: Floats) -> dict[str, Singles]:
     """Return (N, 2, 3) frames, and their scales in sigmas and orientations in degrees."""
     stored = lafs.astype(np.float32)
@@ -103,7 +109,8 @@ class FeatureStore(GroupStore):
     ) -> None:
         """Write the features of one image, and what the files hold that they are from."""
         with self._open("a") as file:
-            self._write_features(file, name, features, image_size, [len(features)], content)
+            ends = {0: len(features)}
+            self._write_features(file, name, features, image_size, ends, content)
 
     def contents(self) -> dict[str, Content]:
         """Return for each image what the files hold that it was extracted from."""
@@ -121,18 +128,19 @@ class FeatureStore(GroupStore):
             for name in names:
                 del file[name]
 
-    def extend(self, name: str, features: LocalFeatures) -> None:
-        """Add the features of the next level; what is there keeps its indices."""
+    def extend(self, name: str, features: LocalFeatures, level: int) -> None:
+        """Add the features of another level; what is there keeps its indices."""
         with self._open("a") as file:
             group = self._group(file, name)
             size = tuple(checked(group, "image_size").tolist())
-            ends = checked(group, "level_ends").tolist()
+            ends = _level_ends(group)
             there = self._features(group)
             first_id = int(there.rectification_ids.max(initial=0))
             ids = features.rectification_ids
             added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
             both = union(of_one_size([there, added]))
-            self._write_features(file, name, both, size, [*ends, len(both)], _content(group))
+            ends[level] = len(both)
+            self._write_features(file, name, both, size, ends, _content(group))
 
     def _write_features(
         self,
@@ -140,7 +148,7 @@ class FeatureStore(GroupStore):
         name: str,
         features: LocalFeatures,
         image_size: tuple[int, int],
-        level_ends: list[int],
+        level_ends: dict[int, int],
         content: Content,
     ) -> None:
         datasets = {
@@ -150,7 +158,8 @@ class FeatureStore(GroupStore):
             "image_size": np.asarray(image_size),
             **frame_datasets(features.lafs),
             "rectification_ids": features.rectification_ids,
-            "level_ends": np.asarray(level_ends),
+            "levels": np.asarray(list(level_ends)),
+            "level_ends": np.asarray(list(level_ends.values())),
         }
         self._write(file, name, datasets, content=content.digest, stamp=content.stamp)
 
@@ -160,9 +169,10 @@ class FeatureStore(GroupStore):
             return self._features(self._group(file, name))
 
     def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
-        """Return the indices of the features of two levels, each once, in their order."""
-        ends = [0, *self.level_ends(name)]
-        return np.concatenate([np.arange(*ends[k : k + 2]) for k in sorted({base, level})])
+        """Return the indices of the features of two levels, each once, rising."""
+        ranges = self.level_ranges(name)
+        parts = sorted((ranges[k] for k in {base, level}), key=lambda part: part.start)
+        return np.concatenate([np.arange(part.start, part.stop) for part in parts])
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
         if not is_complete(file, name):
@@ -178,10 +188,11 @@ class FeatureStore(GroupStore):
             checked(group, "rectification_ids"),
         )
 
-    def level_ends(self, name: str) -> list[int]:
-        """Return, for each level that an image has, the number of features up to it."""
-        ends: list[int] = self._values(name, "level_ends").tolist()
-        return ends
+    def level_ranges(self, name: str) -> dict[int, range]:
+        """Return which features are of each level that an image has, in their order."""
+        with self._open("r") as file:
+            ends = _level_ends(self._group(file, name))
+        return dict(zip(ends, map(range, [0, *ends.values()], ends.values()), strict=True))
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""

@@ -200,7 +200,7 @@ def inspect_image(
     """
     workspace = Workspace(output_path)
     workspace.require_own(path.parent)
-    numbers = range(len(extractor.rectifiers))
+    numbers = list(extractor.rectifiers)
     read = [extractor.photograph(path, mask=mask, level=number)[0] for number in numbers]
     workspace.begin()
     lines = []
@@ -221,7 +221,7 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
     start = time.perf_counter()
     plan, warning = extractor.plan(photograph, number)
     recorder = _Recorder(extractor.extractors[number])
-    recorders = (*extractor.extractors[:number], recorder, *extractor.extractors[number + 1 :])
+    recorders = {**extractor.extractors, number: recorder}
     features = replace(extractor, extractors=recorders).execute(photograph, plan, number)
     first_id = 0 if extractor.options.levels[number].base == number else 1
     seen, seconds = dict(enumerate(recorder.seen, first_id)), time.perf_counter() - start

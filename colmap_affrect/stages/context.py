@@ -10,6 +10,7 @@ from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import AffrectError, ImageError, OptionError
+from colmap_affrect.features.weights import WEIGHT_FILES, find, install_hint
 from colmap_affrect.images.photographs import (
     CameraOptions,
     MaskOptions,
@@ -148,14 +149,28 @@ class Resources:
 
         return str(resolve_device(self.device))
 
+    def usable_levels(self, options: ExtractionOptions) -> list[int]:
+        """Return the first level, and those of escalation whose files of weights are here."""
+        there = {key for key in options.weights if find(key, self.weights_path)}
+        return [k for k, level in enumerate(options.levels) if not k or level.weights <= there]
+
+    def how_to_complete(self, options: ExtractionOptions) -> str:
+        """Return how to get what the other levels need; empty if there are none."""
+        usable = self.usable_levels(options)
+        waiting = [level for k, level in enumerate(options.levels) if k not in usable]
+        keys = sorted(set[str]().union(*(level.weights for level in waiting)))
+        hint = install_hint(WEIGHT_FILES[key] for key in keys)
+        return f"{hint}colmap-affrect weights fetch {' '.join(keys)}" if keys else ""
+
 
 def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) -> None:
     """Refuse weights that are not those of the machine that leads the work."""
-    for key, path in weights.items():
-        if file_sha256(path) != digests[key]:
+    found = {key: file_sha256(path) for key, path in weights.items()}
+    for key in sorted(found.keys() | digests.keys()):
+        if found.get(key) != digests.get(key):
             raise AffrectError(
-                f"{path}: is another file than {key} on the machine that leads the work; give "
-                "both the same"
+                f"{weights.get(key, key)}: is not the file {key} of the machine that leads the "
+                "work; give both the same"
             )
 
 

@@ -18,6 +18,7 @@ record, so that a killed run goes on in the same way:
   cannot hint at what learned features match.
 """
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import PairVerifier, connected_parts
-from colmap_affrect.errors import ImageError
+from colmap_affrect.errors import ImageError, such_as
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
@@ -50,6 +51,8 @@ from colmap_affrect.stages.match import match_pairs, matched_at_level, write_bat
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers, verify_new
+
+logger = logging.getLogger(__name__)
 
 MIN_SHARE_KEPT = 0.9
 """Of the inliers of measured frames in one geometry with others. Right ones keep 95 per cent and
@@ -89,7 +92,9 @@ def escalate(
         level, todo = work
         escalation.match_at(todo, level)
         escalated |= set(todo)
-    return StageReport("escalate", time.perf_counter() - start, len(escalated))
+    warnings = escalation.waiting()
+    wall_s = time.perf_counter() - start
+    return StageReport("escalate", wall_s, len(escalated), warnings=warnings)
 
 
 def measured_inliers(context: Context) -> dict[Pair, Indices]:
@@ -126,10 +131,11 @@ class Escalation:
         self.pairs = listed_pairs(context)
         self.features, self.matches = context.features, context.matches
         self.path = context.workspace.database
-        self.levels = range(1, len(self.extraction.levels))
+        self.levels = context.resources.usable_levels(self.extraction)[1:]
         self._is_measured = [level.features.has_shapes for level in self.extraction.levels]
         # Beside measured ones there are others, at which these cannot hint; 0 if there are not.
-        self._blind_level = self._is_measured.index(False) if self.has_both_kinds else 0
+        blind = (k for k in self.levels if not self._is_measured[k])
+        self._blind_level = next(blind, 0) if self.has_both_kinds else 0
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
 
     @property
@@ -218,14 +224,25 @@ class Escalation:
         if pairs:
             self.matches.keep_note(STEP, [level, list(pairs)])
         images = sorted({name for pair in pairs for name in pair})
-        names = [name for name in images if len(self.features.level_ends(name)) <= level]
-        title, total = f"escalate, level {level}", len(names) + len(pairs)
+        needed = sorted({self.extraction.levels[level].base, level})
+        missing = [(name, k) for name in images for k in self._lacking(name, needed)]
+        title, total = f"escalate, level {level}", len(missing) + len(pairs)
         with self.context.progress.stage(title, total, "steps") as advance:
-            self._extend(names, level, advance)
+            self._extend(missing, advance)
             if pairs:
                 self._match_again(pairs, level, advance)
         self.write()
         self.matches.keep_note(STEP, None)
+
+    def waiting(self) -> dict[str, str]:
+        """Say what levels that lack weights may tie, if anything is left to tie."""
+        how = self.context.resources.how_to_complete(self.extraction)
+        left = sorted(self.graph().insecure) if how else []
+        if not left:
+            return {}
+        text = f"its weights are not here; it may tie {such_as(left)}: {how}; then run this again"
+        logger.warning("learned matching: %s", text)
+        return {"learned matching": text}
 
     def write(self) -> None:
         """Bring the database up to what is stored."""
@@ -241,31 +258,30 @@ class Escalation:
         self.matches.write((), self.pairs, 0)
         self.matches.keep_note(STEP, None)
 
-    def _extend(self, names: Sequence[str], level: int, advance: Callable[[int], None]) -> None:
-        """Add to images the features of all levels that they lack, up to this one."""
-        if not names:
+    def _lacking(self, name: str, levels: Sequence[int]) -> list[int]:
+        there = self.features.level_ranges(name)
+        return [level for level in levels if level not in there]
+
+    def _extend(self, missing: Sequence[tuple[str, int]], advance: Callable[[int], None]) -> None:
+        """Add to images the features of levels that they lack."""
+        if not missing:
             return
-        missing = [
-            (name, lacking)
-            for name in names
-            for lacking in range(len(self.features.level_ends(name)), level + 1)
-        ]
         inputs = self.context.inputs
         images = extract_images(self.context, inputs, self.extractor, missing)
         with closing(images) as found_images:
-            for (name, reached), found in zip(missing, found_images, strict=True):
+            for (name, level), found in zip(missing, found_images, strict=True):
                 if isinstance(found, ImageError):
                     raise found
-                self.features.extend(name, found.features)
-                if reached == level:
-                    advance(1)
+                self.features.extend(name, found.features, level)
+                advance(1)
 
     def measured(self, pair: Pair, indices: NDArray[np.integer]) -> Bools:
         """Return which of the (M, 2) matches of a pair are of frames that were measured singly."""
         found = np.ones(len(indices), bool)
         for name, rows in zip(pair, indices.T, strict=True):
-            levels = np.searchsorted(self.features.level_ends(name), rows, side="right")
-            found &= np.array(self._is_measured)[levels]
+            ranges = self.features.level_ranges(name)
+            part = np.searchsorted([k.stop for k in ranges.values()], rows, side="right")
+            found &= np.array(self._is_measured)[list(ranges)][part]
         return found
 
     def _match_again(

@@ -219,9 +219,8 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
     with colmap_database.open_database(workspace.database) as database:
         for name, count in counts.items():
             if name in ids and not colmap_database.has_keypoints(database, ids[name], count):
-                colmap_database.write_keypoints(
-                    database, ids[name], store.read_frames(name), store.level_ends(name)
-                )
+                ends = [part.stop for part in store.level_ranges(name).values()]
+                colmap_database.write_keypoints(database, ids[name], store.read_frames(name), ends)
     return rejected
 
 

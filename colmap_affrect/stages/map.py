@@ -19,6 +19,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import measured_inliers
 
+STRONGEST = "default"  # of the recipes
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
 
@@ -149,8 +150,10 @@ def advice(
     texts = []
     if FOCAL_CONTRADICTED in doubts:
         texts.append("run again without the given focal lengths, or with others: they do not fit")
-    if not is_foreign:
-        texts += _other_recipes(workspace.recipe())
+    if not is_foreign and workspace.recipe() != STRONGEST:
+        texts.append(f"run again with --recipe {STRONGEST}, which tries more for these photographs")
+    elif not is_foreign and (how := context.resources.how_to_complete(context.extraction)):
+        texts.append(f"{how}; then run again: learned matching helps where light or age differ")
     if FOCAL_UNKNOWN in doubts and not (is_foreign or context.inputs.from_database):
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
@@ -165,17 +168,3 @@ def advice(
     if missing:
         texts.append("more photographs that show the missing places")
     return tuple(texts)
-
-
-def _other_recipes(recipe: str) -> list[str]:
-    """Return what to try in the place of a recipe; the second needs weights."""
-    stronger, learned = "on-demand", "on-demand-learned"
-    texts = []
-    if recipe not in (stronger, learned):
-        texts.append(
-            f"run again with --recipe {stronger}, which tries more warps where photographs "
-            "are missing or weakly connected"
-        )
-    if recipe != learned:
-        texts.append(f"run again with --recipe {learned}, if light or age differ")
-    return texts

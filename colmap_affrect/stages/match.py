@@ -28,6 +28,7 @@ from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FINISHED, FeatureStore, PairMatches
+from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.stages.context import Context, Resources, require_same_files
 from colmap_affrect.stages.extract import write_images_and_keypoints
 from colmap_affrect.stages.pairs import listed_pairs
@@ -59,11 +60,11 @@ def match(
     options = options or context.matching
     workspace, extraction = context.workspace, context.extraction
     try:
-        matchers = extraction.matchers(options)
+        extraction.matchers(options)
     except OptionError as error:
         other = "other features than those here take 'run' with another --output-path"
         raise OptionError(f"{error}; {other}") from error
-    weights = load_matchers(context, matchers)
+    weights = load_matchers(context, extraction, options)
     record = options.to_mapping() | ({WEIGHTS: digests(weights)} if weights else {})
     workspace.record_options("match", record, overwrite=overwrite)
     matches, digest = context.matches, file_sha256(workspace.pairs)
@@ -87,12 +88,15 @@ def match(
     return StageReport("match", wall_s, len(missing), len(pairs) - len(missing), warnings=warnings)
 
 
-def load_matchers(context: Context, matchers: Iterable[MatcherOptions]) -> dict[str, Path]:
-    """Return the files of weights that matchers read, by key.
+def load_matchers(
+    context: Context, extraction: ExtractionOptions, options: MatcherOptions
+) -> dict[str, Path]:
+    """Return the files of weights that the matchers of all levels read, by key.
 
     Their networks are built once before matching begins: AffrectError for what cannot be used.
     """
-    resources, learned = context.resources, {m for m in matchers if m.weights}
+    resources, matchers = context.resources, extraction.matchers(options)
+    learned = {matchers[k] for k in resources.usable_levels(extraction) if matchers[k].weights}
     keys = sorted({key for options in learned for key in options.weights})
     weights = resolve(keys, resources.weights_path)
     if "match" not in context.workspace.begun:

@@ -80,8 +80,8 @@ class ImageExtractor:
     """
 
     options: ExtractionOptions  # of the recipe
-    extractors: tuple[FeatureExtractor, ...]  # of each level, that of every image first
-    rectifiers: tuple[Rectifier, ...]  # of each level
+    extractors: Mapping[int, FeatureExtractor]  # by level, but those that wait for weights
+    rectifiers: Mapping[int, Rectifier]  # of the same levels
     weights: Mapping[str, Path] = field(default_factory=dict)  # files of the networks by key
     resources: Resources = field(default_factory=Resources)  # that it was prepared with
     # held while networks run, which take one image at a time
@@ -217,6 +217,7 @@ def prepare(
 ) -> ImageExtractor:
     """Find everything a recipe needs, before any image is touched, and build its parts.
 
+    Levels of escalation whose weights are not here are left out.
     ``image_names`` are those to come, to see whether there are depth maps for them. AffrectError
     when a file of weights is neither found nor downloaded, or the device is not there,
     OptionError when depth maps are needed and no source is given, DepthError when the
@@ -224,11 +225,14 @@ def prepare(
     """
     resources = resources or Resources()
     options.check_depth()
-    weights = resolve(options.weights, resources.weights_path, progress=progress)
+    levels = {k: options.levels[k] for k in resources.usable_levels(options)}
+    parts = {part for level in levels.values() for part in level.network_parts}
+    keys = sorted({key for part in parts for key in part.weights})
+    weights = resolve(keys, resources.weights_path, progress=progress)
     device = resources.require_device(uses_network=options.uses_networks)
     network, depth = NetworkContext(weights, device), None
     extractor = cache(lambda features: EXTRACTORS.make(features, network))
-    extractors = tuple(extractor(level.features) for level in options.levels)
+    extractors = {k: extractor(level.features) for k, level in levels.items()}
     if options.uses_depth:
         depth = DepthMaps(options.depth)
         if image_names is not None:
@@ -241,7 +245,7 @@ def prepare(
             source = shapes(item.shape_source, level.features)
         return RECTIFIERS.make(item, RectifierInputs(source, depth if item.uses_depth else None))
 
-    rectifiers = tuple(map(rectifier, options.levels))
+    rectifiers = {k: rectifier(level) for k, level in levels.items()}
     return ImageExtractor(options, extractors, rectifiers, weights, resources)
 
 

@@ -70,7 +70,7 @@ def main() -> None:
     """Print the table: means over images, of the seconds the median over rounds."""
     parser = parser_of(__doc__)
     parser.add_argument(
-        "--methods", nargs="+", default=["default", "second-moment-shapes"],
+        "--methods", nargs="+", default=["rectified", "second-moment-shapes"],
         help="[LABEL=]RECIPE[:KEY=VALUE[,...]]",
     )  # fmt: skip
     parser.add_argument("--image-path", type=Path, required=True, help="folder of images")

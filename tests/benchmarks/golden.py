@@ -177,22 +177,23 @@ def jobs() -> dict[str, Job]:
     depth = ["--depth-path", str(COURTYARD / "depth")]
     preset = ["--mapper", "incremental", "--database-descriptors", "--preset", "colmap"]
     few = ["--pairs", "retrieval,sequence", "--num-neighbors", "2"]
+    rectified = ["--recipe", "rectified"]
     demand, with_depth = ["--recipe", "on-demand"], "depth-affnet-recommended"
     found: dict[str, Job] = {
-        "courtyard default": (images, court, []),
+        "courtyard rectified": (images, court, rectified),
         "courtyard on-demand": (images, court, demand),
         f"courtyard {with_depth}": (images, court[:5], ["--recipe", with_depth, *depth]),
         "courtyard depth-planes, incremental mapper, descriptors": (
             images, court, ["--recipe", "depth-planes-recommended", *depth, *preset]
         ),
-        "courtyard retrieval, sequence": (images, court, few),
+        "courtyard retrieval, sequence": (images, court, [*few, *rectified]),
     }  # fmt: skip
     if SHARED.is_dir():
         fountain = ["0000.jpg", "0005.jpg", "0010.jpg"]
         kermit = sorted(path.name for path in KERMIT.iterdir())
         found["courtyard affnet-shapes"] = (images, court[:3], AFFNET)
         for name, of in (("fountain", (FOUNTAIN, fountain)), ("kermit", (KERMIT, kermit))):
-            found[f"{name} default"] = (*of, [])
+            found[f"{name} rectified"] = (*of, rectified)
             found[f"{name} on-demand"] = (*of, demand)
             found[f"{name} affnet-shapes"] = (of[0], of[1][:5], [*AFFNET, *FEWER])
     return found

@@ -4,7 +4,7 @@ Runs ``colmap-affrect compare`` on subsets of the scenes: every method (COLMAP's
 with changed options as ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``) computes features and raw matches
 once, verification and mapping run once per seed. Usage:
 
-    python tests/benchmarks/registration.py --methods sift default --work-path out/cache \
+    python tests/benchmarks/registration.py --methods sift rectified --work-path out/cache \
         --output-path out/registration.json
 
 Prints a Markdown table of everything in the JSON file, which has a row for each method and seed;
@@ -156,7 +156,7 @@ def main() -> None:
     """Run all methods on all subsets."""
     root = Path(__file__).resolve().parents[2]
     parser = parser_of(__doc__)
-    parser.add_argument("--methods", nargs="+", default=["sift", "default"])
+    parser.add_argument("--methods", nargs="+", default=["sift", "rectified"])
     parser.add_argument("--subsets", nargs="+", choices=SUBSETS, default=SUBSETS, metavar="NAME")
     parser.add_argument("--seeds", type=int, default=5, help="run the seeds 0 to SEEDS - 1")
     parser.add_argument("--scenes-path", type=Path, default=root.parent / "shared" / "scenes")

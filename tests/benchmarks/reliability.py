@@ -102,7 +102,7 @@ class Set:
     first: int = 0
     spoil: str = ""  # a key of SPOILS, or "aged"
     other: str = ""  # scene that is mixed in
-    recipe: str = "default"
+    recipe: str = "rectified"
 
 
 FOUNTAIN, HERZ, TEMPLE = "strecha_fountain_p11", "strecha_herz_jesus_p25", "temple_sparse_ring"
@@ -130,14 +130,14 @@ SETS = {
     "saharov-aged": Set("saharov32", 3, spoil="aged"),
     "fountain-aged": Set(FOUNTAIN, 2, spoil="aged"),
     "kitchen-mirrored": Set("kitchen", 2, spoil="mirrored"),
-    "temple-learned": Set(TEMPLE, 2, recipe="on-demand-learned"),
-    "saharov-learned": Set("saharov32", 5, 1, recipe="on-demand-learned"),
-    "herz-learned": Set(HERZ, 8, recipe="on-demand-learned"),
-    "fountain-learned": Set(FOUNTAIN, 5, recipe="on-demand-learned"),
-    "kitchen-learned": Set("kitchen", 2, recipe="on-demand-learned"),
-    "dunes-learned": Set("copr_kap", 2, recipe="on-demand-learned"),
-    "sacre_coeur-learned": Set("sacre_coeur", 2, recipe="on-demand-learned"),
-    "kermit-learned": Set("kermit", 2, recipe="on-demand-learned"),
+    "temple-learned": Set(TEMPLE, 2, recipe="default"),
+    "saharov-learned": Set("saharov32", 5, 1, recipe="default"),
+    "herz-learned": Set(HERZ, 8, recipe="default"),
+    "fountain-learned": Set(FOUNTAIN, 5, recipe="default"),
+    "kitchen-learned": Set("kitchen", 2, recipe="default"),
+    "dunes-learned": Set("copr_kap", 2, recipe="default"),
+    "sacre_coeur-learned": Set("sacre_coeur", 2, recipe="default"),
+    "kermit-learned": Set("kermit", 2, recipe="default"),
 }
 
 

@@ -32,7 +32,7 @@ from colmap_affrect.stages.context import Resources
 
 Row = dict[str, float]
 
-DEFAULT_METHODS = [SIFT, "unrectified-rootsift", "default"]
+DEFAULT_METHODS = [SIFT, "unrectified-rootsift", "rectified"]
 VERIFICATION = VerificationOptions(random_seed=0)
 HEADER = (
     "method", "extraction per image", "ratio", "matching per pair", "ratio", "features per image",

@@ -32,5 +32,5 @@ def test_speed_and_complexity_are_measured(tmp_path: Path) -> None:
     text = run_script("tests/benchmarks/speed.py", *given, "--output-path", result)
     assert '"extract_s"' in result.read_text()
     assert "| unrectified-rootsift | " in text
-    given = [*photos, "--num-images", 1, "--methods", "default"]
+    given = [*photos, "--num-images", 1, "--methods", "rectified"]
     assert "| default | " in run_script("tests/benchmarks/complexity.py", *given)

@@ -70,9 +70,11 @@ def test_help_loads_no_heavy_package() -> None:
 
 def test_recipes_are_listed_with_what_they_need(call: Call) -> None:
     lines = call("recipes").stdout.splitlines()
-    assert [line.split()[0] for line in lines[::2]] == recipe_names()
+    first, *others = [line.split()[0] for line in lines[::2]]
+    assert (first, sorted([first, *others])) == ("default", recipe_names())
     needs = {name.split()[0]: line.strip() for name, line in zip(*[iter(lines)] * 2, strict=True)}
-    assert needs["default"] == needs["on-demand"] == "needs nothing"
+    assert needs["rectified"] == needs["on-demand"] == "needs nothing"
+    assert needs["default"] == "needs nothing, and uses aliked-n16, lightglue-aliked if it can"
     assert needs["dense-affnet"] == "needs affnet, hardnet, orinet"
     assert needs["depth-planes-recommended"] == "needs depth"
 
@@ -267,8 +269,8 @@ def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:
 
     assert keys("aliked-lightglue", "aliked-n16") == ["aliked-n16", "lightglue-aliked"]
     assert keys("aliked") == ["aliked-n16", "aliked-n16rot", "aliked-n32"]
-    done = call("weights", "fetch", "default")
-    assert (done.code, done.stdout) == (0, "default: no weights are needed\n")
+    done = call("weights", "fetch", "rectified")
+    assert (done.code, done.stdout) == (0, "rectified: no weights are needed\n")
 
 
 def test_what_is_printed_may_end_early() -> None:

@@ -79,7 +79,7 @@ def test_healthy_run_has_no_findings_and_stays_as_it_is(folders: Folders) -> Non
     assert state() == before
     checked = "\n".join(diagnose(folders.out).checked)
     for text in (
-        "stages on record: extract, pairs, match, verify, guide, map; recipe default",
+        "stages on record: extract, pairs, match, verify, escalate, guide, map; recipe default",
         "features.h5: all values",
         "3 images, 1 camera",
         "sparse: models of 3 images",

@@ -30,7 +30,7 @@ from colmap_affrect.stages.one_image import ImageExtractor
 Done = tuple[Path, Evaluation]
 Patch, Calls = pytest.MonkeyPatch, Counter[str]
 PLAIN = "unrectified-rootsift"
-RECIPES = (PLAIN, "default=default:max_image_size_px=120")
+RECIPES = (PLAIN, "rectified=rectified:max_image_size_px=120")
 NAMES = ["cafe", "dance", "shop"]
 
 
@@ -81,7 +81,7 @@ def errors(recipe: RecipeResult) -> list[float]:
 
 def test_every_recipe_solves_easy_pairs(done: Done) -> None:
     _, evaluation = done
-    assert [recipe.name for recipe in evaluation.recipes] == [PLAIN, "default"]
+    assert [recipe.name for recipe in evaluation.recipes] == [PLAIN, "rectified"]
     for recipe in evaluation.recipes:
         assert [pair.name for pair in recipe.pairs] == NAMES
         assert max(errors(recipe)) < 1.0
@@ -99,7 +99,7 @@ def test_files_and_tables_say_the_same(done: Done) -> None:
     assert text == evaluation.to_json()
     values = json.loads(text)
     assert (values["protocol"], values["settings"]["scores"]["threshold_px"]) == ("evd", 0.5)
-    pair = values["recipes"]["default"]["pairs"][0]
+    pair = values["recipes"]["rectified"]["pairs"][0]
     assert {"name", "error", "num_inliers", "seconds"} <= pair.keys()
     row = evaluation.published["paper: AffNetShapes (Table 2: EVD, 15 pairs)"]
     assert list(row.items())[4:] == [("< 10 px", 9), ("< 20 px", 10), ("seconds", 185.47)]

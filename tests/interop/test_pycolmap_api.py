@@ -82,13 +82,13 @@ def test_images_and_pairs_are_added_call_by_call(photos: Path, tmp_path: Path) -
     first = colmap_affrect.extract_features(path, photos, image_names=NAMES[2:])
     assert (first.num_done, first.num_kept) == (2, 0)
     listed.write_text(f"{NAMES[3]} {NAMES[2]}\n")
-    match, _ = colmap_affrect.match_image_pairs(
+    match, *_ = colmap_affrect.match_image_pairs(
         path, pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed)
     )
     assert match.num_done == 1
     second = colmap_affrect.extract_features(path, photos)
     assert (second.num_done, second.num_kept) == (2, 2)
-    match, verify = colmap_affrect.match_exhaustive(path)
+    match, verify, _ = colmap_affrect.match_exhaustive(path)
     assert (match.num_done, match.num_kept) == (5, 1)
     assert verify.num_done == 5
 

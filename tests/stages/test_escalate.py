@@ -210,7 +210,7 @@ def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: 
     assert max(tried.values()) == 2
     sizes = extracted_px(Context(workspace))
     for name in HARD:
-        first, second, third = features.level_ends(name)
+        first, second, third = (part.stop for part in features.level_ranges(name).values())
         origin = features.read(name).rectification_ids
         assert not origin[:second].any()
         assert (origin[second:] > 0).all()
@@ -223,10 +223,10 @@ def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: 
         assert sizes[low, high] == (480, 360, 360)[level]
         (found,) = store.read([pair])
         for side, name in enumerate(pair):
-            ends = features.level_ends(name)
+            parts = features.level_ranges(name)
             own = found.indices[:, side]
-            assert own.max() < ends[level]
-            assert own.min() >= (ends[0] if level else 0)
+            assert own.max() < parts[level].stop
+            assert own.min() >= (parts[0].stop if level else 0)
     assert store.levels([EASY])[EASY] > 0
 
 
@@ -314,7 +314,7 @@ def test_features_of_levels_follow_one_another(
 ) -> None:
     store, earlier = FeatureStore(escalated[0].features), FeatureStore(before.features)
     for name in NAMES:
-        ends = store.level_ends(name)
+        ends = [part.stop for part in store.level_ranges(name).values()]
         first = store.read(name).select(store.level_indices(name, 0))
         assert_array_equal(first.lafs, earlier.read(name).lafs)
         if len(ends) > 1:

@@ -189,7 +189,7 @@ def test_work_in_another_process_refuses_other_weights(
     pickle.loads(matcher)
     found["affnet"].write_bytes(b"of another release")
     for content in (pickled, matcher):
-        with pytest.raises(AffrectError, match=r"AffNet\.pth: is another file than affnet on the"):
+        with pytest.raises(AffrectError, match=r"AffNet\.pth: is not the file affnet of"):
             pickle.loads(content)
 
 

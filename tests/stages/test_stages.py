@@ -28,7 +28,7 @@ from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.stores import FeatureStore, pair_key
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.map import advice
 from colmap_affrect.stages.verify import verify_matches
 
@@ -94,7 +94,7 @@ def test_run_registers_all_photographs_and_leaves_all_results(
     (record,) = read_camera_records(workspace.cameras).values()
     assert (record.names, record.source, record.is_fixed) == (tuple(names), "given", True)
     assert len(workspace.pairs.read_text(encoding="utf-8").splitlines()) == 6
-    stages = ["extract", "pairs", "match", "verify", "guide", "map"]
+    stages = ["extract", "pairs", "match", "verify", "escalate", "guide", "map"]
     assert workspace.recorded().keys() == {"recipe", "begun", *stages, "made_from"}
     assert workspace.begun == stages
 
@@ -123,6 +123,7 @@ def test_stage_commands_do_exactly_what_run_does(
         ["pairs"],
         ["match"],
         ["verify", *seed],
+        ["escalate"],
         ["guide"],
         ["map", *seed],
     ):
@@ -140,20 +141,23 @@ def test_stage_commands_do_exactly_what_run_does(
     assert without_times(reports[0]) == without_times(reports[1])
 
 
-def test_advice_is_about_what_is_wrong(finished: tuple[Workspace, ReconstructionReport]) -> None:
+def test_advice_is_about_what_is_wrong(
+    finished: tuple[Workspace, ReconstructionReport], monkeypatch: pytest.MonkeyPatch
+) -> None:
     workspace, report = finished
     context, (model, *_) = Context(workspace), report.models
     assert advice(context, ["unreadable.png"], [model]) == ()
     masks = "run again with --mask-path, if things move, repeat or are written on the photographs"
     doubtful = replace(model, doubtful={NAMES[0]: FOCAL_UNKNOWN})
     assert masks in advice(context, ["unreadable.png"], [doubtful])
-    stronger = "run again with --recipe on-demand,"
-    assert any(text.startswith(stronger) for text in advice(context, [], [doubtful]))
+    learned = "learned matching helps where light or age differ"
+    monkeypatch.setattr(Resources, "how_to_complete", lambda *_: "pip install it")
+    assert any(text.endswith(learned) for text in advice(context, [], [doubtful]))
     assert masks in advice(context, [NAMES[0]], [model])
     wrong = replace(model, taken_out={NAMES[0]: f"{FOCAL_CONTRADICTED}, 9 px: 8 px does"})
     assert advice(context, [NAMES[0]], [wrong])[0].startswith("run again without the given focal")
     first, *_, last = advice(context, [NAMES[0]], [doubtful])
-    assert first.startswith(stronger)
+    assert first.endswith(learned)
     assert last.startswith("more photographs that show")
 
 
@@ -165,7 +169,7 @@ def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
     done = {stage.name: (stage.num_done, stage.num_kept) for stage in report.stages}
     assert done == {
         "extract": (0, 4), "pairs": (6, 0), "match": (0, 6), "verify": (0, 6),
-        "guide": (0, 0), "map": (0, 1),
+        "escalate": (0, 0), "guide": (0, 0), "map": (0, 1),
     }  # fmt: skip
     assert report.status == "ok"
     assert {path: path.read_bytes() for path in before} == before
