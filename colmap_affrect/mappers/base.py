@@ -99,8 +99,8 @@ class MappedModel:
 
     Attributes:
         reconstruction: the model.
-        bridges: by the names of images that came in by one verified pair, alone or with a whole
-            model, not by tracks through three images.
+        bridges: by the names of images that came in by one verified pair, not by tracks through
+            three images.
         taken_out: images that were surely wrong and had to leave, with the reason.
         moves: what made the model, in the words of a report.
     """

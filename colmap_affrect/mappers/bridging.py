@@ -1,4 +1,4 @@
-"""Bridges: images and whole models that hang on a model by one verified pair.
+"""Bridges: images that hang on a model by one verified pair.
 
 The pair gives rotation and direction of translation, but not the scale, since its features are
 not those whose depth the model knows. They lie beside them, though: the ratio of the model's depths
@@ -6,7 +6,7 @@ to those of the pair at neighbouring places is the scale (:mod:`colmap_affrect.g
 What a bridge would do is judged by all other verified pairs of the images that it brings in.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -92,25 +92,23 @@ class Hypothesis:
 
     Attributes:
         bridge: what would be reported.
-        poses: of the images that come in, by image id, in the frame of the model.
-        cameras: of these images.
-        share: of the inliers of all pairs between the model and these images, how many agree.
-        weight: of these pairs together.
-        other: index of the model that comes in; None for a single image.
+        image_id: of the image that comes in.
+        pose: of this image, in the frame of the model.
+        camera: of this image.
+        agreeing: weight of the pairs between the model and this image, as far as they agree.
     """
 
     bridge: Bridge
-    poses: Mapping[int, Pose]
-    cameras: CameraById
-    share: float
-    weight: float
-    other: int | None = None
+    image_id: int
+    pose: Pose
+    camera: pycolmap.Camera
+    agreeing: float
 
     @property
     def rank(self) -> float:
         """Higher for what more pairs agree with, and for scales that more places agree on."""
         agreement = self.bridge.num_agreeing / self.bridge.num_ratios
-        return self.share * self.weight * agreement
+        return self.agreeing * agreement
 
 
 class Bridges:
@@ -121,12 +119,10 @@ class Bridges:
         self.graph, self.random_seed = graph, random_seed
         self._relative: dict[tuple[Any, ...], list[RelativePose]] = {}
 
-    def find(self, part: Part, others: Sequence[Part]) -> list[Hypothesis]:
-        """Return all bridges from a model to other models and to single images, best first."""
-        found = [*self._to_images(part)]
-        for index, other in enumerate(others):
-            found += self._to_model(part, other, index)
-        return sorted(filter(None, found), key=lambda hypothesis: -hypothesis.rank)
+    def find(self, part: Part) -> list[Hypothesis]:
+        """Return all bridges from a model to other images, best first."""
+        found = filter(None, self._to_images(part))
+        return sorted(found, key=lambda hypothesis: -hypothesis.rank)
 
     def _to_images(self, part: Part) -> Iterator[Hypothesis | None]:
         for pair in self.graph.pairs:
@@ -143,66 +139,7 @@ class Bridges:
                 pose = relative.pose if side == 0 else inverse(relative.pose)
                 rotation, translation = part.poses[near]
                 moved = pose[0] @ rotation, pose[0] @ translation + scale.scale * pose[1]
-                yield self._judged(part, (near, far), {far: moved}, {far: cameras[far]}, scale)
-
-    def _to_model(self, part: Part, other: Part, index: int) -> Iterator[Hypothesis | None]:
-        """Yield bridges to a model: by a common image, and by pairs between both."""
-        for common in part.poses.keys() & other.poses.keys():
-            places = other.known_depths(common)
-            radius = RADIUS_FRAC * _longer_side(part.cameras[common])
-            estimate = _trusted(scale_between(part.known_depths(common), places, radius))
-            if estimate is not None:
-                yield self._moved(part, other, index, (common, common), estimate, IDENTITY)
-        for pair in self.graph.pairs:
-            for side in (0, 1):
-                near, far = pair.ids[side], pair.ids[1 - side]
-                if near not in part.poses or far not in other.poses:
-                    continue
-                if near in other.poses or far in part.poses:
-                    continue
-                cameras = {near: part.cameras[near], far: other.cameras[far]}
-                for relative in self._poses(pair, cameras):
-                    scales = (
-                        self._scale(part, near, side, relative),
-                        self._scale(other, far, 1 - side, relative),
-                    )
-                    if scales[0] is None or scales[1] is None:
-                        continue
-                    pose = relative.pose if side == 0 else inverse(relative.pose)
-                    scaled = pose[0], pose[1] * scales[0].scale
-                    both = _quotient(scales[0], scales[1])
-                    yield self._moved(part, other, index, (near, far), both, scaled)
-
-    def _moved(
-        self,
-        part: Part,
-        other: Part,
-        index: int,
-        ids: tuple[int, int],
-        scale: ScaleEstimate,
-        relative: Pose,
-    ) -> Hypothesis | None:
-        """Move a model so that ``relative`` leads from a near image to one of its images.
-
-        ``scale`` is the length of the part's unit in those of the other: lengths of the other
-        times it are lengths of the part.
-        """
-        near, far = ids
-        rotation, translation = part.poses[near]
-        target = relative[0] @ rotation, relative[0] @ translation + relative[1]
-        source = other.poses[far]
-        # x_far = R_s X_o + t_s (other's units) and scale * x_far = R_t X_p + t_t
-        turn = source[0].T @ target[0]
-        shift = source[0].T @ (target[1] - scale.scale * source[1])
-        poses = {}
-        for image_id, (own_rotation, own_translation) in other.poses.items():
-            if image_id not in part.poses:
-                moved = scale.scale * own_translation + own_rotation @ shift
-                poses[image_id] = own_rotation @ turn, moved
-        if not poses:
-            return None
-        cameras = {i: self._camera(part, i, other.cameras[i]) for i in poses}
-        return self._judged(part, ids, poses, cameras, scale, index)
+                yield self._judged(part, (near, far), moved, cameras[far], scale)
 
     def _scale(
         self, part: Part, image_id: int, side: int, relative: RelativePose
@@ -222,30 +159,22 @@ class Bridges:
         self,
         part: Part,
         ids: tuple[int, int],
-        poses: Mapping[int, Pose],
-        cameras: CameraById,
+        pose: Pose,
+        camera: pycolmap.Camera,
         scale: ScaleEstimate,
-        other: int | None = None,
     ) -> Hypothesis | None:
-        """Ask all pairs between the model and what comes in; None where they disagree."""
-        all_poses, all_cameras = {**part.poses, **poses}, {**part.cameras, **cameras}
+        """Ask all pairs between the model and an image; None where they disagree."""
+        near, far = ids
+        poses, cameras = {**part.poses, far: pose}, {**part.cameras, far: camera}
         weight = agreeing = 0.0
-        for pair in self.graph.pairs:
-            if (pair.ids[0] in part.poses) + (pair.ids[1] in part.poses) == 1 and all(
-                image_id in all_poses for image_id in pair.ids
-            ):
+        for pair in self.graph.pairs_inside(poses):
+            if far in pair.ids:
                 weight += pair.weight
-                agreeing += pair.weight * self.graph.agreement(pair, all_poses, all_cameras)
-        if weight and agreeing < MIN_SHARE * weight:
+                agreeing += pair.weight * self.graph.agreement(pair, poses, cameras)
+        if agreeing < MIN_SHARE * weight:
             return None
-        bridge = Bridge(
-            self.graph.names[ids[0]],
-            scale.num_agreeing,
-            scale.num_ratios,
-            scale.error_frac,
-        )
-        share = agreeing / weight if weight else 1.0
-        return Hypothesis(bridge, poses, cameras, share, weight, other)
+        numbers = scale.num_agreeing, scale.num_ratios, scale.error_frac
+        return Hypothesis(Bridge(self.graph.names[near], *numbers), far, pose, camera, agreeing)
 
     def _poses(self, pair: VerifiedPair, cameras: CameraById) -> list[RelativePose]:
         focals = [cameras[image_id].mean_focal_length() for image_id in pair.ids]
@@ -254,18 +183,11 @@ class Bridges:
             self._relative[key] = self.graph.relative_poses(pair, cameras, self.random_seed)
         return self._relative[key]
 
-    def _camera(
-        self, part: Part, image_id: int, default: pycolmap.Camera | None = None
-    ) -> pycolmap.Camera:
-        """Return the camera that an image has in a model, or would have there."""
-        shared = self.graph.cameras[image_id]
-        for known in part.cameras.values():
-            if known.camera_id == shared.camera_id:
-                return known
-        return default or shared
-
-
-IDENTITY: Pose = (np.eye(3), np.zeros(3))
+    def _camera(self, part: Part, image_id: int) -> pycolmap.Camera:
+        """Return the camera that an image would have in a model."""
+        usual = self.graph.cameras[image_id]
+        alike = (known for known in part.cameras.values() if known.camera_id == usual.camera_id)
+        return next(alike, usual)
 
 
 def _longer_side(camera: pycolmap.Camera) -> int:
@@ -277,10 +199,3 @@ def _trusted(estimate: ScaleEstimate | None) -> ScaleEstimate | None:
     if estimate is None or estimate.num_agreeing < MIN_AGREEING:
         return None
     return estimate if estimate.share >= MIN_AGREEING_SHARE else None
-
-
-def _quotient(first: ScaleEstimate, second: ScaleEstimate) -> ScaleEstimate:
-    """Divide two scales; counts are those of the weaker one."""
-    weaker = min(first, second, key=lambda estimate: (estimate.share, estimate.num_agreeing))
-    error = float(np.hypot(first.error_frac, second.error_frac))
-    return ScaleEstimate(first.scale / second.scale, weaker.num_agreeing, weaker.num_ratios, error)

@@ -1,4 +1,4 @@
-"""Models that grow from a first pair, as in COLMAP's incremental mapper, or are joined by bridges.
+"""Models that grow from a first pair, as in COLMAP's incremental mapper, and by bridges.
 
 All adjustments know what is known of the cameras (:mod:`colmap_affrect.mappers.adjustment`).
 """
@@ -97,8 +97,10 @@ class Grower:
     def applied(
         self, hypothesis: Hypothesis, model: pycolmap.Reconstruction
     ) -> pycolmap.Reconstruction:
-        """Return a copy of a model with the images of a bridge, grown and adjusted from there."""
-        return self.placed(hypothesis.poses, hypothesis.cameras, copy.deepcopy(model))
+        """Return a copy of a model with the image of a bridge, grown and adjusted from there."""
+        poses = {hypothesis.image_id: hypothesis.pose}
+        cameras = {hypothesis.image_id: hypothesis.camera}
+        return self.placed(poses, cameras, copy.deepcopy(model))
 
     def placed(
         self, poses: PoseById, cameras: CameraById, model: pycolmap.Reconstruction
@@ -143,21 +145,20 @@ class Grower:
 
 
 class Joiner:
-    """Joins models and images by bridges until nothing joins."""
+    """Joins images to models by bridges until nothing joins."""
 
     def __init__(self, graph: PairGraph, grower: Grower, evidence: Evidence) -> None:
         self.graph, self.grower, self.evidence = graph, grower, evidence
         self.bridges = Bridges(graph, grower.native.random_seed)
 
     def join(
-        self, model: pycolmap.Reconstruction, others: Models
+        self, model: pycolmap.Reconstruction
     ) -> tuple[pycolmap.Reconstruction, dict[str, Bridge]]:
-        """Bridge from a model to images and to others until nothing joins; return its bridges."""
+        """Bridge from a model to images until nothing joins; return its bridges, too."""
         built: dict[str, Bridge] = {}
         score = self.evidence.of(model)
         while True:
-            hypotheses = self.bridges.find(Part(model), [Part(other) for other in others])
-            for hypothesis in hypotheses[:MAX_TRIALS]:
+            for hypothesis in self.bridges.find(Part(model))[:MAX_TRIALS]:
                 grown = self.grower.applied(hypothesis, model)
                 new_score = self.evidence.of(grown)
                 new = set(grown.reg_image_ids()) - set(model.reg_image_ids())
@@ -166,6 +167,4 @@ class Joiner:
             else:
                 return model, built
             model, score = grown, new_score
-            built.update({self.graph.names[i]: hypothesis.bridge for i in hypothesis.poses})
-            if hypothesis.other is not None:
-                others = [other for i, other in enumerate(others) if i != hypothesis.other]
+            built[self.graph.names[hypothesis.image_id]] = hypothesis.bridge

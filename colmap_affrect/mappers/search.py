@@ -22,7 +22,7 @@ ZOOMS = 1.0, 1.4, 0.7, 2.0
 """Factors of the usual focal length near which unknown ones begin: all lenses from wide to long."""
 SHARED_SIGMA = 0.1
 """Deviation of the logarithm of those that several images share, while models grow: two or three of
-these images do not tell it, and models that are to be joined must agree."""
+these images do not tell it."""
 SAME_FOCAL = 0.03  # of the logarithm: bridges built with one are right with the other
 NUM_STARTS = 3
 
@@ -37,7 +37,7 @@ class Search:
     num_seeds: int
     show: Callable[[int], None]
     num_starts: int = NUM_STARTS
-    """Models that are joined to the others in turn; with 0 there are no bridges, and one try."""
+    """Models from which bridges are built in turn; with 0 there are none, and one try."""
 
     def grower(self, graph: PairGraph, adjuster: Adjuster | None = None) -> Grower:
         """Return what grows models of a graph."""
@@ -52,8 +52,8 @@ class Search:
     ) -> list[MappedModel]:
         """Return the best model, and then the best ones of images that none before has.
 
-        If a model is given to start from, it is among those that are joined, and unknown focal
-        lengths stay near its own.
+        If a model is given to start from, bridges begin at it, too, and unknown focal lengths stay
+        near its own.
         """
         if start:
             return self._beyond(graph, start)
@@ -160,21 +160,18 @@ class Search:
     def joined(
         self, graph: PairGraph, adjuster: Adjuster, models: Models, num_starts: int
     ) -> list[MappedModel]:
-        """Return the best model that bridges make of some, best first, and those left out of it."""
+        """Return the best model that bridges make of one of some, and those left out of it."""
         if not models:
             return []
         if not num_starts or graph.is_explained_by(models[0]):
             return [MappedModel(models[0])]
         grower = self.grower(graph, adjuster)
         joiner = Joiner(graph, grower, self.evidence)
-        joined = [
-            joiner.join(model, models[:index] + models[index + 1 :])
-            for index, model in enumerate(models[:num_starts])
-        ]
+        joined = [joiner.join(model) for model in models[:num_starts]]
         best, bridges = max(joined, key=lambda pair: self.evidence.of(pair[0]))
         found, inside = [MappedModel(best, bridges)], set(best.reg_image_ids())
         for model in models:
-            if inside.isdisjoint(model.reg_image_ids()):
+            if len(set(model.reg_image_ids()) - inside) > 1:
                 found.append(MappedModel(model))
                 inside.update(model.reg_image_ids())
         return found

@@ -36,7 +36,7 @@ class SparseOptions(PipelineOptions):
 class SparseMapper(IncrementalMapper):
     """Maps small sets as one estimate; COLMAP maps large ones, and registers into a model.
 
-    What that leaves out is joined by bridges here, too.
+    What that leaves out comes in by bridges here, too.
     """
 
     Options = SparseOptions
