@@ -2,11 +2,11 @@
 
 Features of the levels of escalation follow each other in the order in which they were asked for:
 those of ``levels[k]`` end at ``level_ends[k]``. Descriptors of several sizes are filled up with
-zeros, which change no distance. Matches have the
-attributes ``level``, whose features were matched together with those of level 0, and
-``tried_level``, the highest that was tried. ``guided.h5`` has a group per pair that was matched
-again by its geometry. Files are opened for one image or one batch of pairs and closed again; what
-is written in between appears as a whole (:mod:`colmap_affrect.project.atomic_files`).
+zeros, which change no distance. Matches have the attributes ``level``, whose features were matched
+together with those of level 0, and ``tried``, with a bit for each level that was tried.
+``guided.h5`` has a group per pair that was matched again by its geometry. Files are opened for one
+image or one batch of pairs and closed again; what is written in between appears as a whole
+(:mod:`colmap_affrect.project.atomic_files`).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -248,10 +248,18 @@ class MatchStore(GroupStore):
         """Write a batch of pairs; record that a level was tried for others, which keep theirs."""
         with self._open("a") as file:
             for pair in pairs:
-                key, level = pair_key(*pair.names), pair.level
-                self._write(file, key, hloc_matches(pair), level=level, tried_level=level)
+                key = pair_key(*pair.names)
+                before = int(file[key].attrs["tried"]) if is_complete(file, key) else 0
+                known = {"level": pair.level, "tried": before | 1 << pair.level}
+                self._write(file, key, hloc_matches(pair), **known)
             for names in tried:
-                file[pair_key(*names)].attrs["tried_level"] = tried_level
+                file[pair_key(*names)].attrs["tried"] |= 1 << tried_level
+
+    def forget_tried(self) -> None:
+        """Forget which levels were tried beside the first."""
+        with self._open("a") as file:
+            for _, group in complete_groups(file):
+                group.attrs["tried"] = 1
 
     def remove(self, images: Iterable[str] = (), pairs: Iterable[tuple[str, str]] = ()) -> None:
         """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
@@ -267,7 +275,7 @@ class MatchStore(GroupStore):
                 file.attrs.pop(note, None)
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
-                if is_asked or group.attrs.get("tried_level"):
+                if is_asked or group.attrs["tried"] > 1:
                     del file[key]
 
     def has(self, pairs: Sequence[tuple[str, str]]) -> Bools:
@@ -286,7 +294,7 @@ class MatchStore(GroupStore):
     def levels(
         self, pairs: Iterable[tuple[str, str]], attribute: str = "level"
     ) -> dict[tuple[str, str], int]:
-        """Return the level that the matches of each pair are from, or its ``tried_level``."""
+        """Return the level that the matches of each pair are from, or its ``tried`` ones."""
         with self._open("r") as file:
             return {pair: int(file[pair_key(*pair)].attrs[attribute]) for pair in pairs}
 

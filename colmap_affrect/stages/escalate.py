@@ -169,8 +169,8 @@ class Escalation:
             )
         insecure = insecure_images(num_inliers, self.options.strong_num_inliers, weakly_connected)
         failed = [pair for pair, count in num_inliers.items() if not count]
-        reached, tried = self.matches.levels(failed), self.matches.levels(failed, "tried_level")
-        stalled = {pair for pair in failed if reached[pair] < tried[pair]}
+        reached, tried = self.matches.levels(failed), self.matches.levels(failed, "tried")
+        stalled = {pair for pair in failed if tried[pair] >> reached[pair] > 1}
         num_consistent, num_raw = self._num_matches(failed)
         return EscalationGraph(num_inliers, num_consistent, insecure, stalled, num_raw)
 
@@ -197,10 +197,10 @@ class Escalation:
         There are no pairs where a killed run has matched all of a step, and only the database lacks
         them.
         """
-        tried = self.matches.levels(self.pairs, "tried_level")
+        tried = self.matches.levels(self.pairs, "tried")
         if step := self.matches.note(STEP):
             level, pairs = step
-            return level, [p for p in map(tuple, pairs) if tried.get(p, level) < level]
+            return level, [p for p in map(tuple, pairs) if not tried.get(p, -1) >> level & 1]
         graph, levels = self.graph(), self.matches.levels(self.pairs)
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
 
@@ -208,13 +208,19 @@ class Escalation:
             for level in self.levels:
                 for pairs in (joining, hanging, graph.links(levels, level)):
                     yield level, pairs
-            if self._blind_level:
-                yield self._blind_level, graph.blind(self.options, tried, self._blind_level)
+            if blind := self._blind_level:
+                done = {pair for pair in self.pairs if tried[pair] & self._at_least(blind)}
+                yield blind, graph.blind(self.options, done)
 
         for level, pairs in steps():
-            if todo := [pair for pair in pairs if tried[pair] < level]:
+            if todo := [pair for pair in pairs if not tried[pair] & self._at_least(level)]:
                 return level, todo
         return None
+
+    def _at_least(self, level: int) -> int:
+        """Return the bits of the levels from one on that have frames of its kind."""
+        kinds = self._is_measured
+        return sum(1 << k for k in range(level, len(kinds)) if kinds[k] == kinds[level])
 
     def match_at(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers.
@@ -255,7 +261,7 @@ class Escalation:
         higher = [pair for pair in self.pairs if levels[pair]]
         with self.context.progress.stage("match", len(higher), "pairs") as advance:
             match_pairs(self.context, higher, self.matching, advance)
-        self.matches.write((), self.pairs, 0)
+        self.matches.forget_tried()
         self.matches.keep_note(STEP, None)
 
     def _lacking(self, name: str, levels: Sequence[int]) -> list[int]:

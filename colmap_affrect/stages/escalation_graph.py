@@ -75,17 +75,17 @@ class EscalationGraph:
             if not self.insecure.isdisjoint(pair) and (count or self._is_promising(pair, options))
         ]
 
-    def blind(self, options: EscalateOptions, tried: Mapping[Pair, int], level: int) -> list[Pair]:
+    def blind(self, options: EscalateOptions, tried: Collection[Pair]) -> list[Pair]:
         """Return pairs of images that are not secure whatever their matches hint at, the best few.
 
-        Where light or age differ the matches of right ones hint at nothing. Those for which this
-        level has been ``tried`` count among the few.
+        Where light or age differ the matches of right ones hint at nothing. Those that were
+        ``tried`` count among the few.
         """
         of_image: defaultdict[str, list[Pair]] = defaultdict(list)
         num_left = dict.fromkeys(self.insecure, options.num_blind_pairs)
         for pair in self.num_inliers:
             for name in self.insecure & set(pair):
-                if tried[pair] >= level:
+                if pair in tried:
                     num_left[name] -= 1
                 elif pair in self.num_consistent:
                     of_image[name].append(pair)

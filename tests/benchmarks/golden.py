@@ -76,7 +76,7 @@ def h5_digest(path: Path) -> str:
         parts.append(name)
         if isinstance(item, h5py.Dataset):
             parts.append(item[()])
-        kept = ("level", "tried_level", "complete", "uncertainty")
+        kept = ("level", "complete")
         parts.append(sorted((key, str(item.attrs[key])) for key in item.attrs if key in kept))
 
     with h5py.File(path, "r") as file:

@@ -80,17 +80,17 @@ def test_verified_and_promising_pairs_of_loose_images_escalate() -> None:
 
 def test_pairs_of_loose_images_escalate_blindly_to_features_of_another_kind() -> None:
     """The best of each image that is not secure, by matches that agree, then by all."""
-    tried = dict.fromkeys(map(tuple, INLIERS), 1)
+    tried: set[tuple[str, str]] = set()
     raw = {("a", "d"): 5, ("b", "d"): 7, ("c", "d"): 9, ("d", "e"): 3, ("c", "e"): 80}
     pairs = dataclasses.replace(graph(INLIERS, {"ad": 1}, "d"), num_raw=raw)
     two = EscalateOptions(num_blind_pairs=2)
-    assert pairs.blind(two, tried, 2) == [("a", "d"), ("c", "d")]
+    assert pairs.blind(two, tried) == [("a", "d"), ("c", "d")]
     of_d = [tuple(pair) for pair in ("ad", "bd", "cd", "de")]
-    assert pairs.blind(EscalateOptions(), tried, 2) == of_d
-    assert pairs.blind(EscalateOptions(num_blind_pairs=0), tried, 2) == []
-    assert pairs.blind(two, {**tried, ("a", "d"): 2}, 2) == [("c", "d")]
-    assert pairs.blind(two, {**tried, ("a", "d"): 2, ("d", "e"): 3}, 2) == []
-    assert graph(INLIERS, {}).blind(EscalateOptions(), tried, 2) == []
+    assert pairs.blind(EscalateOptions(), tried) == of_d
+    assert pairs.blind(EscalateOptions(num_blind_pairs=0), tried) == []
+    assert pairs.blind(two, {*tried, ("a", "d")}) == [("c", "d")]
+    assert pairs.blind(two, {*tried, ("a", "d"), ("d", "e")}) == []
+    assert graph(INLIERS, {}).blind(EscalateOptions(), tried) == []
 
 
 def test_links_follow_images_that_gained_and_need_more() -> None:
