@@ -53,7 +53,8 @@ class Level:
     @property
     def name(self) -> str:
         """Name in reports."""
-        return f"{self.rectifier.name} {self.features.name}" if self.base else self.rectifier.name
+        warps, own = self.rectifier.name, self.features.name if self.base else ""
+        return own if own and warps == "identity" else f"{warps} {own}".rstrip()
 
     @property
     def network_parts(self) -> tuple[NetworkOptions, ...]:

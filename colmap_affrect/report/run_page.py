@@ -133,6 +133,7 @@ def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
     }
     if report.models:
         tiles |= {
+            "of them sure": f"{len(model.sure)}",
             "points": f"{model.num_points3D:,}",
             "photographs per point": f"{model.mean_track_length:.2f}",
             "reprojection error": f"{model.mean_reprojection_error_px:.2f} px",

@@ -232,7 +232,7 @@ class Escalation:
         images = sorted({name for pair in pairs for name in pair})
         needed = sorted({self.extraction.levels[level].base, level})
         missing = [(name, k) for name in images for k in self._lacking(name, needed)]
-        title, total = f"escalate, level {level}", len(missing) + len(pairs)
+        title, total = f"escalate, {self.extraction.levels[level].name}", len(missing) + len(pairs)
         with self.context.progress.stage(title, total, "steps") as advance:
             self._extend(missing, advance)
             if pairs:

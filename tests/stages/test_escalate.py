@@ -283,7 +283,7 @@ def test_each_escalate_has_a_bar_of_its_own_that_ends_full(
     workspace, shown = copy(before, tmp_path), io.StringIO()
     with workspace.locked():
         escalation.escalate(Context(workspace, progress=Progress(shown)))
-    lines = [line for line in shown.getvalue().splitlines() if line.startswith("escalate, level")]
+    lines = [line for line in shown.getvalue().splitlines() if line.startswith("escalate, ")]
     last = {line.split(":")[0]: line.split(": ")[1].split()[0].split("/") for line in lines}
     assert list(last) == sorted(last)
     assert all(done == total for done, total in last.values())
