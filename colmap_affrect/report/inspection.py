@@ -207,7 +207,7 @@ def inspect_image(
     suffixes = [f"-level-{number}" if number else "" for number in numbers]
     sheets = [output_path / f"{path.stem}-inspection{suffix}.png" for suffix in suffixes]
     with new_results(*sheets, replaces=True) as new_sheets:
-        for number, (photograph, sheet) in enumerate(zip(read, new_sheets, strict=True)):
+        for number, photograph, sheet in zip(numbers, read, new_sheets, strict=True):
             level = inspect_level(extractor, photograph, number)
             name = extractor.options.levels[number].rectifier.name
             text = f"level {number}, {name}: {_summary(level)}"

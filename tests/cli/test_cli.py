@@ -225,9 +225,12 @@ def test_file_or_folder_that_is_not_there_is_wrong_usage_before_anything_is_made
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images" / "view_5_tilt70.jpg"
 
 
+SMALL = "max_image_size_px=240"
+
+
 def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
     out = tmp_path / "out č"
-    done = call("inspect", FACADE, "--output-path", out, "--set", "max_image_size_px=240")
+    done = call("inspect", FACADE, "--output-path", out, "--recipe", "rectified", "--set", SMALL)
     assert (done.code, done.stderr) == (0, [])
     sheet = out / "view_5_tilt70-inspection.png"
     assert sheet.stat().st_size > 50_000

@@ -14,6 +14,7 @@ from colmap_affrect.data import Photograph, Rectification, RectificationPlan
 from colmap_affrect.errors import ImageError
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.report.inspection import PALETTE, WIDTH_PX, inspect_image, inspect_level, tinted
+from colmap_affrect.stages import context
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
 SIZE = (300, 200)
@@ -21,7 +22,7 @@ SIZE = (300, 200)
 
 @pytest.fixture(scope="module")
 def extractor() -> ImageExtractor:
-    return prepare(load_recipe("default").extraction)
+    return prepare(load_recipe("rectified").extraction)
 
 
 @pytest.fixture
@@ -56,6 +57,17 @@ def test_level_has_the_plan_and_the_features_of_extraction(
     said = inspect(extractor, photo, tmp_path / "new" / "out")
     assert f"{len(plan.items)} warp" in said
     assert f"{len(features)} features" in said
+
+
+def test_levels_that_wait_for_weights_are_passed_over(
+    photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(context, "find", lambda *_: None)
+    said = inspect(prepare(load_recipe("default").extraction), photo, tmp_path / "out")
+    assert [line.partition(",")[0] for line in said.splitlines()[:3]] == [
+        "level 0", "level 1", "level 3"
+    ]  # fmt: skip
+    assert (tmp_path / "out" / "photo-inspection-level-3.png").exists()
 
 
 def test_missing_depth_is_a_warning_as_in_extraction(photo: Path, tmp_path: Path) -> None:
