@@ -1,6 +1,6 @@
 """Moves: which pairs the next models are made of.
 
-The search tries them one after the other and keeps the model with most evidence. A move is a
+The sparse mapper tries them one after the other and keeps the model with most evidence. A move is a
 function of all pairs and of the inliers of measured frames, by pair, and has one line in
 :data:`MOVES`. It returns None where there is nothing to try.
 """

@@ -1,7 +1,7 @@
 """The search for the model with most evidence.
 
 Models grow from several first pairs and, where a focal length is not known, from several of these;
-bridges join them. One number chooses: how much the verified pairs speak for a model
+bridges add images to them. One number chooses: how much the verified pairs speak for a model
 (:mod:`colmap_affrect.mappers.evidence`).
 """
 

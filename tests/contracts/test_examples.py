@@ -7,13 +7,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from contracts.contracts import MatcherContract
+from contracts import test_mappers
+from contracts.contracts import ExtractorContract, MatcherContract
 from small_scene import NAMES
 from synthetic import texture, write_image
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features.base import EXTRACTORS
-from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.features.base import EXTRACTORS, FeatureExtractor, NetworkContext
+from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
@@ -51,6 +52,21 @@ def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 class TestMutual(MatcherContract):
     def make(self) -> Matcher:
         return MATCHERS.make(MATCHERS.options("mutual"), MatcherContext())
+
+
+class TestOrb(ExtractorContract):
+    def make(self) -> FeatureExtractor:
+        return EXTRACTORS.make(EXTRACTORS.options("orb"), NetworkContext())
+
+
+task = test_mappers.task
+
+
+def test_new_mapper_keeps_the_contract(task: MappingTask, tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    own.mkdir()
+    test_mappers.test_mapper_registers_tells_of_it_and_keeps_given_cameras("plain", task, own)
+    test_mappers.test_mapper_has_presets_and_refuses_unknown_options("plain")
 
 
 def test_new_extractor_and_matcher_are_chosen_by_name(tmp_path: Path) -> None:
