@@ -45,6 +45,9 @@ from colmap_affrect.comparison import results
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MappingTask
 from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS, measure
 from colmap_affrect.project.report import DOUBTFUL, SURE
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.escalate import measured_inliers
 
 
 def mirrored(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:
@@ -255,6 +258,7 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
         images = {image.name: image.image_id for image in database.read_all_images()}
     truth = truth_of(name, scenes_path, list(images))
     true_cameras = calibration(SETS[name], scenes_path)
+    measured = measured_inliers(Context(Workspace(out)))
     with tempfile.TemporaryDirectory() as folder:
         small = Path(folder) / "small.db"
         shutil.copy(out / "database.db", small)
@@ -270,7 +274,13 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
                     break
                 path = Path(folder) / "part.db"
                 write_part(small, path, {images[i] for i in part}, told[1])
-                task = MappingTask(path, None, cameras=told[0], may_share=kind == "unknown")
+                task = MappingTask(
+                    path,
+                    None,
+                    measured={pair: some for pair, some in measured.items() if {*part} >= {*pair}},
+                    cameras=told[0],
+                    may_share=kind == "unknown",
+                )
                 mapper = MAPPERS.make(MAPPERS.options("sparse"))
                 models = mapper.map(task, Path(folder), number, lambda _: None)
                 if not models:
