@@ -33,4 +33,4 @@ def test_speed_and_complexity_are_measured(tmp_path: Path) -> None:
     assert '"extract_s"' in result.read_text()
     assert "| unrectified-rootsift | " in text
     given = [*photos, "--num-images", 1, "--methods", "rectified"]
-    assert "| default | " in run_script("tests/benchmarks/complexity.py", *given)
+    assert "| rectified | " in run_script("tests/benchmarks/complexity.py", *given)
