@@ -155,10 +155,8 @@ class Resources:
         return [k for k, level in enumerate(options.levels) if not k or level.weights <= there]
 
     def how_to_complete(self, options: ExtractionOptions) -> str:
-        """Return how to get what the other levels need; empty if there are none."""
-        usable = self.usable_levels(options)
-        waiting = [level for k, level in enumerate(options.levels) if k not in usable]
-        keys = sorted(set[str]().union(*(level.weights for level in waiting)))
+        """Return how to get what other levels wait for; empty if none does."""
+        keys = [key for key in options.weights if not find(key, self.weights_path)]
         hint = install_hint(WEIGHT_FILES[key] for key in keys)
         return f"{hint}colmap-affrect weights fetch {' '.join(keys)}" if keys else ""
 
