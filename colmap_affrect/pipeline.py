@@ -1,6 +1,7 @@
 """From a folder of photographs to a COLMAP model: the stages one after the other."""
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,10 +21,16 @@ from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.report import ReconstructionReport, StageReport, installed_versions
+from colmap_affrect.project.report import (
+    ReconstructionReport,
+    StageReport,
+    installed_versions,
+    summed,
+)
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.stages.climb import climb
 from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_descriptors
@@ -72,6 +79,7 @@ class RunOptions(InputOptions):
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
     database_descriptors: bool = False  # also into the database, as COLMAP's matchers need them
     extend: Extension | None = None  # the model that the photographs are registered into
+    max_minutes: float = math.inf  # after which nothing more is tried for photographs in need
 
 
 def run(
@@ -101,37 +109,46 @@ def run(
         progress: where to show progress.
     """
     options = options or RunOptions()
+    recipe = options.recipe
     mapper = MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    num_pairs = math.comb(len(names), 2)
-    if options.pairs.match_list_path:
-        num_pairs = len(read_pairs(Path(options.pairs.match_list_path), names))
-    elif "exhaustive" not in options.pairs.methods:
-        num_pairs = min(num_pairs, len(names) * options.pairs.num_neighbors)
-    shown = progress.with_forecast(Forecast(len(names), num_pairs))
-    context = Context(Workspace(output_path), options.resources, executor, shown)
+    shown = progress.with_forecast(Forecast(len(names), _num_pairs(names, options.pairs)))
+    deadline_s = time.monotonic() + 60 * options.max_minutes
+    context = Context(Workspace(output_path), options.resources, executor, shown, deadline_s)
     if options.extend:
         if overwrite:
             options.extend.refuse_discarding(output_path)
         existing_names(options.extend.model_path, names)
-    options.recipe.extraction.check_depth()
-    resolve(options.recipe.required_weights, options.resources.weights_path, progress=progress)
-    load_matchers(context, options.recipe.extraction, options.recipe.matching)
+    recipe.extraction.check_depth()
+    resolve(recipe.required_weights, options.resources.weights_path, progress=progress)
+    load_matchers(context, recipe.extraction, recipe.matching)
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         reports = [
-            extract(context, inputs, options.recipe, later=later, overwrite=overwrite),
+            extract(context, inputs, recipe, later=later, overwrite=overwrite),
             choose_pairs(context, options.pairs),
-            match(context, options.recipe.matching),
+            match(context, recipe.matching),
             verify_matches(context, options.verification),
         ]
-        if options.recipe.extraction.escalation:
-            reports.append(escalate(context, options.recipe.escalate))
-        reports.append(guide(context, options.recipe.guided))
+        if not recipe.extraction.escalation:
+            reports.append(guide(context, recipe.guided))
+        elif options.extend:
+            reports += [escalate(context, recipe.escalate), guide(context, recipe.guided)]
+        else:
+            reports += climb(context, mapper, recipe)
         if options.database_descriptors:
             write_descriptors(context)
         return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
+
+
+def _num_pairs(names: Sequence[str], options: PairOptions) -> int:
+    """Return about how many pairs there will be."""
+    if options.match_list_path:
+        return len(read_pairs(Path(options.match_list_path), names))
+    count = math.comb(len(names), 2)
+    is_all = "exhaustive" in options.methods
+    return count if is_all else min(count, len(names) * options.num_neighbors)
 
 
 def map_from_database(
@@ -192,7 +209,7 @@ def map_and_report(
         models=tuple(models),
         num_pairs=num_matched_pairs(workspace.database) if copied else len(listed_pairs(context)),
         num_verified_pairs=len(pair_inliers),
-        stages=(*earlier, report),
+        stages=summed((*earlier, report)),
         recipe="" if copied else workspace.recipe(),
         versions=installed_versions(),
         preset=options.preset_name,

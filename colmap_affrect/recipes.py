@@ -136,24 +136,16 @@ class ExtractionOptions(Options):
 
 
 class EscalateOptions(Options):
-    """Which pairs are escalated: those of weakly connected images."""
+    """Which pairs are escalated: those of images that a model lost, or is not sure of."""
 
     strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
-    """The pairs of an image are escalated while none of them has as many: an image that only weak
-    pairs connect is verified but rarely registered."""
+    """Pairs with as many need nothing more, where their images have enough tracks."""
     min_num_tracks: Annotated[int, within(0, 1_000_000)] = 30
-    """The pairs of an image are escalated when fewer of its features are in tracks through three
-    images or more: mapping registers images by such features, and COLMAP wants 30 of them."""
-    min_num_consistent: Annotated[int, within(0, 1_000_000)] = 2
-    """A pair that is not verified is escalated only when so many of its matches are confirmed by
-    the matches beside them: else hardly any verifies at a higher level; 0: all are."""
-    num_best_pairs: Annotated[int, within(0, 1_000_000)] = 2
-    """So many pairs of an image that no verified pair connects to the others, those with the most
-    such matches, are escalated all the same."""
-    num_blind_pairs: Annotated[int, within(0, 1_000_000)] = 10
-    """In the end so many pairs of an image that is still weakly connected get the first level
-    whose frames are not measured (ALIKED, XFeat), without any hint at a common surface:
-    where light or age differ, gradients do."""
+    """So many features of an image should be in tracks through three images or more: COLMAP
+    registers images by 30 of them."""
+    max_seconds_per_image: Annotated[float, within(0.0, 1e9)] = 120.0
+    """What an image is worth: a pair is left alone when it would take longer, for each image that
+    it is likely to save. Of one core, by what levels usually cost."""
 
 
 class Recipe(ExtractionOptions):

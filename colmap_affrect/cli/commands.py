@@ -50,6 +50,7 @@ def run(options: argparse.Namespace) -> None:
         recipe=recipe,
         database_descriptors=bool(options.database_descriptors),
         extend=given.extension(options),
+        max_minutes=options.max_minutes,
         **given.inputs(options, recipe),
     )
     with given.executor(options) as executor:

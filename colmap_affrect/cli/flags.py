@@ -3,6 +3,7 @@
 What :mod:`.given` makes an options class of has the field as destination, as ``cameras.mode``.
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,13 @@ def _switch(text: str, **settings: Any) -> Settings:
 
 def integers(text: str) -> tuple[int, ...]:
     return tuple(int(number) for number in text.split(","))
+
+
+def minutes(text: str) -> float:
+    number = float(text)
+    if not number >= 0:
+        raise ValueError
+    return number
 
 
 def words(text: str) -> tuple[str, ...]:
@@ -89,6 +97,9 @@ FLAGS: dict[str, Settings] = {
         "one that 'recipes' lists, or the path of a TOML file (default: default)"),
     "--set": _value("SECTION.OPTION=VALUE", "change one option of the recipe, e.g. --set "
         "rectifier.tilt_radius=1.8; may be repeated", action="append", default=[]),
+    "--max-minutes": _value("N", "try nothing more for lost photographs after so long; the same "
+        "command goes on (default: as long as more is likely to help)", type=minutes,
+        default=math.inf),
     "--depth-path": _path("FOLDER",
         "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
     "--database-descriptors": _switch(

@@ -39,8 +39,8 @@ from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
+from colmap_affrect.stages.climb import climb
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import add_images, extract
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
@@ -236,8 +236,9 @@ class MethodRun:
         if self.method.escalates:
             verification = self.verification.changed(random_seed=self.options.seeds[0])
             verify_matches(replace(context, progress=SILENT), verification)
+            mapper = MAPPERS.make(self.mapping.changed(random_seed=self.options.seeds[0]))
             with watch.step("escalate"):
-                escalate(context)
+                climb(context, mapper, recipe)
         return failures
 
     def _run_seed(self, seed: int) -> SeedResult:

@@ -47,6 +47,8 @@ class MappingTask:
         database_path: COLMAP database with two-view geometries.
         image_path: folder of the photographs, for the colours of the points; None for no colours.
         extend: register images into this model.
+        before: the model from before pairs were matched again, and what made it: mappers may begin
+            with it.
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
         measured: (M, 2) inliers of measured frames, of pairs of image names that have others, too.
@@ -57,6 +59,7 @@ class MappingTask:
     database_path: Path
     image_path: Path | None
     extend: ExistingModel | None = None
+    before: MappedModel | None = None
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
     measured: Mapping[tuple[str, str], NDArray[np.int64]] = field(default_factory=dict)
@@ -101,13 +104,11 @@ class MappedModel:
         reconstruction: the model.
         bridges: by the names of images that came in by one verified pair, not by tracks through
             three images.
-        taken_out: images that were surely wrong and had to leave, with the reason.
         moves: what made the model, in the words of a report.
     """
 
     reconstruction: pycolmap.Reconstruction
     bridges: Mapping[str, Bridge] = field(default_factory=dict)
-    taken_out: Mapping[str, str] = field(default_factory=dict)
     moves: tuple[str, ...] = ()
 
 

@@ -4,7 +4,7 @@ What is known of finished models is kept beside them: COLMAP's files cannot hold
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import TypeAdapter
@@ -93,7 +93,7 @@ def map_database(
         KeyboardInterrupt: after mapping has been stopped and what it wrote, but snapshots, removed.
     """
     partial = sparse_path.with_name(sparse_path.name + ".partial")
-    remove_own([partial] if task.extend else [partial, sparse_path])
+    remove_own([partial] if task.extend or task.before else [partial, sparse_path])
     num_images = len(image_ids(task.database_path))
     most_shown = 0
 
@@ -110,12 +110,12 @@ def map_database(
             raw.mkdir(parents=True)
             found = mapper.map(whole, raw, mapper.options.random_seed, show)
             remove_own([raw])
-        judged = [_judged(model, task) for model in found]
-        kept = [(model, sure) for model, sure in judged if sure]
+        judged = [(model, *_judged(model, task)) for model in found]
+        kept = [(model, sure, taken) for model, sure, taken in judged if sure]
         summaries = []
-        for index, (model, sure) in enumerate(sorted(kept, key=_size, reverse=True)):
+        for index, (model, sure, taken) in enumerate(sorted(kept, key=_size, reverse=True)):
             write_model(model.reconstruction, partial / str(index))
-            summaries.append(_summary(model, sure))
+            summaries.append(_summary(model, sure, taken))
             write_summary(summaries[-1], partial / str(index))
         remove_own([sparse_path])
         partial.rename(sparse_path)
@@ -124,32 +124,32 @@ def map_database(
     return summaries
 
 
-def _size(judged: tuple[MappedModel, Judgements]) -> tuple[int, int]:
+def _size(judged: tuple[MappedModel, Judgements, Judgements]) -> tuple[int, int]:
     model = judged[0].reconstruction
     return model.num_reg_images(), model.num_points3D()
 
 
-def _judged(mapped: MappedModel, task: MappingTask) -> tuple[MappedModel, Judgements]:
-    """Take out the images that are surely wrong, the worst one first; judge what is left.
+def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgements]:
+    """Take out the images that are surely wrong, the worst one first; judge what is left, and them.
 
     The reconstruction itself is changed; nothing is left of it with fewer than two images. Of a rig
     all images leave that were taken at once. Those of a model that is extended stay.
     """
-    model, taken = mapped.reconstruction, dict[str, str]()
+    model, taken = mapped.reconstruction, dict[str, Judgement]()
     while model.num_reg_images() > 1:
         found = judge(mapped, task)
         name = min(found, key=lambda name: found[name].probability)
         if task.extend or found[name].probability >= WRONG:
-            return replace(mapped, taken_out=taken), found
+            return found, taken
         frame_id = model.find_image_with_name(name).frame_id
         for image in model.images.values():
             if image.frame_id == frame_id and image.has_pose:
-                taken[image.name] = found[name].reason
+                taken[image.name] = found[name]
         model.deregister_frame(frame_id)
-    return mapped, {}
+    return {}, taken
 
 
-def _summary(mapped: MappedModel, found: Judgements) -> ModelSummary:
+def _summary(mapped: MappedModel, found: Judgements, taken: Judgements) -> ModelSummary:
     """Count what a model holds, and say how sure it is of each photograph."""
     model = mapped.reconstruction
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
@@ -160,9 +160,10 @@ def _summary(mapped: MappedModel, found: Judgements) -> ModelSummary:
         mean_track_length=float(model.compute_mean_track_length()),
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
         probabilities={name: round(one.probability, 3) for name, one in found.items()},
+        gains={name: round(one.gain, 3) for name, one in {**taken, **found}.items()},
         doubtful={name: one.reason for name, one in found.items() if one.probability < DOUBTFUL},
         bridges=dict(mapped.bridges),
-        taken_out=dict(mapped.taken_out),
+        taken_out={name: one.reason for name, one in taken.items()},
         focals_px=focals,
         moves=mapped.moves,
     )

@@ -155,6 +155,8 @@ TERMS: Mapping[str, Term] = {
 }
 """The terms, by their names in the file of coefficients."""
 
+OF_MATCHES = {"evidence", "agreement", "points of three", "bridge"}  # terms that more may mend
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -163,10 +165,12 @@ class Judgement:
     Attributes:
         probability: that it stands right.
         reason: what speaks most against that, empty if nothing does.
+        gain: what more matches may add to the probability.
     """
 
     probability: float
     reason: str
+    gain: float = 0.0
 
 
 @cache
@@ -185,14 +189,16 @@ def judge(mapped: MappedModel, task: MappingTask) -> dict[str, Judgement]:
 def judged(measures: Measures) -> Judgement:
     """Return the probability that a photograph stands right, and what takes most from it."""
     constant, weights = _coefficients()
-    log_odds, losses = constant, []
+    log_odds, left, losses = constant, 0.0, []
     for name, (weight, usual) in weights.items():
         value = TERMS[name].value(measures)
         log_odds += weight * value
         losses.append((weight * (usual - value), TERMS[name].reason(measures)))
+        left += max(0.0, losses[-1][0]) * (name in OF_MATCHES)
     worst = sorted((loss for loss in losses if loss[0] >= MIN_LOSS), reverse=True)
     reasons = [text for _, text in (worst or [max(losses)])[:NUM_REASONS]]
-    return Judgement(1.0 / (1.0 + math.exp(-log_odds)), "; ".join(reasons))
+    now, then = (1.0 / (1.0 + math.exp(-odds)) for odds in (log_odds, log_odds + left))
+    return Judgement(now, "; ".join(reasons), then - now)
 
 
 def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:

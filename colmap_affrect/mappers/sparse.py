@@ -12,11 +12,12 @@ from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.moves import MOVES
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, cameras_of, graph_of, poses_of
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.options import within
 
 SOME_TRACKS = "from some of the tracks"  # the move that makes easy models
+AGAIN = "after pairs were matched again"
 OWN_CAMERAS = "with a camera for each photograph"
 LARGE = 100  # images from which on COLMAP's own pipeline maps
 
@@ -55,6 +56,9 @@ class SparseMapper(IncrementalMapper):
             show(count)
 
         if task.extend or len(graph.keypoints) >= LARGE:
+            if task.before:
+                search = self._search(task, graph, native, shown)
+                return _again(search, graph, task.before)
             found = super().map(task, output_path, random_seed, show)
             if found and graph.is_explained_by(found[0].reconstruction):
                 return found
@@ -122,7 +126,8 @@ class SparseMapper(IncrementalMapper):
         search = self._search(replace(task, cameras=cameras), graph, native, show)
         ids = {name: image_id for image_id, name in graph.names.items()}
         measured = {(ids[a], ids[b]): inliers for (a, b), inliers in task.measured.items()}
-        best, most = list[MappedModel](), 0.0
+        best = _again(search, graph, task.before) if task.before else []
+        most = search.evidence_of(best)
         tried = set[frozenset[tuple[Ids, int]]]()
         for name, move in MOVES.items():
             start = best[0].reconstruction if best else None
@@ -156,6 +161,17 @@ class SparseMapper(IncrementalMapper):
         return best or (
             self._best(replace(task, may_share=False), own[0], native, show) if is_sharing else []
         )
+
+
+def _again(search: Search, graph: PairGraph, before: MappedModel) -> list[MappedModel]:
+    """Return a model with the poses of one before, and all that now joins it."""
+    found = before.reconstruction
+    grower, empty = search.grower(graph), pycolmap.Reconstruction()
+    model = grower.placed(poses_of(found), cameras_of(found), empty)
+    joined = search.joined(graph, search.adjuster, [model], num_starts=1)
+    for mapped in joined:
+        grower.finish(mapped.reconstruction)
+    return [replace(mapped, moves=(*before.moves, AGAIN)) for mapped in joined]
 
 
 def _with_own_cameras(

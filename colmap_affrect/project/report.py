@@ -4,7 +4,7 @@ import json
 import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from typing import Any
 
@@ -90,6 +90,16 @@ class StageReport:
         return f"{self.name}: {self.num_done} done{kept}{failed}{warned} in {self.wall_s:.1f} s"
 
 
+def summed(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
+    """Return one report of each stage, in the order in which they began: the last, all seconds."""
+    found = dict[str, StageReport]()
+    for report in reports:
+        before = found.get(report.name, replace(report, wall_s=0.0, num_done=0))
+        wall_s, num_done = before.wall_s + report.wall_s, before.num_done + report.num_done
+        found[report.name] = replace(report, wall_s=wall_s, num_done=num_done)
+    return tuple(found.values())
+
+
 @dataclass(frozen=True)
 class Bridge:
     """How an image was registered by one verified pair whose scale comes from neighbouring depths.
@@ -118,6 +128,7 @@ class ModelSummary:
 
     Attributes:
         probabilities: how probable it is that an image stands right, within 5 degrees.
+        gains: what more matches may add to these probabilities.
         doubtful: images that are rather wrong than right, with the reason.
         bridges: by what images were registered that came in by no track through three images.
         taken_out: images that were surely wrong, with the reason.
@@ -130,6 +141,7 @@ class ModelSummary:
     mean_track_length: float
     mean_reprojection_error_px: float
     probabilities: dict[str, float] = field(default_factory=dict)
+    gains: dict[str, float] = field(default_factory=dict)
     doubtful: dict[str, str] = field(default_factory=dict)
     bridges: dict[str, Bridge] = field(default_factory=dict)
     taken_out: dict[str, str] = field(default_factory=dict)

@@ -35,6 +35,8 @@ STEP = "step"
 """Note of matches: level and pairs of the step of escalation that has begun and not ended."""
 FINISHED = "finished_list"
 """Note of matches: digest of the list whose pairs have all been matched and looked at."""
+CLIMBING = "climbing_list"
+"""Note of matches: the same, of which there was a model before pairs were matched again."""
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
@@ -271,7 +273,7 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for note in (FINISHED, STEP):
+            for note in (FINISHED, STEP, CLIMBING):
                 file.attrs.pop(note, None)
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))

@@ -1,5 +1,6 @@
 """What all stages of a run have in common: photographs, options on record, files, resources."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -174,7 +175,7 @@ def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) 
 
 @dataclass(frozen=True)
 class Context:
-    """Where a run works and with what; none of it changes a result.
+    """Where a run works and with what; but for the deadline none of it changes a result.
 
     Options are those on record of the folder, which the workspace reads when a command begins: of
     photographs and features once these have been extracted, of other stages those that were done
@@ -185,6 +186,7 @@ class Context:
     resources: Resources = field(default_factory=Resources)  # weights and device
     executor: Executor | None = None  # for images and pairs, e.g. a cluster; None: threads here
     progress: Progress = SILENT  # where to show progress
+    deadline_s: float = math.inf  # of time.monotonic(): from then on nothing more is tried
 
     @property
     def inputs(self) -> Inputs:

@@ -1,27 +1,21 @@
 """Escalation on demand: more warps for the pairs of images that need them, and only those.
 
-Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015) images get the
-features that the level adds, and pairs are matched again. New matches take the place of the old
-ones only when their two-view geometry has more inliers, or, where neither is verified, when more of
-them confirm each other. Which pairs escalate is decided anew after every step, by what the database
-holds then, and the lowest level that has something to do comes first; the step that has begun is on
-record, so that a killed run goes on in the same way:
+Images get the features that a level of the recipe adds, and pairs are matched again with them
+(Mishkin, Matas, Perdoch, MODS, 2015). New matches take the place of the old ones only when their
+two-view geometry has more inliers, or, where neither is verified, when more of them confirm each
+other. Which pairs are matched again, and at which level, is decided anew after every step
+(:mod:`colmap_affrect.stages.expected_gain`), by what the database holds then; the step that has
+begun is on record, so that a killed run goes on in the same way.
 
-- First pairs between images that no verified pairs connect, then those of an image that is not
-  secure: without a strong pair, or with few features in tracks through three images.
-- Of pairs that are not verified only those whose matches hint at a common surface
-  (:mod:`colmap_affrect.geometry.neighbors`), and the best few of an image that is left outside.
-- Then the verified pairs of the images that gained, while one of the two is not secure: new
-  features that two images alone have cannot be tied to the rest.
-- When nothing else is left to do, the best pairs of each image that is still not secure, ten at
-  most, at the first level whose frames are not measured, where frames of others are: gradients
-  cannot hint at what learned features match.
+Images are in need that the model before has not, or is not sure of. While there is none, or pairs
+have changed since, only those that have no strong pair, or few features in tracks through three
+images: the next model tells of the others.
 """
 
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
@@ -30,18 +24,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.colmap.verification import PairVerifier, connected_parts
 from colmap_affrect.errors import ImageError, such_as
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.neighbors import num_consistent_matches
+from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import STEP, PairMatches
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalation_graph import (
-    EscalationGraph,
+from colmap_affrect.stages.expected_gain import (
+    ExpectedGain,
+    PairState,
     insecure_images,
     weakly_connected_images,
 )
@@ -66,6 +63,10 @@ OUTNUMBERED = 4
 """So many inliers of other frames to one of measured frames decide, where they agree with half of
 these: of what changes, such as a sitter, few gradients match, and their geometry is off."""
 
+LIKELY = 0.25
+"""Part of what more matches add to the probability of an image that is likely right: they tell more
+often that it is right than that they put it right."""
+
 
 def escalate(
     context: Context, options: EscalateOptions | None = None, *, overwrite: bool = False
@@ -89,10 +90,15 @@ def escalate(
     escalation.write()  # it may have been killed before
     escalated: set[Pair] = set()
     while work := escalation.next_work():
+        if time.monotonic() > context.deadline_s:
+            break
         level, todo = work
         escalation.match_at(todo, level)
         escalated |= set(todo)
     warnings = escalation.waiting()
+    if work:
+        warnings["time"] = "it is over; the same command without --max-minutes tries more"
+        logger.warning("time: %s", warnings["time"])
     wall_s = time.perf_counter() - start
     return StageReport("escalate", wall_s, len(escalated), warnings=warnings)
 
@@ -133,9 +139,6 @@ class Escalation:
         self.path = context.workspace.database
         self.levels = context.resources.usable_levels(self.extraction)[1:]
         self._is_measured = [level.features.has_shapes for level in self.extraction.levels]
-        # Beside measured ones there are others, at which these cannot hint; 0 if there are not.
-        blind = (k for k in self.levels if not self._is_measured[k])
-        self._blind_level = next(blind, 0) if self.has_both_kinds else 0
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
 
     @property
@@ -159,23 +162,47 @@ class Escalation:
             if first in ids and second in ids
         }
 
-    def graph(self) -> EscalationGraph:
-        """Return the pairs as the database has them; tracks count where there are three images."""
-        num_inliers = self.num_inliers()
-        weakly_connected: set[str] = set()
-        if len({name for pair in num_inliers for name in pair}) > 2:
-            weakly_connected = weakly_connected_images(
-                verified_inliers(self.context), self.options.min_num_tracks
-            )
-        insecure = insecure_images(num_inliers, self.options.strong_num_inliers, weakly_connected)
-        failed = [pair for pair, count in num_inliers.items() if not count]
-        reached, tried = self.matches.levels(failed), self.matches.levels(failed, "tried")
-        stalled = {pair for pair in failed if tried[pair] >> reached[pair] > 1}
-        num_consistent, num_raw = self._num_matches(failed)
-        return EscalationGraph(num_inliers, num_consistent, insecure, stalled, num_raw)
+    def needs(self) -> dict[str, float]:
+        """Return what more matches may be worth to images: 1 to those that a model has not.
 
-    def _num_matches(self, pairs: Sequence[Pair]) -> tuple[dict[Pair, int], dict[Pair, int]]:
-        """Return how many raw matches of pairs confirm each other, and how many there are."""
+        To doubtful ones what they may add to the probability that these are right, and a quarter
+        of that to others, which are likely right as they are.
+        """
+        workspace, names = self.context.workspace, self.features.names()
+        folders = model_folders(workspace.sparse)
+        model = read_summary(folders[0]) if folders else ModelSummary((), 0, 0.0, 0.0)
+        is_current = workspace.made_from("map") == rows_digest(self.path)
+        lost = set(names) - set(model.sure)
+        if not is_current:  # what has been tied since waits for the next model
+            lost &= self._insecure()
+        likely = set(model.registered_names) - model.doubtful.keys()
+        worth = {name: LIKELY if name in likely else 1.0 for name in sorted(lost)}
+        return {name: share * model.gains.get(name, 1.0) for name, share in worth.items()}
+
+    def _insecure(self) -> set[str]:
+        """Return the images that mapping may well lose, by the pairs as they are."""
+        limit = self.options.strong_num_inliers
+        return insecure_images(self.num_inliers(), limit, self._loose())
+
+    def _loose(self) -> set[str]:
+        """Return the images with few features in tracks through three, where there are three."""
+        if len(self.features.names()) < 3:
+            return set()
+        return weakly_connected_images(verified_inliers(self.context), self.options.min_num_tracks)
+
+    def states(self) -> dict[Pair, PairState]:
+        """Return what is known of the pairs that are in the database."""
+        num_inliers = self.num_inliers()
+        failed = [pair for pair, count in num_inliers.items() if not count]
+        num_consistent, levels = self._num_consistent(failed), self.matches.levels
+        reached, tried = levels(num_inliers), levels(num_inliers, "tried")
+        return {
+            pair: PairState(count, num_consistent.get(pair, 0), reached[pair], tried[pair])
+            for pair, count in num_inliers.items()
+        }
+
+    def _num_consistent(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
+        """Return how many raw matches of pairs confirm each other."""
         ids = colmap_database.image_ids(self.path)
         with colmap_database.open_database(self.path) as database:
             matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
@@ -184,8 +211,7 @@ class Escalation:
             key = indices.tobytes()
             if pair not in known or known[pair][0] != key:
                 known[pair] = key, num_consistent_matches(*self._frames(pair, indices))
-        counts = {pair: len(indices) for pair, indices in matches.items()}
-        return {pair: known[pair][1] for pair in pairs}, counts
+        return {pair: known[pair][1] for pair in pairs}
 
     def _frames(self, pair: Pair, indices: NDArray[np.integer]) -> tuple[Singles, Singles]:
         first, second = self._all_frames(pair)
@@ -197,25 +223,30 @@ class Escalation:
         There are no pairs where a killed run has matched all of a step, and only the database lacks
         them.
         """
-        tried = self.matches.levels(self.pairs, "tried")
         if step := self.matches.note(STEP):
             level, pairs = step
+            tried = self.matches.levels(self.pairs, "tried")
             return level, [p for p in map(tuple, pairs) if not tried.get(p, -1) >> level & 1]
-        graph, levels = self.graph(), self.matches.levels(self.pairs)
-        joining, hanging = graph.joining(self.options), graph.hanging(self.options)
-
-        def steps() -> Iterator[tuple[int, list[Pair]]]:
-            for level in self.levels:
-                for pairs in (joining, hanging, graph.links(levels, level)):
-                    yield level, pairs
-            if blind := self._blind_level:
-                done = {pair for pair in self.pairs if tried[pair] & self._at_least(blind)}
-                yield blind, graph.blind(self.options, done)
-
-        for level, pairs in steps():
-            if todo := [pair for pair in pairs if not tried[pair] & self._at_least(level)]:
-                return level, todo
-        return None
+        needs, sizes = self.needs(), self.features.image_sizes()
+        if not needs:
+            return None
+        states, loose, best = self.states(), self._loose(), (0.0, 0, list[Pair]())
+        ranges = {name: self.features.level_ranges(name) for name in sizes}
+        for number in self.levels:
+            level = self.extraction.levels[number]
+            is_blind = self.has_both_kinds and not self._is_measured[number]
+            gain = ExpectedGain(
+                states,
+                loose,
+                # They take like for same: only for images that nothing else holds.
+                {name: need for name, need in needs.items() if need > 0.5 or not is_blind},
+                {name: _megapixels(size, level.max_image_size_px) for name, size in sizes.items()},
+                [k for k, is_measured in enumerate(self._is_measured) if not is_measured],
+                {name for name in sizes if number not in ranges[name]},
+            )
+            rate, pairs = gain.best_pairs(number, level, self._at_least(number), self.options)
+            best = max(best, (rate, number, pairs), key=lambda found: found[0])
+        return best[1:] if best[0] else None
 
     def _at_least(self, level: int) -> int:
         """Return the bits of the levels from one on that have frames of its kind."""
@@ -243,7 +274,7 @@ class Escalation:
     def waiting(self) -> dict[str, str]:
         """Say what levels that lack weights may tie, if anything is left to tie."""
         how = self.context.resources.how_to_complete(self.extraction)
-        left = sorted(self.graph().insecure) if how else []
+        left = sorted(self.needs()) if how else []
         if not left:
             return {}
         text = f"its weights are not here; it may tie {such_as(left)}: {how}; then run this again"
@@ -294,12 +325,12 @@ class Escalation:
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
     ) -> None:
         size_px = self.extraction.levels[level].max_image_size_px
-        verifier, graph = PairVerifier(self.path, self.verification, size_px), self.graph()
+        verifier, states = PairVerifier(self.path, self.verification, size_px), self.states()
         others = self._inliers_of_other_kind(pairs, level)
 
         def judged(found: PairMatches) -> tuple[Pair, PairMatches | None]:
             chosen, worth = self._judged(found, others.get(found.names), verifier)
-            return found.names, chosen if worth > graph.worth(found.names) else None
+            return found.names, chosen if worth > states[found.names].worth else None
 
         def write(batch: Sequence[tuple[Pair, PairMatches | None]]) -> None:
             better = [chosen for _, chosen in batch if chosen]
@@ -373,3 +404,7 @@ class Escalation:
                 if len(others):
                     found[pair] = others
         return found
+
+
+def _megapixels(size: tuple[int, int], limit_px: int) -> float:
+    return math.prod(size) * min(1.0, limit_px / max(size)) ** 2 / 1e6

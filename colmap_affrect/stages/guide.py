@@ -27,7 +27,7 @@ from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore, GuidedPair
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalation_graph import weakly_connected_images
+from colmap_affrect.stages.expected_gain import weakly_connected_images
 from colmap_affrect.stages.match import IMAGES_IN_MEMORY, PAIRS_PER_WRITE
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (

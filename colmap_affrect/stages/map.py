@@ -5,11 +5,12 @@ from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
 from colmap_affrect.images.photographs import MaskOptions
-from colmap_affrect.mappers.base import Mapper, MappingTask
+from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, read_summaries
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
@@ -28,6 +29,7 @@ def map_images(
     mapper: Mapper,
     extend: Extension | None = None,
     *,
+    goes_on: bool = False,
     overwrite: bool = False,
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
@@ -53,17 +55,20 @@ def map_images(
         models = read_summaries(workspace.sparse)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
-    read_summaries(workspace.sparse)  # refuses edited ones
+    known_models = read_summaries(workspace.sparse)  # refuses edited ones
+    before = _read_before(workspace, known_models[0]) if goes_on and known_models else None
     workspace.record_made_from(map="")  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
-        models = map_database(mapper, _task(context, existing), workspace.sparse, advance)
+        models = map_database(mapper, _task(context, existing, before), workspace.sparse, advance)
     workspace.record_made_from(map=inputs)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models)), models
 
 
-def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
+def _task(
+    context: Context, existing: ExistingModel | None, before: MappedModel | None = None
+) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace = context.workspace
     copied = workspace.is_foreign
@@ -71,10 +76,16 @@ def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
         workspace.database,
         workspace.photographs(),
         existing,
+        before,
         measured={} if copied else measured_inliers(context),
         cameras=read_camera_records(workspace.cameras),
         may_share=not copied and context.inputs.may_share,
     )
+
+
+def _read_before(workspace: Workspace, summary: ModelSummary) -> MappedModel:
+    model = pycolmap.Reconstruction(str(workspace.sparse / "0"))
+    return MappedModel(model, moves=summary.moves)
 
 
 def _inputs(workspace: Workspace, extend: Extension | None) -> str:

@@ -21,7 +21,7 @@ from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.record import stamp_of
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import escalate
+from colmap_affrect.stages.escalate import Escalation
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.verify import copy_verified, verify_matches
 
@@ -120,7 +120,7 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
         return
     verify_matches(context)
     if "escalate" in begun:
-        escalate(context)
+        Escalation(context, context.escalation).write()
     if "guide" in begun:
         guide(context)
 

@@ -45,7 +45,7 @@ name = "identity"
 features = "shapeless"
 [escalate]
 strong_num_inliers = 1000000
-min_num_consistent = 0
+max_seconds_per_image = 1e9
 """
 
 
@@ -116,9 +116,9 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
         none = replace(found, indices=found.indices[:0], scores=found.scores[:0])
         context.matches.write([none], own, 0)
     escalation_of(context).write()
-    options = EscalateOptions(strong_num_inliers=1, min_num_tracks=0, num_best_pairs=0)
-    none_blind = options.changed(num_blind_pairs=0)
-    assert Escalation(context, none_blind).next_work() is None
+    options = EscalateOptions(strong_num_inliers=1, min_num_tracks=0)
+    worthless = options.changed(max_seconds_per_image=0.0)
+    assert Escalation(context, worthless).next_work() is None
     escalation = Escalation(context, options)
     assert escalation.next_work() == (1, own)
 
