@@ -139,10 +139,7 @@ class EscalateOptions(Options):
     """Which pairs are escalated: those of images that a model lost, or is not sure of."""
 
     strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
-    """Pairs with as many need nothing more, where their images have enough tracks."""
-    min_num_tracks: Annotated[int, within(0, 1_000_000)] = 30
-    """So many features of an image should be in tracks through three images or more: COLMAP
-    registers images by 30 of them."""
+    """Pairs with as many need nothing more, where their images have ``guided.min_num_tracks``."""
     max_seconds_per_image: Annotated[float, within(0.0, 1e9)] = 120.0
     """What an image is worth: a pair is left alone when it would take longer, for each image that
     it is likely to save. Of one core, by what levels usually cost."""

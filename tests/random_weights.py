@@ -28,7 +28,6 @@ def write_random_weights(folder: Path) -> dict[str, Path]:
         "orinet": randomized(feature.OriNet(pretrained=False), 2, gain=2.0),
         "hardnet": randomized(feature.HardNet(pretrained=False), 3),
         "aliked-n16": randomized(feature.ALIKED(), 4),
-        "xfeat": randomized(feature.XFeat().net, 5),
     }
     for name, network in networks.items():
         torch.save({"state_dict": network.state_dict()}, folder / name)

@@ -19,7 +19,7 @@ NAMES = [
     "affnet-shapes", "aliked-lightglue", "asift", "asift-recommended", "default", "dense-affnet",
     "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended", "depth-planes",
     "depth-planes-recommended", "on-demand", "rectified", "second-moment-shapes",
-    "sift-lightglue", "unrectified", "unrectified-rootsift", "xfeat-lighterglue",
+    "sift-lightglue", "unrectified", "unrectified-rootsift",
 ]  # fmt: skip
 
 OF_THE_PAPER = {
@@ -74,8 +74,8 @@ def test_matcher_must_be_trained_for_the_features() -> None:
 
 
 def test_matching_of_a_level_must_take_its_features() -> None:
-    values = {"escalation": [{"features": "xfeat", "matching": {"name": "lightglue"}}]}
-    with pytest.raises(OptionError, match="takes features of aliked, not of xfeat"):
+    values = {"escalation": [{"features": "affnet-hardnet", "matching": {"name": "lightglue"}}]}
+    with pytest.raises(OptionError, match="takes features of aliked, not of affnet-hardnet"):
         Recipe.from_mapping(values, "mine")
 
 

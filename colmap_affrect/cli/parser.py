@@ -17,7 +17,7 @@ EXAMPLES = (
     "pairs --output-path out --pairs retrieval,sequence --num-neighbors 30",
     "match --output-path out",
     "verify --output-path out",
-    "escalate --output-path out --overwrite --set escalate.min_num_tracks=10",
+    "escalate --output-path out --overwrite --set escalate.max_seconds_per_image=30",
     "guide --output-path out",
     "map --output-path out",
     "map --output-path out --from-database any.db --image-path photos",

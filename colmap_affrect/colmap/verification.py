@@ -21,9 +21,9 @@ from colmap_affrect.colmap.database import (
     require_database_space,
     unverified_pairs,
 )
-from colmap_affrect.colmap.two_views import pair_model, significance
+from colmap_affrect.colmap.two_views import significance
 from colmap_affrect.geometry.affine import homography_errors
-from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -242,23 +242,6 @@ class PairVerifier:
         ids, sides, indices = self._ordered(names, frames, indices)
         size_px = of_pair(self._extracted_px, ids)
         return estimate_geometry(sides, indices, self._options, size_px)
-
-    def are_explained(self, names: Names, frames: Frames, indices: Matches, by: Matches) -> Bools:
-        """Tell which of (M, 2) matches the geometry of other ones, ``by``, explains, as inliers.
-
-        All where that geometry is rejected, or one that nothing can contradict.
-        """
-        geometry = self.geometry(names, frames, by)
-        ids, (first, second), indices = self._ordered(names, frames, indices)
-        cameras = (first.camera, second.camera)
-        matched = (first.keypoints[indices[:, 0]], second.keypoints[indices[:, 1]])
-        with np.errstate(all="ignore"):  # points that a camera cannot undistort are not explained
-            model = pair_model(geometry, cameras, matched)
-            if model is None:
-                return np.ones(len(indices), np.bool_)
-            rows = np.arange(len(indices))
-            limit_px = max_error_px(cameras, self._options, of_pair(self._extracted_px, ids))
-            return np.asarray(model.errors(rows, rows) <= limit_px)
 
     def _ordered(
         self, names: Names, frames: Frames, indices: Matches

@@ -76,7 +76,6 @@ EXTRACTORS: Registry[FeatureExtractor] = Registry(
         "rootsift": "colmap_affrect.features.sift:RootSift",
         "affnet-hardnet": "colmap_affrect.features.affnet_hardnet:AffNetHardNet",
         "aliked": "colmap_affrect.features.learned:Aliked",
-        "xfeat": "colmap_affrect.features.learned:XFeat",
     },
     default="rootsift",
 )

@@ -1,11 +1,10 @@
-"""Features ``aliked`` and ``xfeat``: networks that detect and describe in one pass.
+"""Features ``aliked``: a network that detects and describes in one pass.
 
 Frames are upright circles of RADIUS_PX in the view, which a warp makes ellipses in the image.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -16,39 +15,28 @@ from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, Netwo
 from colmap_affrect.features.sift import is_searchable
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.geometry.arrays import Singles
-from colmap_affrect.geometry.conventions import HALF_PIXEL
 from colmap_affrect.options import within
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 RADIUS_PX = 12.0
-"""Radius of all frames: a sigma of 2 px, within which both networks find a point again, so
+"""Radius of all frames: a sigma of 2 px, within which the network finds a point again, so
 that a point that warps show again is known as the same."""
 
 Found = tuple["Tensor", "Tensor", Callable[["Tensor"], "Tensor"]]
 """(N, 2) points in pixel-centre px, (N,) responses, and what describes those of some indices."""
 
 
-class LearnedOptions(FeatureOptions):
-    """What both networks have in common."""
+class AlikedOptions(FeatureOptions):
+    """Features ``aliked`` (Zhao et al. 2023)."""
 
+    name: Literal["aliked"] = "aliked"
     in_color: ClassVar[bool] = True
     bytes_per_px: ClassVar[int] = 1600
     has_shapes: ClassVar[bool] = False
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
-    """Most features of one view, by response, as their authors match them."""
-
-    @property
-    def weights(self) -> tuple[str, ...]:
-        """Key of the file of weights."""
-        return (self.name,)
-
-
-class AlikedOptions(LearnedOptions):
-    """Features ``aliked`` (Zhao et al. 2023)."""
-
-    name: Literal["aliked"] = "aliked"
+    """Most features of one view, by response, as its authors match them."""
     model: Literal["n16", "n16rot", "n32"] = "n16"
     """``n16rot`` was trained with rotated images, ``n32`` looks at twice as many places."""
     score_threshold: Annotated[float, within(0.001, 1.0)] = 0.2
@@ -60,18 +48,16 @@ class AlikedOptions(LearnedOptions):
         return (f"aliked-{self.model}",)
 
 
-class XFeatOptions(LearnedOptions):
-    """Features ``xfeat`` (Potje et al. 2024)."""
+class Aliked(FeatureExtractor):
+    """ALIKED: maxima of a score map to parts of a pixel, descriptors from places round them.
 
-    name: Literal["xfeat"] = "xfeat"
-    score_threshold: Annotated[float, within(0.0, 1.0)] = 0.05
-    """Scores are above it, before they are weighted by reliability."""
+    ``n16`` and ``n32`` find points where they are; ``n16rot`` up to 1 px below, by what there is.
+    """
 
+    Options = AlikedOptions
+    descriptor_size = 128
 
-class LearnedFeatures(FeatureExtractor):
-    """A network on one view after another; its class says how it is called."""
-
-    def __init__(self, options: AlikedOptions | XFeatOptions, context: NetworkContext) -> None:
+    def __init__(self, options: AlikedOptions, context: NetworkContext) -> None:
         """Load the network; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import load_extractor, resolve_device
 
@@ -96,48 +82,14 @@ class LearnedFeatures(FeatureExtractor):
         lafs = lafs_from_keypoints(points, np.full(len(points), RADIUS_PX), np.zeros(len(points)))
         return LocalFeatures(lafs, responses, descriptors)
 
-    @abstractmethod
     def _run(self, pixels: Tensor) -> Found:
         """Return the features of a (1, 3, H, W) view in [0, 1]; descriptors are of unit length."""
-
-
-class Aliked(LearnedFeatures):
-    """ALIKED: maxima of a score map to parts of a pixel, descriptors from places round them.
-
-    ``n16`` and ``n32`` find points where they are; ``n16rot`` up to 1 px below, by what there is.
-    """
-
-    Options = AlikedOptions
-    descriptor_size = 128
-
-    def _run(self, pixels: Tensor) -> Found:
         features, scores = self.network.extract_dense_map(pixels)
         (places,), (responses,), _ = self.network.dkd(scores)
         size = places.new_tensor([pixels.shape[3] - 1, pixels.shape[2] - 1])
         points = (places + 1) / 2 * size
         head = self.network.desc_head
         return points, responses, lambda chosen: head(features, [places[chosen]])[0][0]
-
-
-class XFeat(LearnedFeatures):
-    """XFeat: maxima of a heat map, descriptors of cells of 8 px interpolated at them.
-
-    The network sees the view shrunk to whole multiples of 32 px. Pixel i there stands for the
-    middle between i and i + 1: compared with shrunk photographs it finds points 0.4 px left of and
-    above where they are.
-    """
-
-    Options = XFeatOptions
-    descriptor_size = 64
-
-    def _run(self, pixels: Tensor) -> Found:
-        height, width = pixels.shape[2:]
-        (found,) = self.network.detectAndCompute(pixels, top_k=height * width)
-        # kornia multiplies whole pixels of the shrunk view by these; of corner coordinates, which
-        # that is right for, those of the middle are i + 1.
-        factors = [side / max(side // 32 * 32, 32) for side in (width, height)]
-        points = found["keypoints"] + pixels.new_tensor(factors) - HALF_PIXEL
-        return points, found["scores"], found["descriptors"].__getitem__
 
 
 def _best(points: Tensor, responses: Tensor, allowed: Mask, limit: int) -> Tensor:

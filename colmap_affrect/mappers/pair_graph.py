@@ -18,7 +18,6 @@ from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import Pose, relative_pose
 from colmap_affrect.colmap.two_views import decomposed_homography, homography_matrix
-from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.geometry.epipolar import sampson_errors
 from colmap_affrect.geometry.two_views import (
     Depths,
@@ -154,16 +153,6 @@ class PairGraph:
     def without(self, ids: Collection[Ids]) -> Self:
         """Leave out some pairs."""
         return self._with((pair for pair in self._verified if pair.ids not in ids), self.cache)
-
-    def with_inliers(self, inliers: Mapping[Ids, NDArray[np.int64]]) -> Self:
-        """Leave some pairs only those of their inliers that are among (M, 2) given ones."""
-        kept = (
-            replace(pair, matches=pair.matches[rows_in(pair.matches, inliers[pair.ids])])
-            if pair.ids in inliers
-            else pair
-            for pair in self._verified
-        )
-        return self._with(kept, self.cache)
 
     @property
     def _verified(self) -> tuple[VerifiedPair, ...]:

@@ -12,7 +12,7 @@ from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.moves import MOVES
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, cameras_of, graph_of, poses_of
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, graph_of, poses_of
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.options import within
 
@@ -125,21 +125,17 @@ class SparseMapper(IncrementalMapper):
             graph = graph.with_cameras(cameras)
         search = self._search(replace(task, cameras=cameras), graph, native, show)
         ids = {name: image_id for image_id, name in graph.names.items()}
-        measured = {(ids[a], ids[b]): inliers for (a, b), inliers in task.measured.items()}
+        pairs = ((ids[a], ids[b]) for a, b in task.unmeasured)
+        unmeasured = {(min(pair), max(pair)) for pair in pairs}
         best = _again(search, graph, task.before) if task.before else []
         most = search.evidence_of(best)
-        tried = set[frozenset[tuple[Ids, int]]]()
         for name, move in MOVES.items():
             start = best[0].reconstruction if best else None
             if start and search.is_certain(start, graph):
                 break
-            reduced = move(graph, measured)
-            if reduced is None:
+            reduced = move(graph, unmeasured)
+            if reduced is None or (start and reduced.is_explained_by(start)):
                 continue
-            pairs = frozenset((pair.ids, len(pair.matches)) for pair in reduced.pairs)
-            if pairs in tried or (start and reduced.is_explained_by(start)):
-                continue
-            tried.add(pairs)
             models = [] if start else _of_some_tracks(search, reduced, graph)
             models = models or search.best(reduced, start)
             evidence = search.evidence_of(models)
@@ -148,7 +144,8 @@ class SparseMapper(IncrementalMapper):
             moves = (*(best[0].moves if best else ()), name, *models[0].moves)
             best, most = [replace(model, moves=moves) for model in models], evidence
             if is_sharing:
-                model = _with_own_cameras(own[1], move(own[0], measured) or own[0], search, best[0])
+                same = move(own[0], unmeasured) or own[0]
+                model = _with_own_cameras(own[1], same, search, best[0])
                 if model and own[1].evidence.of(model) > most + MIN_GAIN:
                     is_sharing, (graph, search) = False, own
                     first = replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))

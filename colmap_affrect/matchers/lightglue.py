@@ -54,16 +54,15 @@ class Training(NamedTuple):
 
 TRAININGS = {
     "aliked": Training("lightglue-aliked", "aliked", "aliked-lightglue"),
-    "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat-lighterglue"),
     "sift": Training("lightglue-sift", "rootsift", "sift-lightglue", False),
 }
 
 
 class LightGlueOptions(MatcherOptions):
-    """LightGlue, and LighterGlue for XFeat; defaults are those of LightGlue's authors."""
+    """LightGlue; defaults are those of its authors."""
 
     name: Literal["lightglue"] = "lightglue"
-    trained_for: Literal["aliked", "xfeat", "sift"] = "aliked"
+    trained_for: Literal["aliked", "sift"] = "aliked"
     """Features that the weights were trained for."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of each view that are matched, those of the largest responses."""
@@ -212,12 +211,11 @@ def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
 
 
 def renamed(name: str) -> str:
-    """Return kornia's name of a parameter in LightGlue's first files and in XFeat's.
+    """Return kornia's name of a parameter in LightGlue's first files.
 
-    >>> renamed("matcher.self_attn.3.out_proj.bias")
+    >>> renamed("self_attn.3.out_proj.bias")
     'transformers.3.self_attn.out_proj.bias'
     """
-    name = name.removeprefix("matcher.")
     return re.sub(r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1.", name)
 
 

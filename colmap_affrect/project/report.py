@@ -153,6 +153,11 @@ class ModelSummary:
         """Names of the images that are right with a probability of ``SURE`` or more."""
         return tuple(name for name, share in self.probabilities.items() if share >= SURE)
 
+    @property
+    def likely(self) -> set[str]:
+        """Names of the images that are rather right than wrong."""
+        return set(self.registered_names) - self.doubtful.keys()
+
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
         lines = _some(f"joined      {name} {one.text()}" for name, one in self.bridges.items())

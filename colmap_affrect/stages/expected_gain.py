@@ -41,17 +41,11 @@ class PairState:
 
 @dataclass(frozen=True)
 class LevelGain:
-    """What a kind of level usually brings and costs.
+    """What a kind of level usually brings and costs."""
 
-    Attributes:
-        weights: of the regression, by name of the term.
-        image_s: seconds of one core for the features of an image, by megapixel.
-        pair_s: the same for matching a pair of images.
-    """
-
-    weights: Mapping[str, float]
-    image_s: float
-    pair_s: float
+    weights: Mapping[str, float]  # of the regression, by name of the term
+    image_s: float  # of one core, for the features of an image, by megapixel
+    pair_s: float  # the same for matching a pair of images
 
     def chance(self, terms: Mapping[str, float]) -> float:
         """Return the probability that a pair verifies, and is right."""
@@ -141,9 +135,11 @@ class ExpectedGain:
         for pair, state in states.items():
             is_strong = state.num_inliers >= options.strong_num_inliers
             is_done = state.tried & others or (is_strong and self.loose.isdisjoint(pair))
+            is_alike = (state.level in self.unmeasured) != level.features.has_shapes
+            # Measured frames tell sides that look the same, so pairs that they verify stay theirs.
+            is_done |= bool(state.num_inliers) and not (is_alike or level.features.has_shapes)
             if not is_done and (tied := self._tied(pair)):
-                is_hint = not level.features.has_shapes or state.level not in self.unmeasured
-                hint = state if is_hint else replace(state, num_inliers=0)
+                hint = state if is_alike else replace(state, num_inliers=0)
                 known = terms(hint, wins, max(0, num_tried - wins))
                 found.append((gain.chance(known), tied, pair))
         found.sort(key=lambda item: (-item[0] * sum(value for _, value in item[1]), item[2]))

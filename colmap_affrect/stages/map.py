@@ -18,7 +18,7 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import measured_inliers
+from colmap_affrect.stages.escalate import unmeasured_pairs
 
 STRONGEST = "default"  # of the recipes
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
@@ -77,7 +77,7 @@ def _task(
         workspace.photographs(),
         existing,
         before,
-        measured={} if copied else measured_inliers(context),
+        unmeasured=frozenset() if copied else frozenset(unmeasured_pairs(context)),
         cameras=read_camera_records(workspace.cameras),
         may_share=not copied and context.inputs.may_share,
     )

@@ -47,7 +47,7 @@ from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS, measure
 from colmap_affrect.project.report import DOUBTFUL, SURE
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import measured_inliers
+from colmap_affrect.stages.escalate import unmeasured_pairs
 
 
 def mirrored(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:
@@ -258,7 +258,7 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
         images = {image.name: image.image_id for image in database.read_all_images()}
     truth = truth_of(name, scenes_path, list(images))
     true_cameras = calibration(SETS[name], scenes_path)
-    measured = measured_inliers(Context(Workspace(out)))
+    unmeasured = unmeasured_pairs(Context(Workspace(out)))
     with tempfile.TemporaryDirectory() as folder:
         small = Path(folder) / "small.db"
         shutil.copy(out / "database.db", small)
@@ -277,7 +277,7 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
                 task = MappingTask(
                     path,
                     None,
-                    measured={pair: some for pair, some in measured.items() if {*part} >= {*pair}},
+                    unmeasured=frozenset(pair for pair in unmeasured if {*part} >= {*pair}),
                     cameras=told[0],
                     may_share=kind == "unknown",
                 )

@@ -24,7 +24,6 @@ from colmap_affrect.rectifiers.depth_planes import DepthPlanesOptions
 FEATURES = {
     **{name: {"name": name} for name in EXTRACTORS.names()},
     "affnet-hardnet": {"name": "affnet-hardnet", "max_num_features": 60},
-    "xfeat": {"name": "xfeat", "score_threshold": 0.0},  # random scores are far below the default
 }
 
 
@@ -33,8 +32,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return write_random_weights(tmp_path_factory.mktemp("weights"))
 
 
-LONG = ["aliked"]
-"""They take seconds; the quickest of the learned features stays."""
+LONG = ["aliked"]  # takes seconds
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Features aliked and xfeat: what kornia computes, at the right places, under masks."""
+"""Features aliked: what kornia computes, at the right places, under masks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from random_weights import write_random_weights
 
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.features.base import EXTRACTORS, NetworkContext
-from colmap_affrect.features.learned import RADIUS_PX, LearnedFeatures
+from colmap_affrect.features.learned import RADIUS_PX, Aliked
 from colmap_affrect.features.weights import WEIGHT_FILES, find
 
 COURTYARD = Path(__file__).resolve().parents[2] / "sample_scenes" / "courtyard"
@@ -23,7 +23,7 @@ SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
 ALL = 1_000_000
 
 MOST_OFFSET_PX = 0.45
-"""By what the photographs show; without the half pixel of XFeat it is 0.5 and more."""
+"""By what the photographs show; half a pixel too much or too little is more."""
 
 SAME_DESCRIPTOR = 1e-3
 """Sums in another order, where kornia's layout in memory is another."""
@@ -34,7 +34,7 @@ def options_of(key: str) -> dict[str, object]:
     return {"name": name, **({"model": model} if model else {})}
 
 
-def make(options: dict[str, object], weights: dict[str, Path]) -> LearnedFeatures:
+def make(options: dict[str, object], weights: dict[str, Path]) -> Aliked:
     return EXTRACTORS.make(EXTRACTORS.options(options), NetworkContext(weights))
 
 
@@ -65,11 +65,6 @@ def by_kornia(key: str, path: Path, image: np.ndarray) -> tuple[np.ndarray, np.n
     state = torch.load(path, map_location="cpu", weights_only=True)
     state = state.get("state_dict", state)
     with torch.inference_mode():
-        if key == "xfeat":
-            network = feature.XFeat(top_k=ALL, detection_threshold=0.01).eval()
-            network.net.load_state_dict(state)
-            (result,) = network.detectAndCompute(pixels)
-            return result["keypoints"].numpy(), result["descriptors"].numpy()
         network = feature.ALIKED(key).eval()
         network.load_state_dict(state, strict=False)
         found = network(pixels)[0]
@@ -80,8 +75,7 @@ def assert_as_kornia(
     key: str, weights: dict[str, Path], image: np.ndarray, tolerance_px: float
 ) -> None:
     """Compare up to rounding, which may decide whether a pixel is a maximum."""
-    threshold = {"score_threshold": 0.01} if key == "xfeat" else {}
-    options = {**options_of(key), "max_num_features": ALL, **threshold}
+    options = {**options_of(key), "max_num_features": ALL}
     features = make(options, weights).detect((image, None))
     points, descriptors = by_kornia(key, weights[key], image)
     assert len(features) > 100
@@ -95,15 +89,14 @@ def assert_as_kornia(
     assert as_kornia.mean() > 0.99
 
 
-@pytest.mark.parametrize("key", ["aliked-n16", "xfeat"])
+@pytest.mark.parametrize("key", ["aliked-n16"])
 def test_features_are_those_of_kornia(key, weights, photograph) -> None:
     part = photograph[:150, :221]
-    # The factor of XFeat's shrunk view is between offsets of half a pixel.
-    assert_as_kornia(key, weights, part, 0.2 if key == "xfeat" else 0.01)
+    assert_as_kornia(key, weights, part, 0.01)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("key", ["aliked-n16", "xfeat"])
+@pytest.mark.parametrize("key", ["aliked-n16"])
 def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> None:
     """A constant offset in px of the view is another place in the photograph when it is shrunk."""
     extractor = make(options_of(key), published)
@@ -123,7 +116,7 @@ def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> Non
     assert np.linalg.norm(np.concatenate(offsets).mean(axis=0)) < MOST_OFFSET_PX
 
 
-@pytest.mark.parametrize("key", ["aliked-n16", "xfeat"])
+@pytest.mark.parametrize("key", ["aliked-n16"])
 def test_mask_chooses_among_what_is_found_without_it(key, weights, photograph) -> None:
     part = photograph[:150, :221]
     mask = np.zeros(part.shape[:2], np.uint8)
@@ -141,11 +134,10 @@ def test_mask_chooses_among_what_is_found_without_it(key, weights, photograph) -
 
 def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:
     broken = tmp_path / "broken"
-    broken.write_bytes(weights["xfeat"].read_bytes()[:4000])
+    broken.write_bytes(weights["aliked-n16"].read_bytes()[:4000])
     for key, path, message in (
         ("aliked-n32", weights["aliked-n16"], "not the weights of aliked-n32"),
-        ("xfeat", weights["aliked-n16"], "not the weights of xfeat"),
-        ("xfeat", broken, "broken: "),
+        ("aliked-n16", broken, "broken: "),
     ):
         with pytest.raises(AffrectError, match=message):
             make(options_of(key), {key: path})

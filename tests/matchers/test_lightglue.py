@@ -191,8 +191,7 @@ def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_pa
     path = write_comparing_lightglue(tmp_path / "lightglue.pth", trained_for)
     options = LightGlueOptions.from_mapping({"trained_for": trained_for}, "")
     matcher = LightGlue(options, MatcherContext({training.weights: path}, "cpu"))
-    dimension = 64 if trained_for == "xfeat" else 128
-    parts = [features(20, seed, dimension=dimension) for seed in (1, 2)]
+    parts = [features(20, seed) for seed in (1, 2)]
     parts[1] = parts[1].with_rectification_id(1)
     views = matcher.prepare(image(union(parts), training.kind))
     indices = matcher.match(views, views).indices
@@ -202,16 +201,16 @@ def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_pa
 
 
 def test_features_of_another_extractor_are_refused_in_one_line(matcher: LightGlue) -> None:
-    with pytest.raises(OptionError, match="'aliked' takes features of aliked, not of xfeat"):
-        matcher.prepare(image(features(20, 1), "xfeat"))
+    with pytest.raises(OptionError, match="'aliked' takes features of aliked, not of rootsift"):
+        matcher.prepare(image(features(20, 1), "rootsift"))
     matcher.prepare(image(features(20, 1), ""))
 
 
 def test_weights_of_another_network_are_refused(comparing: Path, tmp_path: Path) -> None:
     with pytest.raises(
-        AffrectError, match=r"lightglue\.pth: not the weights of LightGlue for xfeat"
+        AffrectError, match=r"lightglue\.pth: not the weights of LightGlue for sift"
     ):
-        load_network(comparing, LightGlueOptions(trained_for="xfeat"))
+        load_network(comparing, LightGlueOptions(trained_for="sift"))
     state = torch.load(comparing, weights_only=True)
     del state["posenc.Wr.weight"]
     torch.save(state, tmp_path / "partial.pth")

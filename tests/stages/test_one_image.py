@@ -168,7 +168,7 @@ def test_images_at_once_are_as_many_as_there_are_cores_and_memory_for(
         monkeypatch.setattr(one_image, "available_memory_bytes", lambda g=gibibytes: g << 30)
         counts.append(num_images_at_once(extractor))
     assert counts == [1, 3, 8]
-    shrunk = {"max_image_size_px": 1024, "features": "xfeat"}
+    shrunk = {"max_image_size_px": 1024, "features": "aliked"}
     learned = replace(extractor, options=ExtractionOptions.from_mapping(shrunk, "test"))
     for gibibytes, expected in ((1, 1), (9, 2), (100, 2)):  # 1.6 GiB an image, and two at most
         monkeypatch.setattr(one_image, "available_memory_bytes", lambda g=gibibytes: g << 30)
