@@ -77,12 +77,14 @@ def escalate(
         level, todo = work
         escalation.match_at(todo, level)
         escalated.update(todo)
-    warnings = escalation.waiting()
-    if work:
-        warnings["time"] = "it is over; the same command without --max-minutes tries more"
-        logger.warning("time: %s", warnings["time"])
-    wall_s = time.perf_counter() - start
-    return StageReport("escalate", wall_s, len(escalated), warnings=warnings)
+    warnings = dict[str, str]()
+    if not escalated or not escalation.model().registered_names:  # else the next model tells
+        warnings = escalation.waiting()
+        if work:
+            warnings["time"] = "it is over; the same command without --max-minutes tries more"
+    for what, text in warnings.items():
+        logger.warning("%s: %s", what, text)
+    return StageReport("escalate", time.perf_counter() - start, len(escalated), warnings=warnings)
 
 
 def unmeasured_pairs(context: Context) -> list[Pair]:
@@ -244,11 +246,9 @@ class Escalation:
     def waiting(self) -> dict[str, str]:
         """Say what levels that lack weights may tie, if anything is left to tie."""
         how = self.context.resources.how_to_complete(self.extraction)
-        left = sorted(self.needs(self.model())) if how else []
-        if not left:
+        if not how or not (left := sorted(self.needs(self.model()))):
             return {}
         text = f"its weights are not here; it may tie {such_as(left)}: {how}; then run this again"
-        logger.warning("learned matching: %s", text)
         return {"learned matching": text}
 
     def write(self) -> None:
