@@ -97,9 +97,9 @@ FLAGS: dict[str, Settings] = {
         "one that 'recipes' lists, or the path of a TOML file (default: default)"),
     "--set": _value("SECTION.OPTION=VALUE", "change one option of the recipe, e.g. --set "
         "rectifier.tilt_radius=1.8; may be repeated", action="append", default=[]),
-    "--max-minutes": _value("N", "try nothing more for lost photographs after so long; the same "
+    "--max-time": _value("MINUTES", "try nothing more for lost photographs after so long; the same "
         "command goes on (default: as long as more is likely to help)", type=minutes,
-        default=math.inf),
+        default=math.inf, dest="max_minutes"),
     "--depth-path": _path("FOLDER",
         "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
     "--database-descriptors": _switch(

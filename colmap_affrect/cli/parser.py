@@ -121,7 +121,7 @@ MODEL = "--extend --refine-existing --random-seed --json --no-page"
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("all stages: photographs in, COLMAP model out",
-        f"{RESULTS} {IMAGES} {RECIPE} --max-minutes --depth-path --database-descriptors {NETWORKS} "
+        f"{RESULTS} {IMAGES} {RECIPE} --max-time --depth-path --database-descriptors {NETWORKS} "
         f"--scheduler {PAIRS} {MAPPER} {MODEL}"),
     "extract": ("features into features.h5 and database.db",
         f"{RESULTS} {IMAGES} {RECIPE} --depth-path --database-descriptors {NETWORKS} --scheduler"),

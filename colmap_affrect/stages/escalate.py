@@ -7,9 +7,9 @@ other. Which pairs are matched again, and at which level, is decided anew after 
 (:mod:`colmap_affrect.stages.expected_gain`), by what the database holds then; the step that has
 begun is on record, so that a killed run goes on in the same way.
 
-Images are in need that the model before has not, or is not sure of. While there is none, or pairs
-have changed since, only those that have no strong pair, or few features in tracks through three
-images: the next model tells of the others.
+Images are in need that the model before has not, or is not sure of. While there is none, those that
+have no strong pair, or few features in tracks through three images. When one has got these, a small
+set waits for the next model.
 """
 
 import logging
@@ -25,6 +25,7 @@ from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import ImageError, such_as
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.mappers.mapping import model_folders, read_summary
+from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import STEP, PairMatches
@@ -46,8 +47,7 @@ from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers,
 logger = logging.getLogger(__name__)
 
 LIKELY = 0.25
-"""Part of what more matches add to the probability of an image that is likely right: they tell more
-often that it is right than that they put it right."""
+"""Part of a gain that counts for images that are likely right: matches tell that, and mend few."""
 
 
 def escalate(
@@ -81,7 +81,7 @@ def escalate(
     if not escalated or not escalation.model().registered_names:  # else the next model tells
         warnings = escalation.waiting()
         if work:
-            warnings["time"] = "it is over; the same command without --max-minutes tries more"
+            warnings["time"] = "it is over; the same command without --max-time tries more"
     for what, text in warnings.items():
         logger.warning("%s: %s", what, text)
     return StageReport("escalate", time.perf_counter() - start, len(escalated), warnings=warnings)
@@ -137,9 +137,12 @@ class Escalation:
         To doubtful ones what they may add to the probability that these are right, and a quarter
         of that to others, which are likely right as they are.
         """
-        lost = set(self.features.names()) - set(model.sure)
-        if self.context.workspace.made_from("map") != rows_digest(self.path):
-            lost &= self._insecure()  # what has been tied since waits for the next model
+        workspace, names = self.context.workspace, self.features.names()
+        lost = set(names) - set(model.sure)
+        if workspace.made_from("map") != rows_digest(self.path):
+            insecure = lost & self._insecure()  # the next model tells of what has been tied since
+            maps_next = insecure != lost and workspace.sparse.exists() and len(names) < LARGE
+            lost = set() if maps_next else insecure
         worth = {name: LIKELY if name in model.likely else 1.0 for name in sorted(lost)}
         return {name: share * model.gains.get(name, 1.0) for name, share in worth.items()}
 

@@ -20,8 +20,7 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.recipes import EscalateOptions, Level
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")
-SHARE_OF_BEST = 0.3
-"""Pairs worth less than that part of the best wait for what is learned from it."""
+SHARE_OF_BEST = 0.3  # pairs worth less than that part of the best wait for what it tells
 
 
 @dataclass(frozen=True)
@@ -166,10 +165,9 @@ class ExpectedGain:
 def insecure_images(
     num_inliers: Mapping[Pair, int], strong_num_inliers: int, weakly_connected: Collection[str] = ()
 ) -> set[str]:
-    """Return the images that mapping may well lose.
+    """Return the images that mapping may well lose: without a strong pair, or weakly connected.
 
-    Those are in no pair with ``strong_num_inliers``, or are among those that have little in common
-    with two others. ``num_inliers`` of each pair is 0 where it is not verified.
+    ``num_inliers`` of each pair is 0 where it is not verified.
     """
     strong = (pair for pair, count in num_inliers.items() if count >= max(1, strong_num_inliers))
     names = {name for pair in num_inliers for name in pair}
@@ -179,7 +177,6 @@ def insecure_images(
 def weakly_connected_images(matches: Mapping[Pair, Indices], min_num_features: int) -> set[str]:
     """Return the images with fewer features than that in tracks through three images or more.
 
-    A mapper registers an image by features whose matches it has triangulated already. That takes
-    two other images, so a strong pair alone ties an image to nothing.
+    Mappers register images by features that two others have triangulated already.
     """
     return {name for name, count in num_in_tracks(matches).items() if count < min_num_features}
