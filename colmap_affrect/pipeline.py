@@ -35,12 +35,7 @@ from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_descriptors
 from colmap_affrect.stages.guide import guide, guided_counts
-from colmap_affrect.stages.map import (
-    advice,
-    image_names,
-    map_images,
-    unregistered,
-)
+from colmap_affrect.stages.map import advice, image_names, map_images, unregistered
 from colmap_affrect.stages.match import load_matchers, match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs

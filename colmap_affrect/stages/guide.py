@@ -29,6 +29,7 @@ from colmap_affrect.project.stores import FeatureStore, GuidedPair
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.expected_gain import weakly_connected_images
 from colmap_affrect.stages.match import IMAGES_IN_MEMORY, PAIRS_PER_WRITE
+from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (
     extracted_px,
@@ -184,9 +185,11 @@ class Guiding:
             images = self.ids
             if self.options.enabled == "auto":  # of two images alone there are no longer tracks
                 has_three = len({name for pair in exact for name in pair}) > 2
-                min_num_tracks = self.options.min_num_tracks
-                images = weakly_connected_images(exact, min_num_tracks) if has_three else ()
-        chosen = [pair for pair in exact if not set(pair).isdisjoint(images)]
+                limit = self.options.min_num_tracks if has_three else 0
+                images = weakly_connected_images(exact, limit)
+        levels = self.context.matches.levels(listed_pairs(self.context))
+        escalated = {frozenset(pair) for pair, level in levels.items() if level}  # have enough
+        chosen = [p for p in exact if not {*p}.isdisjoint(images) and {*p} not in escalated]
         done = {pair.names for pair in known}
         return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
 
