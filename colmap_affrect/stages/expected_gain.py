@@ -60,9 +60,10 @@ def _known() -> dict[str, LevelGain]:
 
 def gain_of(level: Level) -> LevelGain:
     """Return what a level brings and costs: by whether its frames are measured, and its warps."""
-    warps = "all tilts" if level.rectifier.name == "asift" else "warps"
-    kind = "measured" if level.features.has_shapes else "learned"
-    return _known()[kind if level.rectifier.name == "identity" else f"{kind}, {warps}"]
+    warps = level.rectifier.name
+    if level.features.has_shapes:
+        return _known()["measured, all tilts" if warps == "asift" else "measured, warps"]
+    return _known()["learned" if warps == "identity" else "learned, warps"]
 
 
 def terms(state: PairState, wins: int, losses: int) -> dict[str, float]:

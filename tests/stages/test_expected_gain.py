@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from colmap_affrect.colmap.verification import connected_parts
-from colmap_affrect.recipes import EscalateOptions, Level, load_recipe
+from colmap_affrect.recipes import EscalateOptions, Level, load_recipe, recipe_names
 from colmap_affrect.stages.expected_gain import (
     ExpectedGain,
     PairState,
@@ -56,6 +56,13 @@ def test_what_hints_at_a_surface_makes_a_level_likelier_and_levels_differ(level:
     weak, strong = (gain.chance(terms(PairState(count), 0, 0)) for count in (15, 90))
     assert few < weak < strong
     assert sum(gain_of(other) == gain for other in LEVELS[1:]) == 1
+
+
+def test_levels_of_any_recipe_are_of_a_kind() -> None:
+    for name in recipe_names():
+        for rectifier in ("identity", "asift", "dense-shapes"):
+            for level in load_recipe(name, [f"rectifier={rectifier}"]).levels:
+                assert gain_of(level).image_s > 0.0
 
 
 def gains(
