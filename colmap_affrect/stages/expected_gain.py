@@ -135,11 +135,9 @@ class ExpectedGain:
         for pair, state in states.items():
             is_strong = state.num_inliers >= options.strong_num_inliers
             is_done = state.tried & others or (is_strong and self.loose.isdisjoint(pair))
-            is_alike = (state.level in self.unmeasured) != level.features.has_shapes
-            # Measured frames tell sides that look the same, so pairs that they verify stay theirs.
-            is_done |= bool(state.num_inliers) and not (is_alike or level.features.has_shapes)
             if not is_done and (tied := self._tied(pair)):
-                hint = state if is_alike else replace(state, num_inliers=0)
+                is_hint = not level.features.has_shapes or state.level not in self.unmeasured
+                hint = state if is_hint else replace(state, num_inliers=0)
                 known = terms(hint, wins, max(0, num_tried - wins))
                 found.append((gain.chance(known), tied, pair))
         found.sort(key=lambda item: (-item[0] * sum(value for _, value in item[1]), item[2]))

@@ -80,16 +80,11 @@ def without_matches(context: Context, name: str) -> list[tuple[str, str]]:
     return own
 
 
-def test_pairs_that_measured_frames_verify_stay_theirs(context: Context) -> None:
-    options = EscalateOptions(strong_num_inliers=1_000_000, max_seconds_per_image=1e9)
-    assert Escalation(context, options).next_work() is None
+def test_pairs_of_frames_that_were_not_measured_are_told(context: Context) -> None:
     assert unmeasured_pairs(context) == []
     own = without_matches(context, NAMES[3])
-    escalation = Escalation(context, options)
-    assert escalation.next_work() == (1, own)
-    escalation.match_at(own, 1)
+    escalation_of(context).match_at(own, 1)
     assert sorted(unmeasured_pairs(context)) == sorted(own)
-    assert escalation.next_work() is None
 
 
 def test_images_that_measured_frames_hold_need_no_others(context: Context) -> None:
