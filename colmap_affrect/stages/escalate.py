@@ -186,9 +186,7 @@ class Escalation:
         for pair, indices in matches.items():
             key = indices.tobytes()
             if pair not in known or known[pair][0] != key:
-                first, second = map(self.features.read_frames, pair)
-                rows, columns = indices.T
-                known[pair] = key, num_consistent_matches(first[rows], second[columns])
+                known[pair] = key, self._confirming(pair, indices)
         return {pair: known[pair][1] for pair in pairs}
 
     def next_work(self) -> tuple[int, list[Pair]] | None:
@@ -303,8 +301,12 @@ class Escalation:
         names, (first, second) = found.names, map(self.features.read_frames, found.names)
         if count := len(verifier.inliers(names, (first, second), found.indices)):
             return count, 0
-        rows, columns = found.indices.T
-        return 0, num_consistent_matches(first[rows], second[columns])
+        return 0, self._confirming(names, found.indices)
+
+    def _confirming(self, pair: Pair, indices: NDArray[np.integer]) -> int:
+        first, second = map(self.features.read_frames, pair)
+        rows, columns = indices.T
+        return num_consistent_matches(first[rows], second[columns])
 
 
 def _megapixels(size: tuple[int, int], limit_px: int) -> float:
