@@ -55,10 +55,10 @@ class SparseMapper(IncrementalMapper):
                 raise KeyboardInterrupt
             show(count)
 
-        if task.extend or len(graph.keypoints) >= LARGE:
-            if task.before:
-                search = self._search(task, graph, native, shown)
-                return _again(search, graph, task.before)
+        is_large = len(graph.keypoints) >= LARGE
+        if is_large and task.before:
+            best = _again(self._search(task, graph, native, shown), graph, task.before)
+        elif is_large or task.extend:
             found = super().map(task, output_path, random_seed, show)
             if found and graph.is_explained_by(found[0].reconstruction):
                 return found
@@ -168,7 +168,7 @@ def _again(search: Search, graph: PairGraph, before: MappedModel) -> list[Mapped
     joined = search.joined(graph, search.adjuster, [model], num_starts=1)
     for mapped in joined:
         grower.finish(mapped.reconstruction)
-    return [replace(mapped, moves=(*before.moves, AGAIN)) for mapped in joined]
+    return [replace(m, moves=tuple(dict.fromkeys((*before.moves, AGAIN)))) for m in joined]
 
 
 def _with_own_cameras(

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import cached_property
+from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.tables import rows_digest
@@ -303,7 +304,7 @@ class Escalation:
             return count, 0
         return 0, self._confirming(names, found.indices)
 
-    def _confirming(self, pair: Pair, indices: NDArray[np.integer]) -> int:
+    def _confirming(self, pair: Pair, indices: Any) -> int:
         first, second = map(self.features.read_frames, pair)
         rows, columns = indices.T
         return num_consistent_matches(first[rows], second[columns])
