@@ -5,14 +5,14 @@ once.
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.features.base import NetworkContext, NetworkOptions
 from colmap_affrect.geometry.arrays import Indices, Singles
-from colmap_affrect.options import Registry
+from colmap_affrect.options import Registry, within
 
 ROUNDING = np.float32(1e-6)  # similarities that near to 1 are equal: two copies have ratio 1
 
@@ -23,6 +23,9 @@ class MatcherOptions(NetworkOptions):
     filter_stationary_matches: bool = True
     """Leave out matches that do not move where those of other pairs do not either, and those from
     one such place to another: captions, frames of scans, watermarks."""
+    max_num_first: Annotated[int, within(0, 1_000_000)] = 0
+    """Features of the largest responses that are matched first; 0: all at once. All follow for the
+    pairs of images that these do not tie well."""
 
     def require_extractor(self, extractor: str) -> None:
         """Raise OptionError for a kind of features that cannot be matched; an empty one passes."""

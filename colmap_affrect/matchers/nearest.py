@@ -45,6 +45,7 @@ class NearestOptions(MatcherOptions):
     """The second neighbour must be this far from the first (FGINN; MODS: 10-30 px)."""
     duplicate_radius_px: Annotated[float, within(0.01, 1000.0)] = 2.0
     """Of matches closer than this at both ends the best one stays."""
+    max_num_first: Annotated[int, within(0, 1_000_000)] = 8192
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ class PairMatches:
     scores: Singles  # (M,) float32 in [0, 1], larger is better
     num_keypoints1: int  # number of features of the first image
     level: int = 0  # of escalation, whose features were looked at together with those of level 0
+    of_some: bool = False  # only of the features with the largest responses
 
 
 @lru_cache(maxsize=8)
@@ -253,6 +254,7 @@ class MatchStore(GroupStore):
                 key = pair_key(*pair.names)
                 before = int(file[key].attrs["tried"]) if is_complete(file, key) else 0
                 known = {"level": pair.level, "tried": before | 1 << pair.level}
+                known["of_some"] = pair.of_some
                 self._write(file, key, hloc_matches(pair), **known)
             for names in tried:
                 file[pair_key(*names)].attrs["tried"] |= 1 << tried_level
@@ -287,6 +289,16 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             there = (is_complete(file, pair_key(*pair)) for pair in pairs)
             return np.fromiter(there, np.bool_, len(pairs))
+
+    def nums_of_some(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+        """Return the number of matches of the pairs for which some features were matched."""
+        found = dict[tuple[str, str], int]()
+        with self._open("r") as file:
+            for pair in pairs:
+                group = file[pair_key(*pair)]
+                if group.attrs["of_some"]:
+                    found[pair] = int(np.count_nonzero(checked(group, "matches0") >= 0))
+        return found
 
     def num_pairs(self) -> int:
         """Return the number of pairs that are there, without a look at each."""

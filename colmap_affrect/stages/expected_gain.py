@@ -8,7 +8,7 @@ poses are known.
 
 import json
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Set
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -109,14 +109,22 @@ class ExpectedGain:
     def _part_of(self) -> dict[str, int]:
         return {name: number for number, part in enumerate(self._parts) for name in part}
 
+    @cached_property
+    def _num_verified(self) -> Counter[str]:
+        verified = (pair for pair, state in self.states.items() if state.num_inliers)
+        return Counter(name for pair in verified for name in pair)
+
     def _tied(self, pair: Pair) -> list[tuple[str | int, float]]:
         """Return what would be tied by a pair, images or a part, and how many images that saves.
 
-        What is apart from the largest part must be joined to others before all.
+        What is apart from the largest part must be joined to others before all. Where n verified
+        pairs did not save an image, another one does with 1 / (n + 1), about.
         """
         first, second = (self._part_of[name] for name in pair)
         if first == second:
-            return [(n, self.needs[n]) for n in pair if n in self.needs] if first == 0 else []
+            num = self._num_verified
+            needy = [name for name in pair if name in self.needs] if first == 0 else []
+            return [(name, self.needs[name] / (1 + num[name])) for name in needy]
         smaller = max(first, second)  # parts come by size
         need = sum(self.needs.get(name, 0.0) for name in self._parts[smaller])
         return [(smaller, need)] if need else []

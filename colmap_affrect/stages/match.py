@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from colmap_affrect.pairs.lists import Pair, PairList, ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import FINISHED, FeatureStore, PairMatches
+from colmap_affrect.project.stores import FINISHED, FeatureStore, MatchStore, PairMatches
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.stages.context import Context, Resources, require_same_files
 from colmap_affrect.stages.extract import write_images_and_keypoints
@@ -38,6 +39,9 @@ logger = logging.getLogger(__name__)
 
 PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
+
+MANY_MATCHES = 300  # of the features matched first: photographs of different things have up to 76
+NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
 IMAGES_IN_MEMORY = 40  # of 13,000 features
@@ -74,7 +78,10 @@ def match(
     if missing:
         matches.keep_note(FINISHED, None)
     with context.progress.stage("match", len(missing), "pairs") as advance:
-        match_pairs(context, missing, options, advance)
+        match_pairs(context, missing, options, advance, options.max_num_first)
+    loose = [] if is_finished else not_well_tied(context.matches, pairs)
+    with context.progress.stage("match, all features", len(loose), "pairs") as advance:
+        match_pairs(context, loose, options, advance)
     warnings = {}
     if pairs and (missing or finished is None):
         is_asked = options.filter_stationary_matches
@@ -106,11 +113,31 @@ def load_matchers(
 
 
 def match_pairs(
-    context: Context, pairs: Sequence[Pair], options: MatcherOptions, advance: Callable[[int], None]
+    context: Context,
+    pairs: Sequence[Pair],
+    options: MatcherOptions,
+    advance: Callable[[int], None],
+    max_num: int = 0,
 ) -> None:
-    """Match pairs by the features that every image has, and store them batch by batch."""
-    with closing(matched_at_level(context, pairs, options, 0)) as found_pairs:
+    """Match pairs by the features that every image has, and store them batch by batch.
+
+    ``max_num``: those of the largest responses; 0: all.
+    """
+    with closing(matched_at_level(context, pairs, options, 0, max_num)) as found_pairs:
         write_batches(found_pairs, context.matches.write, advance)
+
+
+def not_well_tied(matches: MatchStore, pairs: Sequence[Pair]) -> list[Pair]:
+    """Return the pairs whose remaining features are wanted, where some were matched.
+
+    That is, all but those with many matches already, and those of two images that each have several
+    such pairs.
+    """
+    nums = matches.nums_of_some(pairs)
+    many = {pair for pair, num in nums.items() if num >= MANY_MATCHES}
+    count = Counter(name for pair in many for name in pair)
+    well_tied = {name for name, num in count.items() if num >= NUM_WELL_TIED}
+    return [pair for pair in nums if pair not in many and not well_tied.issuperset(pair)]
 
 
 def write_batches(
@@ -132,7 +159,7 @@ def write_batches(
 
 
 def matched_at_level(
-    context: Context, pairs: Sequence[Pair], options: MatcherOptions, level: int
+    context: Context, pairs: Sequence[Pair], options: MatcherOptions, level: int, max_num: int = 0
 ) -> Generator[PairMatches, None, None]:
     """Match pairs by the features of a level, and leave out what never moves.
 
@@ -140,7 +167,8 @@ def matched_at_level(
     """
     features, chosen = context.features, context.extraction.levels[level]
     options, extractor = chosen.matching or options, chosen.features.name
-    matching = Matching(features, options, level, chosen.base, extractor, context.resources)
+    resources = context.resources
+    matching = Matching(features, options, level, chosen.base, extractor, resources, max_num)
     stationary = StationaryFilter(features, context.matches)
     with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
         for found in found_pairs:
@@ -180,6 +208,7 @@ class Matching:
     base: int = 0  # level that has the features of the images themselves
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
+    max_num_features: int = 0  # of each image, those of the largest responses; 0: all
     num_similarities: float = 0  # about how many pairs of features there will be to compare
     num_kept: int = IMAGES_IN_MEMORY
 
@@ -196,6 +225,8 @@ def iterate_matches(
         return
     executor = executor or Threads(available_cores())
     counts = matching.store.num_keypoints()
+    if limit := matching.max_num_features:
+        counts = {name: min(count, limit) for name, count in counts.items()}
     num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
     known = replace(matching, num_similarities=num_similarities, num_kept=max(2, num_kept))
@@ -211,6 +242,8 @@ class PreparedImage:
     content: Any  # what the matcher made of it
     frames: Floats  # (N, 2, 3) local affine frames in pixel-centre px
     indices: Indices  # (N,) int64 that its features have in the store
+    end: int  # of the indices of all that could be matched
+    is_part: bool  # there are more
 
 
 class CachedMatcher:
@@ -237,8 +270,9 @@ class CachedMatcher:
         found = self.match(first, second)
         rows, columns = found.indices.T
         indices = np.stack([first.indices[rows], second.indices[columns]], axis=1)
-        count = int(first.indices.max(initial=-1)) + 1
-        return PairMatches(names, indices, found.scores, count, self._matching.level)
+        is_of_some = first.is_part or second.is_part
+        level = self._matching.level
+        return PairMatches(names, indices, found.scores, first.end, level, is_of_some)
 
     def match(self, first: PreparedImage, second: PreparedImage) -> Matches:
         """Match two images; indices are those among the features that were prepared."""
@@ -252,6 +286,16 @@ class CachedMatcher:
     def _prepare(self, name: str) -> PreparedImage:
         matching, store = self._matching, self._matching.store
         indices = store.level_indices(name, matching.level, matching.base)
-        features = store.read(name).select(indices)
+        end, limit, everything = (
+            int(indices.max(initial=-1)) + 1,
+            matching.max_num_features,
+            store.read(name),
+        )
+        is_part = 0 < limit < len(indices)
+        if is_part:
+            order = np.argsort(-everything.responses[indices], kind="stable")
+            indices = np.sort(indices[order[:limit]])
+        features = everything.select(indices)
         image = ImageFeatures(features, store.image_size(name), matching.extractor)
-        return PreparedImage(self._matcher.prepare(image), features.lafs, indices)
+        content = self._matcher.prepare(image)
+        return PreparedImage(content, features.lafs, indices, end, is_part)

@@ -142,3 +142,15 @@ def test_a_level_that_verified_nothing_is_less_likely_to() -> None:
     fresh = gain_of(COVERS).chance(terms(PairState(0, 3), 0, 0))
     assert gain_of(COVERS).chance(terms(PairState(0, 3), 0, 5)) < 0.5 * fresh
     assert gain_of(COVERS).chance(terms(PairState(0, 3), 5, 0)) > fresh
+
+
+def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_another() -> None:
+    def rate(inliers: dict[str, int]) -> float:
+        pairs = gains({"ab": 200, "bc": 200, **inliers}, {"d": 1.0}, {"ad": 5})
+        return pairs.best_pairs(1, COVERS, 0b10, PATIENT)[0]
+
+    lost, tied, tied_twice = (
+        {"ad": 0} | more for more in ({}, {"bd": 200}, {"bd": 200, "cd": 200})
+    )
+    assert rate(tied) == pytest.approx(rate(lost) / 2)
+    assert rate(tied_twice) == pytest.approx(rate(lost) / 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,15 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 from colmap_affrect.stages import match as stage
-from colmap_affrect.stages.match import CachedMatcher, Matching, iterate_matches
+from colmap_affrect.stages.match import (
+    MANY_MATCHES,
+    CachedMatcher,
+    Matching,
+    iterate_matches,
+    not_well_tied,
+)
 
 NAMES = [f"{index}.png" for index in range(6)]
 NUM_FEATURES = 50
@@ -58,3 +65,39 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
     monkeypatch.setattr(stage, "CACHE_BYTES", 5 * stage.BYTES_PER_FEATURE * NUM_FEATURES)
     assert matches(store) == expected
     assert len(NAMES) < len(reads) <= 3 * len(NAMES)
+
+
+def test_the_strongest_features_are_matched_first(store: FeatureStore) -> None:
+    features = store.read(NAMES[0])
+    responses = np.roll(np.arange(1.0, NUM_FEATURES + 1), 7).astype(np.float32)
+    store.write(NAMES[0], replace(features, responses=responses), store.image_size(NAMES[0]))
+    pair = (NAMES[0], NAMES[1])
+    (every,) = iterate_matches([pair], Matching(store, NearestOptions()))
+    (some,) = iterate_matches([pair], Matching(store, NearestOptions(), max_num_features=30))
+    strongest = np.argsort(-responses)[:30]
+    assert (every.of_some, some.of_some) == (False, True)
+    assert len(some.indices) > 5
+    assert set(some.indices[:, 0]) <= set(strongest)
+    assert set(every.indices[:, 0]) - set(strongest)
+    assert some.num_keypoints1 == every.num_keypoints1 == NUM_FEATURES
+
+
+def test_all_features_are_matched_where_the_strongest_do_not_tie_both_images(
+    tmp_path: Path,
+) -> None:
+    """Images a and b have three pairs with many matches, c, d and e two, then c and e three."""
+
+    def pair(names: str, num: int, *, of_some: bool = True) -> PairMatches:
+        indices = np.stack([np.arange(num)] * 2, axis=1)
+        scores = np.ones(num, np.float32)
+        return PairMatches((names[0], names[1]), indices, scores, num, of_some=of_some)
+
+    store = MatchStore(tmp_path / "matches.h5")
+    many = [pair(names, MANY_MATCHES) for names in ("ab", "ac", "ad", "bc", "bd", "eb", "ea")]
+    few = [pair(names, MANY_MATCHES - 1) for names in ("cd", "ce", "fa")]
+    known = [pair("ga", 5, of_some=False)]
+    store.write([*many, *few, *known])
+    pairs = [found.names for found in (*many, *few, *known)]
+    assert not_well_tied(store, pairs) == [("c", "d"), ("c", "e"), ("f", "a")]
+    store.write([pair("ec", MANY_MATCHES), pair("cd", 9, of_some=False)])
+    assert not_well_tied(store, [*pairs, ("e", "c")]) == [("f", "a")]
