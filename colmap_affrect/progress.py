@@ -1,6 +1,7 @@
 """Progress of long stages, a tqdm bar, plain lines or silence, and how long a whole run takes."""
 
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -112,7 +113,7 @@ class Progress:
         if stream is None or total == 0:
             yield lambda _: None
         elif stream.isatty():
-            with tqdm(total=total, desc=title, unit=unit, file=stream) as bar:
+            with tqdm(total=total, desc=title, unit=unit, file=stream) as bar, _ticking(bar):
 
                 def advance(count: int) -> None:
                     bar.set_postfix_str(left(count), refresh=False)
@@ -123,6 +124,24 @@ class Progress:
             yield advance_lines
             if not num_lines:
                 print_line("")
+
+
+@contextmanager
+def _ticking(bar: tqdm) -> Iterator[None]:
+    """Show each second how long a bar has run: one unit may take a minute."""
+    is_over = threading.Event()
+
+    def tick() -> None:
+        while not is_over.wait(1.0):
+            bar.refresh()
+
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
 
 
 SILENT = Progress()

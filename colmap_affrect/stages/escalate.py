@@ -28,6 +28,7 @@ from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import STEP, PairMatches
 from colmap_affrect.recipes import EscalateOptions
@@ -109,6 +110,7 @@ class Escalation:
         self.path = context.workspace.database
         self.levels = context.resources.usable_levels(self.extraction)[1:]
         self.is_measured = [level.features.has_shapes for level in self.extraction.levels]
+        self.left_s = 0.0  # nominal, if nothing helps any more
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
 
     @cached_property
@@ -204,6 +206,7 @@ class Escalation:
         if not (needs := self.needs(model)):
             return None
         states, loose, best = self.states(), self._loose(), (0.0, 0, list[Pair]())
+        self.left_s = 0.0
         held = self._held(model, states)
         ranges = {name: self.features.level_ranges(name) for name in sizes}
         for number in self.levels:
@@ -217,7 +220,9 @@ class Escalation:
                 [k for k, is_measured in enumerate(self.is_measured) if not is_measured],
                 {name for name in sizes if number not in ranges[name]},
             )
-            rate, pairs = gain.best_pairs(number, level, self._at_least(number), self.options)
+            others = self._at_least(number)
+            rate, pairs, seconds = gain.best_pairs(number, level, others, self.options)
+            self.left_s += seconds / available_cores()
             best = max(best, (rate, number, pairs), key=lambda found: found[0])
         return best[1:] if best[0] else None
 
@@ -237,7 +242,9 @@ class Escalation:
         needed = sorted({self.extraction.levels[level].base, level})
         there = {name: self.features.level_ranges(name) for name in images}
         missing = [(name, k) for name in images for k in needed if k not in there[name]]
-        title, total = f"escalate, {self.extraction.levels[level].name}", len(missing) + len(pairs)
+        left = f" (at most about {self.left_s / 60:.0f} min)" if self.left_s >= 60 else ""
+        title = f"escalate, {self.extraction.levels[level].name}{left}"
+        total = len(missing) + len(pairs)
         with self.context.progress.stage(title, total, "steps") as advance:
             self._extend(missing, advance)
             if pairs:

@@ -131,8 +131,8 @@ class ExpectedGain:
 
     def best_pairs(
         self, number: int, level: Level, others: int, options: EscalateOptions
-    ) -> tuple[float, list[Pair]]:
-        """Return images saved by second, and the pairs that are worth a level.
+    ) -> tuple[float, list[Pair], float]:
+        """Return images saved by second, pairs for a level now, and seconds of all worth it.
 
         ``others``: bits of the levels that make this one needless.
         """
@@ -151,14 +151,17 @@ class ExpectedGain:
         found.sort(key=lambda item: (-item[0] * sum(value for _, value in item[1]), item[2]))
         left: defaultdict[str | int, float] = defaultdict(lambda: 1.0)  # chance of being lost still
         chosen, there = list[Pair](), set[str]()
-        best = saved = spent_s = 0.0
+        best = saved = spent_s = all_s = 0.0
         for chance, tied, pair in found:
             lacking = [name for name in pair if name in self.lacking and name not in there]
             seconds = gain.image_s * sum(self.megapixels[name] for name in lacking)
             seconds += gain.pair_s * max(self.megapixels[name] for name in pair)
             brought = chance * sum(value * left[key] for key, value in tied)
             rate = brought / seconds
-            if rate * options.max_seconds_per_image < 1.0 or rate < SHARE_OF_BEST * best:
+            if rate * options.max_seconds_per_image < 1.0:
+                continue
+            all_s += seconds
+            if rate < SHARE_OF_BEST * best:
                 continue
             best = max(best, rate)
             chosen.append(pair)
@@ -166,7 +169,7 @@ class ExpectedGain:
             saved, spent_s = saved + brought, spent_s + seconds
             for key, _ in tied:
                 left[key] *= 1.0 - chance
-        return (saved / spent_s if chosen else 0.0), chosen
+        return (saved / spent_s if chosen else 0.0), chosen, all_s
 
 
 def insecure_images(

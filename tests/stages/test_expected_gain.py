@@ -87,7 +87,7 @@ def gains(
 def chosen(
     found: ExpectedGain, options: EscalateOptions = PATIENT, level: Level = COVERS
 ) -> list[str]:
-    _, pairs = found.best_pairs(1, level, 0b10, options)
+    _, pairs, _ = found.best_pairs(1, level, 0b10, options)
     return ["".join(pair) for pair in pairs]
 
 
@@ -104,7 +104,8 @@ def test_pairs_of_images_in_need_come_by_what_hints_at_a_surface() -> None:
 
 def test_nothing_is_worth_more_than_it_costs() -> None:
     pairs, hints = gains(INLIERS, {"d": 1.0}, {"bd": 8}), {"bd": 8}
-    rate, (best,) = pairs.best_pairs(1, COVERS, 0b10, PATIENT)
+    rate, (best,), seconds = pairs.best_pairs(1, COVERS, 0b10, PATIENT)
+    assert seconds >= gain_of(COVERS).pair_s
     assert best == ("b", "d")
     just, below = (EscalateOptions(max_seconds_per_image=f / rate) for f in (1.01, 0.99))
     assert chosen(pairs, just) == ["bd"]
