@@ -58,12 +58,17 @@ def _known() -> dict[str, LevelGain]:
     return {kind: LevelGain(**values) for kind, values in content.items()}
 
 
-def gain_of(level: Level) -> LevelGain:
-    """Return what a level brings and costs: by whether its frames are measured, and its warps."""
+def kind_of(level: Level) -> str:
+    """Return the kind of a level: whether its frames are measured, and its warps."""
     warps = level.rectifier.name
     if level.features.has_shapes:
-        return _known()["measured, all tilts" if warps == "asift" else "measured, warps"]
-    return _known()["learned" if warps == "identity" else "learned, warps"]
+        return "measured, all tilts" if warps == "asift" else "measured, warps"
+    return "learned" if warps == "identity" else "learned, warps"
+
+
+def gain_of(level: Level) -> LevelGain:
+    """Return what a level brings and costs."""
+    return _known()[kind_of(level)]
 
 
 def terms(state: PairState, wins: int, losses: int) -> dict[str, float]:
