@@ -27,18 +27,16 @@ def write_random_weights(folder: Path) -> dict[str, Path]:
         "affnet": randomized(feature.LAFAffNetShapeEstimator(pretrained=False), 1),
         "orinet": randomized(feature.OriNet(pretrained=False), 2, gain=2.0),
         "hardnet": randomized(feature.HardNet(pretrained=False), 3),
-        "aliked-n16": randomized(feature.ALIKED(), 4),
+        "aliked-n16": randomized(feature.ALIKED(), 4, gain=3.0),
     }
     for name, network in networks.items():
         torch.save({"state_dict": network.state_dict()}, folder / name)
     return {name: folder / name for name in networks}
 
 
-def write_comparing_lightglue(
-    path: Path, kornia_features: str = "sift", sharpness: float = 40.0
-) -> Path:
+def write_comparing_lightglue(path: Path, sharpness: float = 40.0) -> Path:
     """Write a LightGlue whose layers change nothing: it compares the descriptors it is given."""
-    conf = feature.LightGlue.features[kornia_features]
+    conf = feature.LightGlue.features["aliked"]
     network = feature.LightGlue(features=None, **{**conf, "weights": None})
     state = {name: torch.zeros_like(value) for name, value in network.state_dict().items()}
     for name, value in state.items():

@@ -19,7 +19,7 @@ NAMES = [
     "affnet-shapes", "aliked-lightglue", "asift", "asift-recommended", "default", "dense-affnet",
     "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended", "depth-planes",
     "depth-planes-recommended", "on-demand", "rectified", "second-moment-shapes",
-    "sift-lightglue", "unrectified", "unrectified-rootsift",
+    "unrectified", "unrectified-rootsift",
 ]  # fmt: skip
 
 OF_THE_PAPER = {
@@ -65,11 +65,11 @@ def test_levels_build_on_the_lowest_one_with_their_features() -> None:
     assert load_recipe("on-demand").extraction.levels[3].base == 0
 
 
-def test_matcher_must_be_trained_for_the_features() -> None:
+def test_matcher_must_take_the_features() -> None:
     with pytest.raises(OptionError) as error:
         load_recipe("default", ["matching=lightglue"])
     assert str(error.value).endswith(
-        "'aliked' takes features of aliked, not of rootsift; use --recipe aliked-lightglue"
+        "lightglue takes features of aliked, not of rootsift; use --recipe aliked-lightglue"
     )
 
 

@@ -37,8 +37,8 @@ class AlikedOptions(FeatureOptions):
     has_shapes: ClassVar[bool] = False
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of one view, by response, as its authors match them."""
-    model: Literal["n16", "n16rot", "n32"] = "n16"
-    """``n16rot`` was trained with rotated images, ``n32`` looks at twice as many places."""
+    model: Literal["n16", "n16rot"] = "n16"
+    """``n16rot`` was trained with rotated images."""
     score_threshold: Annotated[float, within(0.001, 1.0)] = 0.2
     """Least score; where nothing has it, all maxima above the mean score of the view stay."""
 
@@ -51,7 +51,7 @@ class AlikedOptions(FeatureOptions):
 class Aliked(FeatureExtractor):
     """ALIKED: maxima of a score map to parts of a pixel, descriptors from places round them.
 
-    ``n16`` and ``n32`` find points where they are; ``n16rot`` up to 1 px below, by what there is.
+    ``n16`` finds points where they are, ``n16rot`` up to 1 px below, by what there is.
     """
 
     Options = AlikedOptions

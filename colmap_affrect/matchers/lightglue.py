@@ -14,16 +14,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import load_state_dict, unusable
-from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Indices, Singles
-from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.geometry.tilts import of_unit_area
 from colmap_affrect.matchers.base import (
@@ -39,32 +37,14 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 MIN_VIEW_FEATURES = 8  # of a view: no geometry could be verified by what fewer add
-TRAINING_SIZE_PX = 1024  # longer side in training, whose pixels scales of features are in
 CHUNK_ROWS = 1 << 10  # features whose similarities are held at once, which bounds memory
 DUPLICATE_RADIUS_PX = 2.0  # of nearer matches of several views, at both ends, the best stays
 
 
-class Training(NamedTuple):
-    """What weights were trained for."""
-
-    weights: str  # key of the file
-    kind: str  # of the features that they take
-    recipe: str  # with such features
-    has_circles: bool = True  # whether frames are circles of one radius in the view, upright
-
-
-TRAININGS = {
-    "aliked": Training("lightglue-aliked", "aliked", "aliked-lightglue"),
-    "sift": Training("lightglue-sift", "rootsift", "sift-lightglue", False),
-}
-
-
 class LightGlueOptions(MatcherOptions):
-    """LightGlue; defaults are those of its authors."""
+    """LightGlue for features ``aliked``; defaults are those of its authors."""
 
     name: Literal["lightglue"] = "lightglue"
-    trained_for: Literal["aliked", "sift"] = "aliked"
-    """Features that the weights were trained for."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of each view that are matched, those of the largest responses."""
     depth_confidence: Annotated[float, within(0.0, 1.0)] = 0.95
@@ -80,15 +60,14 @@ class LightGlueOptions(MatcherOptions):
     @property
     def weights(self) -> tuple[str, ...]:
         """Key of the file of weights."""
-        return (TRAININGS[self.trained_for].weights,)
+        return ("lightglue-aliked",)
 
     def require_extractor(self, extractor: str) -> None:
         """Refuse features that the weights were not trained for."""
-        training = TRAININGS[self.trained_for]
-        if extractor not in ("", training.kind):
+        if extractor not in ("", "aliked"):
             raise OptionError(
-                f"matching: trained_for={self.trained_for!r} takes features of {training.kind}, "
-                f"not of {extractor}; use --recipe {training.recipe}"
+                f"matching: lightglue takes features of aliked, not of {extractor}; "
+                "use --recipe aliked-lightglue"
             )
 
 
@@ -127,10 +106,9 @@ class LightGlue:
         """Load the network; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import resolve_device
 
-        self.options, self.training = options, TRAININGS[options.trained_for]
-        self._device = resolve_device(context.device)
-        path = context.weights[self.training.weights]
-        self._network = load_network(path, options).to(self._device)
+        self.options, self._device = options, resolve_device(context.device)
+        (key,) = options.weights
+        self._network = load_network(context.weights[key], options).to(self._device)
         self._gpu_lock = threading.Lock()
 
     def prepare(self, image: ImageFeatures) -> PreparedViews:
@@ -144,20 +122,9 @@ class LightGlue:
                 continue
             order = np.argsort(-features.responses[rows], kind="stable")
             rows = np.sort(rows[order[: self.options.max_num_features]])
-            views.append(PreparedView(rows, self._inputs(features.select(rows), image.image_size)))
+            inputs = network_inputs(features.select(rows), image.image_size)
+            views.append(PreparedView(rows, inputs))
         return PreparedViews(tuple(views), features.keypoints)
-
-    def _inputs(self, features: LocalFeatures, image_size: tuple[int, int]) -> dict[str, Tensor]:
-        import torch
-
-        lafs, size = features.lafs, np.asarray(image_size, np.float64)
-        if features.rectification_ids[0]:
-            lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
-        values = network_inputs(lafs, size, max(image_size), self.options.trained_for)
-        return {
-            name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
-            for name, array in (*values.items(), ("descriptors", features.descriptors))
-        }
 
     def match(self, first: PreparedViews, second: PreparedViews) -> Matches:
         """Match two images; scores are the network's."""
@@ -204,7 +171,7 @@ def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
     from kornia.feature import LightGlue as Network
 
     configuration = {
-        **Network.features[options.trained_for],
+        **Network.features["aliked"],
         "weights": None,
         "depth_confidence": options.depth_confidence,
         "width_confidence": options.width_confidence,
@@ -212,7 +179,7 @@ def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
     }
     network = Network(features=None, **configuration)  # type: ignore[arg-type]
     state = {renamed(name): value for name, value in load_state_dict(path).items()}
-    not_these = f"not the weights of LightGlue for {options.trained_for}"
+    not_these = "not the weights of LightGlue for ALIKED"
     try:
         found = network.load_state_dict(state, strict=False)
     except RuntimeError as error:
@@ -232,40 +199,31 @@ def renamed(name: str) -> str:
     return re.sub(r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1.", name)
 
 
-def frames_of_view(lafs: Array, *, has_circles: bool) -> tuple[Array, Array]:
+def network_inputs(features: LocalFeatures, image_size: tuple[int, int]) -> dict[str, Tensor]:
+    """Return what the network reads of a view, in pixel-centre px as in training."""
+    import torch
+
+    points, size = features.keypoints, np.asarray(image_size, np.float64)
+    if features.rectification_ids[0]:
+        points, size = points_of_view(features.lafs)
+    values = {"keypoints": np.clip(points, 0.0, size), "image_size": size}
+    return {
+        name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
+        for name, array in (*values.items(), ("descriptors", features.descriptors))
+    }
+
+
+def points_of_view(lafs: Array) -> tuple[Array, Array]:
     """Undo the warp of a view, whose frames were carried back into the image.
 
-    Circles became the linear part of the warp; other frames give it up to a rotation, of which none
-    is assumed. Returns (N, 2, 3) frames in px of the view, and its (width, height): as far as they
-    reach.
+    Circles of one radius became the linear part of the warp. Returns (N, 2) points in px of the
+    view, and its (width, height): as far as they reach.
     """
     shapes = of_unit_area(lafs[:, :, :2])
-    if has_circles:
-        linear = shapes.mean(axis=0)
-    else:
-        values, vectors = np.linalg.eigh((shapes @ shapes.transpose(0, 2, 1)).mean(axis=0))
-        linear = vectors * np.sqrt(values) @ vectors.T
-    linear = linear / np.sqrt(determinants(linear))
-    frames = np.linalg.inv(linear) @ lafs
-    low, high = frames[:, :, 2].min(axis=0), frames[:, :, 2].max(axis=0)
-    frames[:, :, 2] -= low
-    return frames, high - low + 1.0
-
-
-def network_inputs(
-    lafs: Array, size: Array, longer_side_px: int, trained_for: str
-) -> dict[str, Array]:
-    """Return what the network reads of (N, 2, 3) frames in a view of (width, height).
-
-    Pixel-centre px, as in training. Scales are those of images of ``TRAINING_SIZE_PX``, of which
-    only larger ones were shrunk; orientations are COLMAP's.
-    """
-    values = {"keypoints": np.clip(lafs[:, :, 2], 0.0, size), "image_size": size}
-    if trained_for != "sift":
-        return values
-    sigmas = np.sqrt(determinants(lafs[:, :, :2])) / MEASUREMENT_SIGMAS
-    sigmas = sigmas * min(1.0, TRAINING_SIZE_PX / longer_side_px)
-    return values | {"scales": sigmas, "oris": np.arctan2(lafs[:, 1, 0], lafs[:, 0, 0])}
+    (linear,) = of_unit_area(shapes.mean(axis=0, keepdims=True))
+    points = (np.linalg.inv(linear) @ lafs)[:, :, 2]
+    low, high = points.min(axis=0), points.max(axis=0)
+    return points - low, high - low + 1.0
 
 
 def promising(

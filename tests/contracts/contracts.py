@@ -109,7 +109,7 @@ class ExtractorContract(Contract):
         assert_array_equal(again[0].descriptors, together[0].descriptors)
 
 
-def image_of(things: np.ndarray, seed: int, extractor: str = "rootsift") -> ImageFeatures:
+def image_of(things: np.ndarray, seed: int) -> ImageFeatures:
     """Features that show some things, their descriptors a bit otherwise in every image."""
     random = np.random.default_rng(seed)
     rows = things + 0.02 * random.random(things.shape)
@@ -118,7 +118,7 @@ def image_of(things: np.ndarray, seed: int, extractor: str = "rootsift") -> Imag
     centers = random.uniform((10.0, 20.0), (400.0, 280.0), (count, 2))
     lafs = lafs_from_keypoints(centers, random.uniform(3, 9, count), np.zeros(count))
     scores = random.random(count).astype(np.float32) + np.float32(0.1)
-    return ImageFeatures(LocalFeatures(lafs, scores, rows), (420, 300), extractor)
+    return ImageFeatures(LocalFeatures(lafs, scores, rows), (420, 300), "")
 
 
 class MatcherContract(Contract):
@@ -145,7 +145,7 @@ class MatcherContract(Contract):
 
     def test_images_without_features_have_no_matches(self, things) -> None:
         matcher: Matcher = self.make()
-        empty = ImageFeatures(LocalFeatures.empty(128), (420, 300), "rootsift")
+        empty = ImageFeatures(LocalFeatures.empty(128), (420, 300), "")
         some, none = matcher.prepare(image_of(things, 2)), matcher.prepare(empty)
         for pair in ((some, none), (none, some), (none, none)):
             found = matcher.match(*pair)

@@ -49,14 +49,10 @@ class TestExtractors(ExtractorContract):
         return self.extractor
 
 
-MATCHER_CHOICES = {"lightglue": {"name": "lightglue", "trained_for": "sift"}}
-"""The contract's features are those of RootSIFT."""
-
-
 @pytest.fixture(scope="module")
 def comparing(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     path = tmp_path_factory.mktemp("weights") / "lightglue.pth"
-    return {"lightglue-sift": write_comparing_lightglue(path)}
+    return {"lightglue-aliked": write_comparing_lightglue(path)}
 
 
 @pytest.mark.parametrize("name", MATCHERS.names(), scope="class")
@@ -66,8 +62,7 @@ class TestMatchers(MatcherContract):
         self.name, self.comparing = name, comparing
 
     def make(self) -> Matcher:
-        options = MATCHERS.options(MATCHER_CHOICES.get(self.name, self.name))
-        return MATCHERS.make(options, MatcherContext(self.comparing))
+        return MATCHERS.make(MATCHERS.options(self.name), MatcherContext(self.comparing))
 
 
 class Corner:

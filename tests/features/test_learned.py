@@ -136,7 +136,7 @@ def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:
     broken = tmp_path / "broken"
     broken.write_bytes(weights["aliked-n16"].read_bytes()[:4000])
     for key, path, message in (
-        ("aliked-n32", weights["aliked-n16"], "not the weights of aliked-n32"),
+        ("aliked-n16", weights["hardnet"], "not the weights of aliked-n16"),
         ("aliked-n16", broken, "broken: "),
     ):
         with pytest.raises(AffrectError, match=message):

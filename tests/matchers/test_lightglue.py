@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -21,12 +22,11 @@ from colmap_affrect.geometry.affine import (
 )
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
 from colmap_affrect.matchers.lightglue import (
-    TRAININGS,
     LightGlue,
     LightGlueOptions,
-    frames_of_view,
     load_network,
     network_inputs,
+    points_of_view,
     united,
 )
 
@@ -53,7 +53,7 @@ def image(found: LocalFeatures, extractor: str = "aliked") -> ImageFeatures:
 @pytest.fixture(scope="module")
 def comparing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "lightglue.pth"
-    return write_comparing_lightglue(path, "aliked")
+    return write_comparing_lightglue(path)
 
 
 @pytest.fixture
@@ -67,52 +67,22 @@ def test_circles_of_a_warp_tell_where_they_were_in_it() -> None:
     warp[:2, 2] = (35.0, -20.0)
     found = features(50, 1)
     carried = transform_frames(np.linalg.inv(warp), found.lafs)
-    frames, size = frames_of_view(carried, has_circles=True)
+    points, size = points_of_view(carried)
     factor = 12.0 / np.sqrt(np.linalg.det(carried[0, :, :2]))
     low = found.keypoints.min(axis=0)
-    assert_allclose(factor * frames[:, :, 2], found.keypoints - low, atol=1e-9)
+    assert_allclose(factor * points, found.keypoints - low, atol=1e-9)
     assert_allclose(factor * (size - 1.0), found.keypoints.max(axis=0) - low, atol=1e-9)
-
-
-def test_turned_frames_of_a_warp_tell_where_they_were_up_to_a_rotation() -> None:
-    random = np.random.default_rng(3)
-    angles = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    lafs = lafs_from_keypoints(random.uniform(0, 500, (60, 2)), random.uniform(3, 20, 60), angles)
-    warp = np.eye(3)
-    warp[:2, :2] = compose_affine(3.0**-0.5, 0.4, 3.0, 0.7)
-    frames, _ = frames_of_view(transform_frames(np.linalg.inv(warp), lafs), has_circles=False)
-    assert_allclose(np.linalg.svd(frames[:, :, :2])[1].prod(axis=1) ** 0.5,
-                    np.sqrt(np.linalg.det(lafs[:, :, :2])), rtol=1e-6)  # fmt: skip
-    turned = frames[:, :, 2] - frames[0, :, 2]
-    expected = lafs[:, :, 2] - lafs[0, :, 2]
-    assert_allclose(np.linalg.norm(turned, axis=1), np.linalg.norm(expected, axis=1), rtol=1e-6)
-    cosines = (turned[1:] * expected[1:]).sum(axis=1)
-    crosses = turned[1:, 0] * expected[1:, 1] - turned[1:, 1] * expected[1:, 0]
-    assert np.ptp(np.arctan2(crosses, cosines)) < 1e-6
 
 
 def test_positions_are_those_of_pixel_centres_within_width_and_height() -> None:
     lafs = lafs_from_keypoints(np.array([[-0.4, 7.0], [899.4, 600.0]]), np.ones(2), np.zeros(2))
-    values = network_inputs(lafs, np.array([900.0, 600.0]), 900, "aliked")
-    assert set(values) == {"keypoints", "image_size"}
-    assert_allclose(values["keypoints"], [[0.0, 7.0], [899.4, 600.0]])
-    assert_allclose(values["image_size"], SIZE)
-
-
-def test_scales_and_orientations_are_those_of_training() -> None:
-    from kornia.feature import LightGlueMatcher
-    from kornia.feature.integrated import _lightglue_keypoint_scale_ori
-
-    assert LightGlueMatcher.known_modes
-    angles = np.array([0.2, 3.0, -2.5, 5.9])
-    lafs = lafs_from_keypoints(np.ones((4, 2)), np.array([6.0, 12.0, 18.0, 7.5]), angles)
-    size = np.array([512.0, 300.0])
-    scales, oris = _lightglue_keypoint_scale_ori(torch.from_numpy(lafs)[None], "sift")
-    values = network_inputs(lafs, size, 512, "sift")
-    assert_allclose(values["scales"], scales[0], rtol=1e-9)
-    assert_allclose(values["oris"], oris[0], rtol=1e-9)
-    shrunk = network_inputs(lafs, size, 4096, "sift")["scales"]
-    assert_allclose(shrunk, values["scales"] / 4.0)
+    found = replace(features(2, 1), lafs=lafs)
+    values = network_inputs(found, SIZE)
+    assert set(values) == {"keypoints", "image_size", "descriptors"}
+    assert_allclose(values["keypoints"][0], [[0.0, 7.0], [899.4, 600.0]], rtol=1e-6)
+    assert_array_equal(values["image_size"][0], SIZE)
+    of_warp = network_inputs(found.with_rectification_id(1), SIZE)
+    assert_allclose(of_warp["image_size"][0], [900.8, 594.0], rtol=1e-6)
 
 
 def test_strongest_features_are_matched_and_keep_their_indices(comparing: Path) -> None:
@@ -184,35 +154,23 @@ def test_threads_find_the_same(matcher: LightGlue) -> None:
         assert_array_equal(one.scores, other.scores)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("trained_for", TRAININGS)
-def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_path: Path) -> None:
-    training = TRAININGS[trained_for]
-    path = write_comparing_lightglue(tmp_path / "lightglue.pth", trained_for)
-    options = LightGlueOptions.from_mapping({"trained_for": trained_for}, "")
-    matcher = LightGlue(options, MatcherContext({training.weights: path}, "cpu"))
-    parts = [features(20, seed) for seed in (1, 2)]
-    parts[1] = parts[1].with_rectification_id(1)
-    views = matcher.prepare(image(union(parts), training.kind))
-    indices = matcher.match(views, views).indices
-    assert_array_equal(indices[:, 0], indices[:, 1])
-    assert set(indices[:, 0] // 20) == {0, 1}
-    assert len(indices) > 35
-
-
 def test_features_of_another_extractor_are_refused_in_one_line(matcher: LightGlue) -> None:
-    with pytest.raises(OptionError, match="'aliked' takes features of aliked, not of rootsift"):
+    with pytest.raises(OptionError, match="lightglue takes features of aliked, not of rootsift"):
         matcher.prepare(image(features(20, 1), "rootsift"))
     matcher.prepare(image(features(20, 1), ""))
 
 
-def test_weights_of_another_network_are_refused(comparing: Path, tmp_path: Path) -> None:
-    with pytest.raises(
-        AffrectError, match=r"lightglue\.pth: not the weights of LightGlue for sift"
-    ):
-        load_network(comparing, LightGlueOptions(trained_for="sift"))
+@pytest.mark.parametrize(
+    ("shape", "message"), [((32, 4), "(of another size)"), (None, "(no posenc.Wr.weight)")]
+)
+def test_weights_of_another_network_are_refused(
+    comparing: Path, tmp_path: Path, shape: tuple[int, int] | None, message: str
+) -> None:
     state = torch.load(comparing, weights_only=True)
     del state["posenc.Wr.weight"]
-    torch.save(state, tmp_path / "partial.pth")
-    with pytest.raises(AffrectError, match=r"partial\.pth: .*no posenc\.Wr\.weight"):
-        load_network(tmp_path / "partial.pth", LightGlueOptions())
+    if shape:
+        state["posenc.Wr.weight"] = torch.zeros(shape)
+    torch.save(state, tmp_path / "other.pth")
+    message = re.escape(f"other.pth: not the weights of LightGlue for ALIKED {message}")
+    with pytest.raises(AffrectError, match=message):
+        load_network(tmp_path / "other.pth", LightGlueOptions())

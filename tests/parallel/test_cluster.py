@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import pytest
 from local_cluster import local_cluster
-from random_weights import write_comparing_lightglue
+from random_weights import write_comparing_lightglue, write_random_weights
 from results import hdf5_content
 from small_scene import INTRINSICS, write_photographs
 
@@ -170,61 +170,62 @@ def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None
         require_environment(here)
 
 
-WITH_NETWORK = load_recipe("sift-lightglue", ["matching.max_num_features=120"])
+WITH_NETWORK = load_recipe("aliked-lightglue", ["matching.max_num_features=120"])
 
 
 @pytest.fixture(scope="module")
-def lightglue(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("weights")
-    write_comparing_lightglue(folder / "sift_lightglue.pth")
+    write_random_weights(folder)["aliked-n16"].rename(folder / "aliked-n16.pth")
+    write_comparing_lightglue(folder / "aliked_lightglue.pth", sharpness=1000.0)
     return folder
 
 
 @pytest.fixture(scope="module")
-def extracted(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def extracted(photos: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An output folder before matching."""
     out = tmp_path_factory.mktemp("out")
     with Workspace(out).locked() as workspace:
-        extract(Context(workspace), Inputs.of(photos), WITH_NETWORK)
+        extract(Context(workspace, Resources(weights, "cpu")), Inputs.of(photos), WITH_NETWORK)
         choose_pairs(Context(workspace))
     return out
 
 
 def matched(
-    out: Path, extracted: Path, lightglue: Path, executor: Executor
+    out: Path, extracted: Path, weights: Path, executor: Executor
 ) -> dict[str, tuple[str, bytes]]:
     """Match in a copy of the folder, or in the folder if it is there already."""
     if not out.exists():
         shutil.copytree(extracted, out)
     with Workspace(out).locked() as workspace:
-        match(Context(workspace, Resources(lightglue, "cpu"), executor))
+        match(Context(workspace, Resources(weights, "cpu"), executor))
     return hdf5_content(Workspace(out).matches)
 
 
 @pytest.mark.long
 def test_matches_of_other_weights_are_not_mixed(
-    tmp_path: Path, extracted: Path, lightglue: Path
+    tmp_path: Path, extracted: Path, weights: Path
 ) -> None:
-    matched(tmp_path / "out", extracted, lightglue, Threads(1))
+    matched(tmp_path / "out", extracted, weights, Threads(1))
     workspace = Workspace(tmp_path / "out")
-    assert list(workspace.recorded()["match"]["weights"]) == ["lightglue-sift"]
+    assert list(workspace.recorded()["match"]["weights"]) == ["lightglue-aliked"]
     assert Context(workspace).matching == WITH_NETWORK.matching
-    write_comparing_lightglue(tmp_path / "sift_lightglue.pth", sharpness=30.0)
+    write_comparing_lightglue(tmp_path / "aliked_lightglue.pth")
     with pytest.raises(StoreError, match="match stage was run there with weights"):
         matched(tmp_path / "out", extracted, tmp_path, Threads(1))
 
 
 @pytest.mark.long
 def test_threads_one_pair_alone_and_a_resumed_run_find_the_same(
-    tmp_path: Path, extracted: Path, lightglue: Path
+    tmp_path: Path, extracted: Path, weights: Path
 ) -> None:
-    expected = matched(tmp_path / "one", extracted, lightglue, Threads(1))
-    assert matched(tmp_path / "two", extracted, lightglue, Threads(2)) == expected
-    context = Context(Workspace(tmp_path / "one"), Resources(lightglue, "cpu"))
+    expected = matched(tmp_path / "one", extracted, weights, Threads(1))
+    assert matched(tmp_path / "two", extracted, weights, Threads(2)) == expected
+    context = Context(Workspace(tmp_path / "one"), Resources(weights, "cpu"))
     pairs = listed_pairs(context)
     assert sum(len(found.scores) for found in context.matches.read(pairs)) > 50
     matching = Matching(
-        context.features, WITH_NETWORK.matching, extractor="rootsift", resources=context.resources
+        context.features, WITH_NETWORK.matching, extractor="aliked", resources=context.resources
     )
     (alone,) = iterate_matches(pairs[3:4], matching, Threads(1))
     (stored,) = context.matches.read(pairs[3:4])
@@ -233,13 +234,13 @@ def test_threads_one_pair_alone_and_a_resumed_run_find_the_same(
     with h5py.File(context.workspace.matches, "a") as file:  # as if the run had been killed
         for key in list(file)[1:]:
             del file[key]
-    assert matched(tmp_path / "one", extracted, lightglue, Threads(2)) == expected
+    assert matched(tmp_path / "one", extracted, weights, Threads(2)) == expected
 
 
 @pytest.mark.long
 def test_cluster_finds_what_threads_find(
-    tmp_path: Path, extracted: Path, lightglue: Path, address: str
+    tmp_path: Path, extracted: Path, weights: Path, address: str
 ) -> None:
-    expected = matched(tmp_path / "local", extracted, lightglue, Threads(2))
+    expected = matched(tmp_path / "local", extracted, weights, Threads(2))
     with connected(address) as cluster:
-        assert matched(tmp_path / "cluster", extracted, lightglue, cluster) == expected
+        assert matched(tmp_path / "cluster", extracted, weights, cluster) == expected
