@@ -27,7 +27,7 @@ from colmap_affrect.evaluation.datasets import EvaluationPair, Pairs
 from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, published
 from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.features.weights import digests
-from colmap_affrect.geometry.arrays import Array, Floats, Indices
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.options import digest_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -54,19 +54,6 @@ class EvaluateOptions:
     max_num_keypoints: int | None = None  # of each image the strongest are matched; None: all
     scores: ScoreOptions = field(default_factory=ScoreOptions)
     resources: Resources = field(default_factory=Resources)
-
-
-class _StrongestFeatures(FeatureStore):
-    """Features of which the strongest of each image are matched."""
-
-    budget: int | None = None  # how many of each level; None for all
-
-    def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
-        indices = super().level_indices(name, level, base)
-        if self.budget is None:
-            return indices
-        order = np.argsort(-self.read(name).responses[indices], kind="stable")
-        return indices[np.sort(order[: self.budget])]
 
 
 class RecipeRun:
@@ -98,13 +85,12 @@ class RecipeRun:
         made = digest_of([inputs, extraction.to_mapping(), digests(self._extractor.weights)])
         features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
         features.parent.mkdir(parents=True, exist_ok=True)
-        self._store = _StrongestFeatures(features)
-        self._store.budget = options.max_num_keypoints
+        self._store, limit = FeatureStore(features), options.max_num_keypoints or 0
         self._matchings: dict[int, Matching] = {}
         for level in self._extractor.extractors:
             chosen = extraction.levels[level]
             of, kind = chosen.matching or matching, chosen.features.name
-            task = Matching(self._store, of, level, chosen.base, kind, resources)
+            task = Matching(self._store, of, level, chosen.base, kind, resources, limit)
             self._matchings[level] = task
         self.failures: dict[str, str] = {}  # images that could not be used in this run: why
         self._lock = Lock()  # of extraction and of the store
