@@ -219,6 +219,7 @@ class Escalation:
                 {name: _megapixels(size, level.max_image_size_px) for name, size in sizes.items()},
                 [k for k, is_measured in enumerate(self.is_measured) if not is_measured],
                 {name for name in sizes if number not in ranges[name]},
+                model.registered_names,
             )
             others = self._at_least(number)
             rate, pairs, seconds = gain.best_pairs(number, level, others, self.options)

@@ -96,6 +96,7 @@ class ExpectedGain:
         megapixels: of each image, as its features are extracted.
         unmeasured: levels whose frames are not measured.
         lacking: images without features of the level yet.
+        registered: images of the model before.
     """
 
     states: Mapping[Pair, PairState]
@@ -104,6 +105,7 @@ class ExpectedGain:
     megapixels: Mapping[str, float]
     unmeasured: Collection[int]
     lacking: Collection[str]
+    registered: Collection[str]
 
     @cached_property
     def _parts(self) -> list[set[str]]:
@@ -115,21 +117,22 @@ class ExpectedGain:
         return {name: number for number, part in enumerate(self._parts) for name in part}
 
     @cached_property
-    def _num_verified(self) -> Counter[str]:
-        verified = (pair for pair, state in self.states.items() if state.num_inliers)
-        return Counter(name for pair in verified for name in pair)
+    def _in_vain(self) -> Counter[str]:
+        """Count the verified pairs of each image with images of the model."""
+        verified = [pair for pair, state in self.states.items() if state.num_inliers]
+        both = [*verified, *(pair[::-1] for pair in verified)]
+        return Counter(name for name, other in both if other in self.registered)
 
     def _tied(self, pair: Pair) -> list[tuple[str | int, float]]:
         """Return what would be tied by a pair, images or a part, and how many images that saves.
 
         What is apart from the largest part must be joined to others before all. Where n verified
-        pairs did not save an image, another one does with 1 / (n + 1), about.
+        pairs with images of the model did not save one, another does with 1 / (n + 1), about.
         """
         first, second = (self._part_of[name] for name in pair)
         if first == second:
-            num = self._num_verified
             needy = [name for name in pair if name in self.needs] if first == 0 else []
-            return [(name, self.needs[name] / (1 + num[name])) for name in needy]
+            return [(name, self.needs[name] / (1 + self._in_vain[name])) for name in needy]
         smaller = max(first, second)  # parts come by size
         need = sum(self.needs.get(name, 0.0) for name in self._parts[smaller])
         return [(smaller, need)] if need else []

@@ -81,7 +81,8 @@ def gains(
     }
     sizes = dict.fromkeys("abcdef", 1.0)
     loose, lacking = set(given.get("loose", "")), set(given.get("lacking", ""))
-    return ExpectedGain(states, loose, needs, sizes, [2, 4], lacking)
+    registered = given.get("registered", "")
+    return ExpectedGain(states, loose, needs, sizes, [2, 4], lacking, registered)
 
 
 def chosen(
@@ -146,8 +147,9 @@ def test_a_level_that_verified_nothing_is_less_likely_to() -> None:
 
 
 def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_another() -> None:
-    def rate(inliers: dict[str, int]) -> float:
-        pairs = gains({"ab": 200, "bc": 200, **inliers}, {"d": 1.0}, {"ad": 5})
+    def rate(inliers: dict[str, int], registered: str = "abc") -> float:
+        all_inliers = {"ab": 200, "bc": 200, **inliers}
+        pairs = gains(all_inliers, {"d": 1.0}, {"ad": 5}, registered=registered)
         return pairs.best_pairs(1, COVERS, 0b10, PATIENT)[0]
 
     lost, tied, tied_twice = (
@@ -155,3 +157,4 @@ def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_anoth
     )
     assert rate(tied) == pytest.approx(rate(lost) / 2)
     assert rate(tied_twice) == pytest.approx(rate(lost) / 3)
+    assert rate(tied_twice, "ab") == pytest.approx(rate(lost) / 2)  # c is not in the model
