@@ -80,7 +80,7 @@ def test_stages_come_after_those_that_they_need(name: str) -> None:
         commands = re.findall(r"^colmap-affrect (\w+)", block, re.MULTILINE)
         stages = [command for command in commands if command in STAGES]
         if stages[:1] == ["extract"]:
-            assert stages == list(STAGES[1 : len(stages) + 1]), block
+            assert stages == [stage for stage in STAGES if stage in COMMANDS][: len(stages)], block
 
 
 @each_page

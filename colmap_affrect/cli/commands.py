@@ -34,10 +34,8 @@ from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
-from colmap_affrect.stages.escalate import escalate as escalate_pairs
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.extract import write_descriptors
-from colmap_affrect.stages.guide import guide as guide_pairs
 from colmap_affrect.stages.match import match as match_pairs
 from colmap_affrect.stages.one_image import prepare
 from colmap_affrect.stages.pairs import choose_pairs
@@ -86,15 +84,9 @@ def stage(options: argparse.Namespace) -> None:
             case "pairs":
                 report = choose_pairs(at, given.over(at.pairing, options, "pairs"), **how)
             case "match":
-                report = match_pairs(at, given.changed(at.matching, options, "matching"), **how)
-            case "verify":
-                report = verify_matches(at, given.verification(options, at.verification), **how)
-            case "escalate":
-                report = escalate_pairs(
-                    at, given.changed(at.escalation, options, "escalate"), **how
-                )
+                report = match_pairs(at, given.matching(at.matching, options), **how)
             case _:
-                report = guide_pairs(at, given.changed(at.guiding, options, "guided"), **how)
+                report = verify_matches(at, given.verification(options, at.verification), **how)
         show(report.summary())
 
 

@@ -69,15 +69,13 @@ def depth_settings(options: argparse.Namespace) -> list[str]:
     return [f"depth.path={json.dumps(str(path.resolve()))}"] if path else []
 
 
-def changed(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOptions:
-    """Return a section of the recipe with what --set changes of it."""
-    values = with_settings({section: known.to_mapping()}, options.set)
+def matching(known: MatcherOptions, options: argparse.Namespace) -> MatcherOptions:
+    """Return a matcher with what --set changes of it; perhaps it is another one."""
+    values = with_settings({"matching": known.to_mapping()}, options.set)
     if len(values) > 1:
-        raise OptionError(f"--set: only options of {section} can be changed here")
-    if isinstance(known, MatcherOptions):  # perhaps another matcher now
-        matching: AnyOptions = MATCHERS.options(values[section], where="--set")
-        return matching
-    return known.from_mapping(values[section], "--set")
+        raise OptionError("--set: only options of matching can be changed here")
+    changed: MatcherOptions = MATCHERS.options(values["matching"], where="--set")
+    return changed
 
 
 def verification(

@@ -17,8 +17,6 @@ EXAMPLES = (
     "pairs --output-path out --pairs retrieval,sequence --num-neighbors 30",
     "match --output-path out",
     "verify --output-path out",
-    "escalate --output-path out --overwrite --set escalate.max_seconds_per_image=30",
-    "guide --output-path out",
     "map --output-path out",
     "map --output-path out --from-database any.db --image-path photos",
     "compare --image-path photos --output-path out --methods sift,default --seeds 0",
@@ -128,11 +126,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "pairs": ("which images to match, into pairs.txt", f"{RESULTS} {PAIRS}"),
     "match": ("matches into matches.h5 and database.db", f"{RESULTS} --set {NETWORKS} --scheduler"),
     "verify": ("two-view geometries into database.db", f"{RESULTS} --preset --random-seed"),
-    "escalate": (
-        "match pairs that failed again, with more warps (recipes that escalate, as on-demand)",
-        f"{RESULTS} --set {NETWORKS} --scheduler"),
-    "guide": ("match verified pairs again, guided by their geometry",
-        f"{RESULTS} --set --scheduler"),
     "map": ("COLMAP models into sparse/",
         f"{RESULTS} --from-database@map --image-path@map {MAPPER} {MODEL}"),
     "compare": (

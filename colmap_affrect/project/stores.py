@@ -259,12 +259,6 @@ class MatchStore(GroupStore):
             for names in tried:
                 file[pair_key(*names)].attrs["tried"] |= 1 << tried_level
 
-    def forget_tried(self) -> None:
-        """Forget which levels were tried beside the first."""
-        with self._open("a") as file:
-            for _, group in complete_groups(file):
-                group.attrs["tried"] = 1
-
     def remove(self, images: Iterable[str] = (), pairs: Iterable[tuple[str, str]] = ()) -> None:
         """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
 

@@ -40,8 +40,7 @@ from colmap_affrect.stages.expected_gain import (
     weakly_connected_images,
 )
 from colmap_affrect.stages.extract import extract_images
-from colmap_affrect.stages.guide import restore_exact
-from colmap_affrect.stages.match import match_pairs, matched_at_level, write_batches, write_matches
+from colmap_affrect.stages.match import matched_at_level, write_batches, write_matches
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers, verify_new
@@ -52,25 +51,18 @@ LIKELY = 0.25
 """Part of a gain that counts for images that are likely right: matches tell that, and mend few."""
 
 
-def escalate(
-    context: Context, options: EscalateOptions | None = None, *, overwrite: bool = False
-) -> StageReport:
+def escalate(context: Context, options: EscalateOptions | None = None) -> StageReport:
     """Go through the levels of the recipe; nothing happens when it has none.
 
-    ``options`` are by default those on record; ``overwrite`` brings all pairs back to level 0
-    first, features that are there are kept. ``num_done`` counts the pairs that were matched again
-    now.
+    ``options`` are by default those on record. ``num_done`` counts the pairs that were matched
+    again now.
     """
     start = time.perf_counter()
     context.resources.require_device()
     context.workspace.require("verify")
     options = options or context.escalation
-    if overwrite:
-        restore_exact(context)
-    context.workspace.record_options("escalate", options.to_mapping(), overwrite=overwrite)
+    context.workspace.record_options("escalate", options.to_mapping())
     escalation = Escalation(context, options)
-    if overwrite:
-        escalation.undo()
     escalation.write()  # it may have been killed before
     escalated: set[Pair] = set()
     while work := escalation.next_work():
@@ -265,15 +257,6 @@ class Escalation:
         """Bring the database up to what is stored."""
         write_matches(self.context, self.pairs, replaces=True)
         verify_new(self.context)
-
-    def undo(self) -> None:
-        """Bring all pairs back to level 0."""
-        levels = self.matches.levels(self.pairs)
-        higher = [pair for pair in self.pairs if levels[pair]]
-        with self.context.progress.stage("match", len(higher), "pairs") as advance:
-            match_pairs(self.context, higher, self.matching, advance)
-        self.matches.forget_tried()
-        self.matches.keep_note(STEP, None)
 
     def _extend(self, missing: Sequence[tuple[str, int]], advance: Callable[[int], None]) -> None:
         """Add to images the features of levels that they lack."""

@@ -1,14 +1,14 @@
 """Guide: matches of verified pairs once more, where their geometry allows them.
 
-For the pairs of images that hang on few tracks through three images, or that the caller names.
-Guided matches are less exact than others, and where they outweigh these a model becomes less
-accurate; so other images are left alone, and what was there before stays on record (``guided.h5``),
-to be told from it. The raw matches stay as they are, as with COLMAP's own guided matching.
+For the pairs of images that hang on few tracks through three images. Guided matches are less exact
+than others, and where they outweigh these a model becomes less accurate; so other images are left
+alone, and what was there before stays on record (``guided.h5``), to be told from it. The raw
+matches stay as they are, as with COLMAP's own guided matching.
 """
 
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -31,58 +31,29 @@ from colmap_affrect.stages.expected_gain import weakly_connected_images
 from colmap_affrect.stages.match import IMAGES_IN_MEMORY, PAIRS_PER_WRITE
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.stationary import StationaryFilter
-from colmap_affrect.stages.verify import (
-    extracted_px,
-    verified_inliers,
-    verify_new,
-)
+from colmap_affrect.stages.verify import extracted_px, verified_inliers
 
 MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
 NOTHING: Indices = np.zeros((0, 2), np.int64)
 
 
-def guide(
-    context: Context,
-    options: GuidedOptions | None = None,
-    images: Collection[str] | None = None,
-    *,
-    overwrite: bool = False,
-) -> StageReport:
+def guide(context: Context, options: GuidedOptions | None = None) -> StageReport:
     """Match the verified pairs of some images again, guided by their geometry.
 
     A pair gets the geometry of its inliers and guided matches when that has more inliers than the
-    one before. Pairs that were guided are not guided again, unless ``overwrite`` undoes that first.
-    By default ``options`` are those on record, and ``images`` those with few features in tracks
-    through three images. ``num_done`` counts the pairs that were matched again now.
+    one before. Pairs that were guided are not guided again. ``options`` are by default those on
+    record. ``num_done`` counts the pairs that were matched again now.
     """
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("verify")
     options = options or context.guiding
-    if overwrite:
-        restore_exact(context)
-    workspace.record_options("guide", options.to_mapping(), overwrite=overwrite)
+    workspace.record_options("guide", options.to_mapping())
     guiding = Guiding(context, options)
-    todo, num_done = guiding.todo(images)
+    todo, num_done = guiding.todo()
     with context.progress.stage("guide", len(todo), "pairs") as advance:
         guiding.guide(todo, advance)
     return StageReport("guide", time.perf_counter() - start, len(todo), num_done)
-
-
-def restore_exact(context: Context) -> None:
-    """Give guided pairs their geometry without guided matches again.
-
-    They stay on record as tried, so that :func:`guide` leaves them alone.
-    """
-    workspace, guided = context.workspace, _gained(context)
-    if not guided:
-        return
-    ids = colmap_database.image_ids(workspace.database)
-    with colmap_database.open_database(workspace.database) as database:
-        for pair in guided:
-            database.delete_two_view_geometry(*(ids[name] for name in pair.names))
-    verify_new(context)
-    context.guided.write([replace(pair, num_inliers=0) for pair in guided])
 
 
 def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, Indices]:
@@ -109,13 +80,9 @@ def current(context: Context) -> list[GuidedPair]:
     ]
 
 
-def _gained(context: Context) -> list[GuidedPair]:
-    return [pair for pair in current(context) if pair.num_inliers]
-
-
 def guided_counts(context: Context) -> dict[str, int]:
     """Return what the report says: pairs with more inliers, and these before and after."""
-    gained = _gained(context)
+    gained = [pair for pair in current(context) if pair.num_inliers]
     if not gained:
         return {}
     return {
@@ -175,18 +142,15 @@ class Guiding:
         self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
         self.verifier = PairVerifier(self.path, context.verification, extracted_px(context))
 
-    def todo(self, images: Collection[str] | None) -> tuple[list[Pair], int]:
+    def todo(self) -> tuple[list[Pair], int]:
         """Return the pairs to guide, and how many are done."""
         known = current(self.context)
         exact = exact_inliers(self.context, known)
-        if self.options.enabled == "never":
-            images = ()
-        elif images is None:
-            images = self.ids
-            if self.options.enabled == "auto":  # of two images alone there are no longer tracks
-                has_three = len({name for pair in exact for name in pair}) > 2
-                limit = self.options.min_num_tracks if has_three else 0
-                images = weakly_connected_images(exact, limit)
+        images = set(self.ids) if self.options.enabled == "always" else set[str]()
+        if self.options.enabled == "auto":  # of two images alone there are no longer tracks
+            has_three = len({name for pair in exact for name in pair}) > 2
+            limit = self.options.min_num_tracks if has_three else 0
+            images = weakly_connected_images(exact, limit)
         levels = self.context.matches.levels(listed_pairs(self.context))
         escalated = {frozenset(pair) for pair, level in levels.items() if level}  # have enough
         chosen = [p for p in exact if not {*p}.isdisjoint(images) and {*p} not in escalated]

@@ -22,8 +22,8 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 
 COMMANDS = [
-    "run", "extract", "pairs", "match", "verify", "escalate", "guide", "map",
-    "compare", "evaluate", "inspect", "recipes", "weights", "doctor",
+    "run", "extract", "pairs", "match", "verify", "map", "compare",
+    "evaluate", "inspect", "recipes", "weights", "doctor",
 ]  # fmt: skip
 TIMEOUT_S = 60
 
@@ -175,7 +175,7 @@ MODEL = "--model-path OUT/sparse/0 --output-path NEW"
 INPUTS = {
     f"run {RUN}": f"{SELECTED} --recipe --weights --depth-path --match-list-path --extend",
     f"compare {RUN}": "--ground-truth-path",
-    "escalate --output-path OUT": "--weights",
+    "match --output-path OUT": "--weights",
     "map --output-path NEW --from-database OUT/database.db": "--image-path",
     f"import-h5 --image-path PHOTOS {H5}": "--cameras-path",
     f"align {MODEL}": "--gps --positions --points",

@@ -117,7 +117,7 @@ def test_map_maps_a_changed_database_as_it_is(out: Path, again: Again, call: Cal
         assert f"{path}: was changed since the last run, and is mapped as it is" in warning
     assert database_content(path) == changed
     kept, other = out / "database.changed.db", ["--output-path", out.with_name("other")]
-    assert f"'colmap-affrect map --from-database {kept} --output-path OTHER'" in again("guide")[0]
+    assert f"'colmap-affrect map --from-database {kept} --output-path OTHER'" in again("verify")[0]
     assert len(database_content(path)["inliers"]) == 3
     assert call("map", "-q", "--from-database", kept, *other).code == 0
     execute(path, "UPDATE matches SET data = zeroblob(1)")

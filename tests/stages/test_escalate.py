@@ -15,6 +15,7 @@ from results import database_content
 
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
+from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import FileTransaction
@@ -23,7 +24,7 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import escalate as escalation
-from colmap_affrect.stages.context import Context, Inputs
+from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import Escalation
 from colmap_affrect.stages.expected_gain import weakly_connected_images
 from colmap_affrect.stages.extract import extract
@@ -59,9 +60,9 @@ def verified(photos: Path, output: Path, recipe: str) -> Workspace:
     return workspace
 
 
-def escalate(workspace: Workspace, **options: bool) -> StageReport:
+def escalate(workspace: Workspace, options: EscalateOptions | None = None) -> StageReport:
     with workspace.locked():
-        return escalation.escalate(Context(workspace), **options)
+        return escalation.escalate(Context(workspace), options)
 
 
 @pytest.fixture(scope="module")
@@ -112,26 +113,20 @@ def same_state(first: Workspace, second: Workspace) -> None:
     assert levels[0] == levels[1]
 
 
-def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path, call: Call) -> None:
-    ended = call("escalate", "--output-path", tmp_path)
-    assert ended.code == 2
-    assert "the verify stage has not been run there" in ended.errors[0]
+def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="the verify stage has not been run there"):
+        escalate(Workspace(tmp_path))
     assert not Workspace(tmp_path).config.exists()
 
 
-@pytest.mark.long
-def test_other_thresholds_than_before_need_no_new_features(
-    escalated: tuple[Workspace, StageReport], tmp_path: Path, call: Call
+def test_other_thresholds_than_before_are_refused(
+    escalated: tuple[Workspace, StageReport], tmp_path: Path
 ) -> None:
     workspace = copy(escalated[0], tmp_path)
-    setting = ["--set", "escalate.strong_num_inliers=5"]
-    refused = call("escalate", "--output-path", tmp_path, *setting)
-    assert "with strong_num_inliers=100, and it is 5 now; use --overwrite" in refused.errors[0]
-    assert call("escalate", "--output-path", tmp_path, *setting, "--overwrite").code == 0
-    now = Workspace(workspace.path)
-    assert Context(now).escalation.strong_num_inliers == 5
-    wrong = call("escalate", "--output-path", tmp_path, "--set", "matching.max_ratio=0.8")
-    assert wrong.errors == ["error: --set: only options of escalate can be changed here"]
+    before = workspace.config.read_bytes()
+    with pytest.raises(StoreError, match="with strong_num_inliers=100, and it is 5 now"):
+        escalate(workspace, EscalateOptions(strong_num_inliers=5))
+    assert workspace.config.read_bytes() == before
 
 
 def test_device_that_is_not_there_discards_nothing(
@@ -139,10 +134,11 @@ def test_device_that_is_not_there_discards_nothing(
 ) -> None:
     workspace = copy(escalated[0], tmp_path)
     before = database_content(workspace.database)
-    for stage in ("match", "escalate"):
-        ended = call(stage, "--output-path", tmp_path, "--device", "cuda:99", "--overwrite")
-        assert (ended.code, len(ended.errors)) == (1, 1)
-        assert "--device cuda:99" in ended.errors[0]
+    ended = call("match", "--output-path", tmp_path, "--device", "cuda:99", "--overwrite")
+    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert "--device cuda:99" in ended.errors[0]
+    with pytest.raises(AffrectError, match="--device cuda:99"):
+        escalation.escalate(Context(workspace, Resources(device="cuda:99")))
     assert workspace.matches.exists()
     assert database_content(workspace.database) == before
 
@@ -383,18 +379,6 @@ def test_run_killed_between_two_changes_of_its_matches_goes_on_to_the_same_resul
             escalate(workspace)
     escalate(workspace)
     same_state(workspace, escalated[0])
-
-
-@pytest.mark.long
-def test_overwrite_escalates_anew_with_the_features_that_are_there(
-    escalated: tuple[Workspace, StageReport], tmp_path: Path
-) -> None:
-    workspace = copy(escalated[0], tmp_path / "overwritten")
-    before = FeatureStore(workspace.features).num_keypoints()
-    assert escalate(workspace, overwrite=True).num_done > 0
-    inliers = Escalation(Context(workspace), EscalateOptions()).num_inliers()
-    assert max(count for pair, count in inliers.items() if HARD[1] in pair) >= 100
-    assert FeatureStore(workspace.features).num_keypoints() == before
 
 
 def test_photographs_without_a_feature_escalate_nowhere(tmp_path: Path) -> None:

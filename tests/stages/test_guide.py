@@ -1,4 +1,4 @@
-"""Guided matching as a stage: who is guided, what stays on record, again, killed and undone."""
+"""Guided matching as a stage: who is guided, what stays on record, again and killed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import Call
 from numpy.testing import assert_array_equal
 from results import database_content
 from small_scene import INTRINSICS, NAMES
@@ -15,6 +14,7 @@ from small_scene import INTRINSICS, NAMES
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.tables import rows_digest
+from colmap_affrect.errors import StoreError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.project.stores import STATIONARY
@@ -23,13 +23,7 @@ from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import guide as stage
 from colmap_affrect.stages.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
-from colmap_affrect.stages.guide import (
-    current,
-    exact_inliers,
-    guide,
-    guided_counts,
-    restore_exact,
-)
+from colmap_affrect.stages.guide import current, exact_inliers, guide, guided_counts
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.stationary import NUM_CELLS
@@ -119,11 +113,13 @@ def test_sets_that_hang_together_are_left_alone(before: Workspace, context: Cont
     assert rows_digest(context.workspace.database) == digest
 
 
-def test_only_images_in_need(context: Context) -> None:
-    every = set(verified_inliers(context))
-    assert guide(context, images=[NAMES[1]]).num_done == 3
+def test_only_images_in_need(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    every, in_need = set(verified_inliers(context)), {NAMES[1]}
+    monkeypatch.setattr(stage, "weakly_connected_images", lambda *_: in_need)
+    assert guide(context).num_done == 3
     assert {pair.names for pair in context.guided.read()} == {p for p in every if NAMES[1] in p}
-    report = guide(context, images=NAMES[:2])
+    in_need.add(NAMES[0])
+    report = guide(context)
     assert (report.num_done, report.num_kept) == (2, 3)
 
 
@@ -136,14 +132,17 @@ def test_captions_are_not_found_again(context: Context) -> None:
     assert guided_counts(context) == {}
 
 
-def test_never(context: Context) -> None:
-    assert guide(context, GuidedOptions(enabled="never"), images=NAMES).num_done == 0
+def test_never(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage, "weakly_connected_images", lambda *_: set(NAMES))
+    assert guide(context, GuidedOptions(enabled="never")).num_done == 0
 
 
-def test_again_nothing_happens(guided: Context) -> None:
+def test_again_nothing_happens_and_other_options_are_refused(guided: Context) -> None:
     content = database_content(guided.workspace.database)
     report = guide(guided)
     assert (report.num_done, report.num_kept) == (0, 6)
+    with pytest.raises(StoreError, match="enabled='always', and it is 'auto' now"):
+        guide(guided, GuidedOptions())
     assert database_content(guided.workspace.database) == content
 
 
@@ -170,21 +169,6 @@ def same_inliers(first: Context, second: Context) -> None:
         assert_array_equal(indices, other[pair])
 
 
-def test_what_is_undone_is_as_before(before: Workspace, guided: Context) -> None:
-    restore_exact(guided)
-    assert guided_counts(guided) == {}
-    same_inliers(Context(before), guided)
-    assert guide(guided).num_done == 0  # they were tried
-
-
-def test_overwrite_undoes_and_guides_again(guided: Context) -> None:
-    counts = guided_counts(guided)
-    assert guide(guided, ALWAYS, overwrite=True).num_done == 6
-    assert guided_counts(guided) == counts
-    assert guide(guided, GuidedOptions(enabled="never"), overwrite=True).num_done == 0
-    assert guided_counts(guided) == {}
-
-
 def test_verification_over_again_forgets_inliers_by_guiding(
     before: Workspace, context: Context
 ) -> None:
@@ -192,17 +176,6 @@ def test_verification_over_again_forgets_inliers_by_guiding(
     verify_matches(context, overwrite=True)
     assert guided_counts(context) == {}
     same_inliers(Context(before), context)
-
-
-def test_command(context: Context, call: Call) -> None:
-    out = ["--output-path", context.workspace.path]
-    ended = call("guide", *out, "--set", "guided.enabled=always", "--set", "guided.band_px=2")
-    assert ended.code == 0
-    assert "guide: 6 done" in ended.stdout
-    refused = call("guide", *out, "--set", "guided.enabled=auto")
-    assert "was run there with band_px=2.0" in refused.errors[0] or "enabled" in refused.errors[0]
-    wrong = call("guide", *out, "--set", "matching.max_ratio=0.8")
-    assert wrong.errors == ["error: --set: only options of guided can be changed here"]
 
 
 def test_ids_of_a_pair_are_in_order(context: Context) -> None:
