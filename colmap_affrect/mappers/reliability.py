@@ -36,6 +36,7 @@ from colmap_affrect.mappers.pair_graph import (
     graph_of,
     poses_of,
 )
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.project.report import Bridge
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
@@ -322,12 +323,15 @@ def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[in
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     sparse = _with_fewer_points(model)
     cost = Adjuster(priors, NOISE_PX, refining, fixed).adjust(sparse, FINAL)
-    found: dict[int, float] = {}
-    for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
-        held = Adjuster(priors, NOISE_PX, refining, fixed.union(keys.tolist()))
+    groups = [keys.tolist() for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS))]
+
+    def growth(keys: Sequence[int]) -> float:
+        held = Adjuster(priors, NOISE_PX, refining, fixed.union(keys))
         least = min(held.adjust(_scaled(sparse, keys, factor), FINAL) for factor in FACTORS)
-        found |= dict.fromkeys(keys.tolist(), least / max(cost, 1e-9) - 1.0)
-    return found
+        return least / max(cost, 1e-9) - 1.0
+
+    growths = zip(groups, map_ordered(growth, groups, available_cores()), strict=True)
+    return {key: value for keys, value in growths for key in keys}
 
 
 def fitting_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:

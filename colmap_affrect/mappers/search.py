@@ -7,7 +7,8 @@ bridges add images to them. One number chooses: how much the verified pairs spea
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,7 +17,8 @@ from colmap_affrect.mappers.adjustment import EXIF_SIGMA, MEDIUM, Adjuster, Foca
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.growing import Grower, Joiner, Models
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, cameras_of, poses_of
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 ZOOMS = 1.0, 1.4, 0.7, 2.0
 """Factors of the usual focal length near which unknown ones begin: all lenses from wide to long."""
@@ -180,18 +182,24 @@ class Search:
         """Return models of different images, that with most evidence first."""
         models: dict[frozenset[int], tuple[float, pycolmap.Reconstruction]] = {}
         best, in_vain = 0.0, 0
-        for pair in sorted(graph.pairs, key=lambda pair: -len(pair.matches)):
-            if in_vain >= self.num_seeds:
-                break
-            model = grower.grow(pair.ids)
-            if model is None:
-                continue
-            images, evidence = frozenset(model.reg_image_ids()), self.evidence.of(model)
-            in_vain = 0 if evidence > best + MIN_GAIN else in_vain + 1
-            best = max(best, evidence)
-            if images not in models or evidence > models[images][0]:
-                models[images] = evidence, model
-            if len(images) == len(graph.keypoints) and self.evidence.is_confirmed(model):
-                break
+        pairs = sorted(graph.pairs, key=lambda pair: -len(pair.matches))
+        with closing(_in_order(grower, [pair.ids for pair in pairs])) as grown:
+            for model in grown:
+                images, evidence = frozenset(model.reg_image_ids()), self.evidence.of(model)
+                in_vain = 0 if evidence > best + MIN_GAIN else in_vain + 1
+                best = max(best, evidence)
+                if images not in models or evidence > models[images][0]:
+                    models[images] = evidence, model
+                is_complete = len(images) == len(graph.keypoints)
+                if in_vain >= self.num_seeds or (is_complete and self.evidence.is_confirmed(model)):
+                    break
         ordered = sorted(models.values(), key=lambda found: -found[0])
         return [model for _, model in ordered]
+
+
+def _in_order(
+    grower: Grower, pairs: Sequence[Ids]
+) -> Generator[pycolmap.Reconstruction, None, None]:
+    """Yield models that grow from pairs: in threads after the first, which often is enough."""
+    yield from filter(None, map(grower.grow, pairs[:1]))
+    yield from filter(None, map_ordered(grower.grow, pairs[1:], available_cores()))
