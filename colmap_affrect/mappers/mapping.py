@@ -3,6 +3,7 @@
 What is known of finished models is kept beside them: COLMAP's files cannot hold it all.
 """
 
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,14 +96,15 @@ def map_database(
     partial = sparse_path.with_name(sparse_path.name + ".partial")
     remove_own([partial] if task.extend or task.before else [partial, sparse_path])
     num_images = len(image_ids(task.database_path))
-    most_shown = 0
+    most_shown, lock = 0, threading.Lock()
 
     def show(count: int) -> None:
         nonlocal most_shown
-        news = min(count, num_images) - most_shown
-        if news > 0:
-            most_shown += news
-            next_image(news)
+        with lock:  # several models may grow at once
+            news = min(count, num_images) - most_shown
+            if news > 0:
+                most_shown += news
+                next_image(news)
 
     try:
         with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as whole:
@@ -113,7 +115,9 @@ def map_database(
         judged = [(model, *_judged(model, task)) for model in found]
         kept = [(model, sure, taken) for model, sure, taken in judged if sure]
         summaries = []
-        for index, (model, sure, taken) in enumerate(sorted(kept, key=_size, reverse=True)):
+        kept.sort(key=lambda found: -found[0].reconstruction.num_points3D())
+        kept.sort(key=lambda found: -found[0].reconstruction.num_reg_images())
+        for index, (model, sure, taken) in enumerate(kept):
             write_model(model.reconstruction, partial / str(index))
             summaries.append(_summary(model, sure, taken))
             write_summary(summaries[-1], partial / str(index))
@@ -122,11 +126,6 @@ def map_database(
     finally:
         remove_own([partial])
     return summaries
-
-
-def _size(judged: tuple[MappedModel, Judgements, Judgements]) -> tuple[int, int]:
-    model = judged[0].reconstruction
-    return model.num_reg_images(), model.num_points3D()
 
 
 def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgements]:
