@@ -20,7 +20,8 @@ logger = logging.getLogger("colmap_affrect")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     try:
-        options = build_parser().parse_args(arguments)
+        given = sys.argv[1:] if arguments is None else arguments
+        options = build_parser().parse_args(given or ["--help"])
         with _logging(options):
             from colmap_affrect.cli import commands  # not for --help
 

@@ -91,10 +91,13 @@ def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
     assert "# Radius r of a covering ball as a tilt ratio. Paper: 1.7.\ntilt_radius" in done.stdout
 
 
+def test_the_name_alone_shows_the_help(call: Call) -> None:
+    assert call() == call("--help")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("", "COMMAND"),
         ("rum", "invalid choice: 'rum'"),
         ("run --image-path x", "required: --output-path"),
         ("map --output-path {out} --camera-mode single", "unknown argument --camera-mode"),
