@@ -64,6 +64,11 @@ class Level:
         return (self.features,)
 
     @property
+    def uses_networks(self) -> bool:
+        """Whether anything runs on torch when features are extracted."""
+        return any(part.uses_network for part in self.network_parts)
+
+    @property
     def weights(self) -> set[str]:
         """Keys of the files of weights that it reads, with those of its own matcher."""
         parts = (*self.network_parts, *([self.matching] if self.matching else []))
@@ -128,11 +133,6 @@ class ExtractionOptions(Options):
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights of all levels, sorted."""
         return tuple(sorted(set[str]().union(*(level.weights for level in self.levels))))
-
-    @property
-    def uses_networks(self) -> bool:
-        """Whether anything runs on torch."""
-        return any(part.uses_network for level in self.levels for part in level.network_parts)
 
 
 class EscalateOptions(Options):

@@ -149,7 +149,8 @@ def extract_images(
         return
     if later := {name for name, level in images if level}:
         _refuse_changed(context, inputs, later)
-    executor = context.executor or Threads(min(num_images_at_once(extractor), len(images)))
+    num = num_images_at_once([extractor.options.levels[k] for k in {k for _, k in images}])
+    executor = context.executor or Threads(min(num, len(images)))
     files = inputs.photographs.files(images[0][0])
     if extractor.options.depth.path:
         files.append(Path(extractor.options.depth.path))

@@ -1,6 +1,6 @@
 """What is done for one photograph, in a thread of this process or on a worker of a cluster."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cache
@@ -85,10 +85,7 @@ class ImageExtractor:
     weights: Mapping[str, Path] = field(default_factory=dict)  # files of the networks by key
     resources: Resources = field(default_factory=Resources)  # that it was prepared with
     # held while networks run, which take one image at a time
-    network_lock: AbstractContextManager[Any] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.network_lock = Lock() if self.options.uses_networks else nullcontext()
+    network_lock: AbstractContextManager[Any] = field(default_factory=Lock)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _prepared_elsewhere, (self.options, self.resources, digests(self.weights))
@@ -129,7 +126,8 @@ class ImageExtractor:
         size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
-        with self.network_lock:
+        has_networks = self.options.levels[level].uses_networks
+        with self.network_lock if has_networks else nullcontext():
             plan, warning = self.plan(photograph, level)
             features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
@@ -197,15 +195,14 @@ class ImageExtractor:
         )
 
 
-def num_images_at_once(extractor: ImageExtractor) -> int:
-    """Return how many images are worked on at once in this process.
+def num_images_at_once(levels: Collection[Level]) -> int:
+    """Return how many images are worked on at once in this process, for features of some levels.
 
     They take at most half of the memory there is. With networks at most two: one is read while
     the networks run on the other.
     """
-    levels = extractor.options.levels
     num_bytes = max(x.features.bytes_per_px * x.max_image_size_px**2 for x in levels)
-    most = 2 if extractor.options.uses_networks else available_cores()
+    most = 2 if any(level.uses_networks for level in levels) else available_cores()
     return min(most, max(1, available_memory_bytes() // 2 // num_bytes))
 
 
@@ -229,7 +226,8 @@ def prepare(
     parts = {part for level in levels.values() for part in level.network_parts}
     keys = sorted({key for part in parts for key in part.weights})
     weights = resolve(keys, resources.weights_path, progress=progress)
-    device = resources.require_device(uses_network=options.uses_networks)
+    uses_network = any(level.uses_networks for level in options.levels)
+    device = resources.require_device(uses_network=uses_network)
     network, depth = NetworkContext(weights, device), None
     extractor = cache(lambda features: EXTRACTORS.make(features, network))
     extractors = {k: extractor(level.features) for k, level in levels.items()}

@@ -161,15 +161,15 @@ def test_intrinsics_are_those_of_the_user_else_colmaps_guess(tmp_path):
 def test_images_at_once_are_as_many_as_there_are_cores_and_memory_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    extractor = prepare(ExtractionOptions())  # 2400 px: 1.4 GiB an image
+    levels = ExtractionOptions().levels  # 2400 px: 1.4 GiB an image
     monkeypatch.setattr(one_image, "available_cores", lambda: 8)
     counts = []
     for gibibytes in (1, 9, 100):
         monkeypatch.setattr(one_image, "available_memory_bytes", lambda g=gibibytes: g << 30)
-        counts.append(num_images_at_once(extractor))
+        counts.append(num_images_at_once(levels))
     assert counts == [1, 3, 8]
     shrunk = {"max_image_size_px": 1024, "features": "aliked"}
-    learned = replace(extractor, options=ExtractionOptions.from_mapping(shrunk, "test"))
+    learned = ExtractionOptions.from_mapping(shrunk, "test").levels
     for gibibytes, expected in ((1, 1), (9, 2), (100, 2)):  # 1.6 GiB an image, and two at most
         monkeypatch.setattr(one_image, "available_memory_bytes", lambda g=gibibytes: g << 30)
         assert num_images_at_once(learned) == expected
