@@ -79,7 +79,7 @@ def match(
         matches.keep_note(FINISHED, None)
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance, options.max_num_first)
-    loose = [] if is_finished else not_well_tied(context.matches, pairs)
+    loose = not_well_tied(context.matches, pairs) if pairs and not is_finished else []
     with context.progress.stage("match, all features", len(loose), "pairs") as advance:
         match_pairs(context, loose, options, advance)
     warnings = {}

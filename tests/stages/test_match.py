@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import Call
+from results import database_content
+from small_scene import NAMES as PHOTOGRAPHS
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
@@ -101,3 +104,27 @@ def test_all_features_are_matched_where_the_strongest_do_not_tie_both_images(
     assert not_well_tied(store, pairs) == [("c", "d"), ("c", "e"), ("f", "a")]
     store.write([pair("ec", MANY_MATCHES), pair("cd", 9, of_some=False)])
     assert not_well_tied(store, [*pairs, ("e", "c")]) == [("f", "a")]
+
+
+def test_all_features_are_matched_once_a_pair_that_tied_an_image_is_not_listed(
+    photos: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Then the database has these matches, too."""
+    monkeypatch.setattr(stage, "MANY_MATCHES", 140)
+    monkeypatch.setattr(stage, "NUM_WELL_TIED", 1)
+    out, (a, b, c, _) = tmp_path / "out", PHOTOGRAPHS
+    where = ["--output-path", out]
+    assert call("extract", "--image-path", photos, *where, "--recipe", "rectified").code == 0
+    listed, pairs = tmp_path / "list.txt", exhaustive_pairs(PHOTOGRAPHS)
+    listed.write_text("".join(f"{one}\t{two}\n" for one, two in pairs), encoding="utf-8")
+    assert call("pairs", *where, "--match-list-path", listed).code == 0
+    assert call("match", *where, "--set", "matching.max_num_first=300").code == 0
+    store = MatchStore(out / "matches.h5")
+    few = len(next(store.read([(a, c)])).indices)
+    assert set(store.nums_of_some(pairs)) == {(a, b), (a, c), (b, c)}
+    listed.write_text(f"{a}\t{c}\n{b}\t{c}\n", encoding="utf-8")
+    assert call("pairs", *where, "--match-list-path", listed).code == 0
+    assert call("match", *where).code == 0
+    many = next(store.read([(a, c)])).indices
+    assert len(many) > 2 * few
+    assert database_content(out / "database.db")["raw matches"][a, c] == len(many)
