@@ -80,15 +80,15 @@ def rotation_error_deg(
     if None in known or len(points[0]) < 8:
         return None
     rays = []
-    for (_, matrix, full), places, size in zip(known, points, sizes, strict=True):  # type: ignore[misc]
+    for (_, matrix, full), places, size in zip(known, points, sizes, strict=True):
         px = (places + 0.5) * np.divide(full, size)
         rays.append((px - matrix[:2, 2]) / matrix.diagonal()[:2])
-    limit = 3.0 / known[0][1][0, 0]  # type: ignore[index]
+    limit = 3.0 / known[0][1][0, 0]
     found, mask = cv2.findEssentialMat(*rays, np.eye(3), cv2.USAC_MAGSAC, 0.999, limit)
     if found is None:
         return 180.0
     _, rotation, _, _ = cv2.recoverPose(found[:3], *rays, np.eye(3), mask=mask)
-    first, second = (pose[:, :3] for pose, _, _ in known)  # type: ignore[misc]
+    first, second = (pose[:, :3] for pose, _, _ in known)
     cosine = (np.trace(rotation.T @ second @ first.T) - 1) / 2
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
