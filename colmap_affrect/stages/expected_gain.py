@@ -2,8 +2,8 @@
 
 A pair at a level is worth the chance that it verifies there, times the photographs that it would
 tie, over what it costs. The chances are logistic regressions on what is known of a pair, one for
-each kind of level; they and the costs are in ``expected_gain.json``, fitted on photographs whose
-poses are known.
+each kind of level, and the costs are nominal. Both are in ``expected_gain.json``;
+``tests/benchmarks/fit_expected_gain.py`` fits the former on photographs whose poses are known.
 """
 
 import json
