@@ -2,16 +2,17 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from colmap_affrect.colmap.by_hand import NOTHING, ByHand
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
-from colmap_affrect.colmap.database_copy import schema_version
+from colmap_affrect.colmap.database_copy import read_names, schema_version
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.errors import ImageError
+from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
@@ -74,6 +75,7 @@ class RunOptions(InputOptions):
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
     database_descriptors: bool = False  # also into the database, as COLMAP's matchers need them
     extend: Extension | None = None  # the model that the photographs are registered into
+    by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
     max_minutes: float = math.inf  # after which nothing more is tried for photographs in need
 
 
@@ -108,9 +110,10 @@ def run(
     mapper = MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
+    _check_by_hand(options.by_hand, names, mapper)
     shown = progress.with_forecast(Forecast(len(names), _num_pairs(names, options.pairs)))
-    deadline_s = time.monotonic() + 60 * options.max_minutes
-    context = Context(Workspace(output_path), options.resources, executor, shown, deadline_s)
+    until_s, workspace = time.monotonic() + 60 * options.max_minutes, Workspace(output_path)
+    context = Context(workspace, options.resources, executor, shown, until_s, options.by_hand)
     if options.extend:
         if overwrite:
             options.extend.refuse_discarding(output_path)
@@ -119,7 +122,7 @@ def run(
     resolve(recipe.required_weights, options.resources.weights_path, progress=progress)
     load_matchers(context, recipe.extraction, recipe.matching)
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
-    with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
+    with workspace.locked(), watched(context, follows=False, discards=overwrite):
         reports = [
             extract(context, inputs, recipe, later=later, overwrite=overwrite),
             choose_pairs(context, options.pairs),
@@ -135,6 +138,14 @@ def run(
         if options.database_descriptors:
             write_descriptors(context)
         return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
+
+
+def _check_by_hand(by_hand: ByHand, names: Collection[str], mapper: Mapper) -> None:
+    by_hand.marks(names)  # refuses what names other photographs
+    if by_hand.tie_points_path and mapper.options.name != MAPPERS.default:
+        raise OptionError(
+            f"--tie-points: the {mapper.options.name} mapper takes none; use --mapper sparse"
+        )
 
 
 def _num_pairs(names: Sequence[str], options: PairOptions) -> int:
@@ -154,6 +165,7 @@ def map_from_database(
     mapping: MapperOptions | None = None,
     verification: VerificationOptions | None = None,
     extend: Extension | None = None,
+    by_hand: ByHand = NOTHING,
     overwrite: bool = False,
     page: bool = True,
     progress: Progress = SILENT,
@@ -169,7 +181,8 @@ def map_from_database(
         if overwrite:
             extend.refuse_discarding(output_path)
         read_given_model(extend.model_path, "--extend ")
-    context = Context(Workspace(output_path), progress=progress)
+    _check_by_hand(by_hand, read_names(database_path), mapper)
+    context = Context(Workspace(output_path), progress=progress, by_hand=by_hand)
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()
         report = copy_verified(context, database_path, image_path, chosen, overwrite=overwrite)
@@ -192,10 +205,12 @@ def map_and_report(
         raise ImageError(f"{path}: {min(gone)} has features, and is gone; run extract again")
     if extend and overwrite:
         extend.refuse_discarding(workspace.path)
+    _check_by_hand(context.by_hand, names, mapper)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
     copied = workspace.is_foreign
-    pair_inliers = num_verified_inliers(context)
+    verified = num_verified_inliers(context)
+    pair_inliers = {pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)}
     missing = unregistered(context, names, models, pair_inliers)
     cameras = read_camera_records(workspace.cameras)
     result = ReconstructionReport(
@@ -217,6 +232,7 @@ def map_and_report(
         ),
         extended=tuple(before),
         advice=advice(context, missing, models),
+        by_hand=context.by_hand.texts(),
     )
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
     replace_text(workspace.report, result.to_json())

@@ -48,6 +48,7 @@ def run(options: argparse.Namespace) -> None:
         recipe=recipe,
         database_descriptors=bool(options.database_descriptors),
         extend=given.extension(options),
+        by_hand=given.by_hand(options),
         max_minutes=options.max_minutes,
         **given.inputs(options, recipe),
     )
@@ -101,6 +102,7 @@ def map(options: argparse.Namespace) -> None:
             mapping=given.mapping(options),
             verification=given.verification(options),
             extend=extend,
+            by_hand=given.by_hand(options),
             progress=given.progress(options),
             **how,
         )
@@ -237,7 +239,9 @@ def _next_steps(report: ReconstructionReport, workspace: Workspace) -> list[str]
     page = f", to look at: {workspace.page}" if workspace.page.exists() else ""
     lines = [f"results     {workspace.path}{page}"]
     if report.models:
-        look = ["--import_path", str(model), "--database_path", str(workspace.database)]
+        mapped = workspace.mapped_database
+        database = mapped if mapped.exists() else workspace.database
+        look = ["--import_path", str(model), "--database_path", str(database)]
         look += ["--image_path", str(photos)] if photos else []
         lines += ["next", f"            colmap gui {shlex.join(look)}"]
     if report.status in ("ok", "partial"):

@@ -37,6 +37,11 @@ def minutes(text: str) -> float:
     return number
 
 
+def pair(text: str) -> tuple[str, str]:
+    first, second = text.split(",")
+    return first, second
+
+
 def words(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
 
@@ -129,6 +134,14 @@ FLAGS: dict[str, Settings] = {
         "cameras stay; it may be of another program, and its photographs must be among those "
         "given"),
     "--refine-existing": _switch("let the poses and cameras of --extend move"),
+    "--tie-points": _path("FILE", "the same points marked by hand in several photographs: CSV of "
+        "point,photograph,x,y in px from the upper left corner, as the page of a run saves it; "
+        "six or more join a lost photograph, or models", dest="tie_points_path"),
+    "--reject-pair": _value("A,B", "do not use the matches of these two photographs, which are "
+        "wrong; may be repeated; without it they are used again", type=pair, action="append",
+        default=[], dest="rejected"),
+    "--leave-out": _value("NAME", "do not map this photograph; may be repeated; without it it is "
+        "mapped again", action="append", default=[], dest="left_out"),
     "--from-database@map": _path("FILE",
         "map this COLMAP database of any program, verified or matched; it is copied"),
     "--image-path@map": _path("PATH",

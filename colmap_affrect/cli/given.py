@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from colmap_affrect.cli.flags import FLAGS
+from colmap_affrect.colmap.by_hand import NOTHING, ByHand
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
@@ -57,6 +58,10 @@ def extension(options: argparse.Namespace) -> Extension | None:
     if options.refine_existing and not options.extend:
         raise OptionError("--refine-existing: only with --extend MODEL")
     return Extension(options.extend, bool(options.refine_existing)) if options.extend else None
+
+
+def by_hand(options: argparse.Namespace) -> ByHand:
+    return ByHand(options.tie_points_path, tuple(options.rejected), tuple(options.left_out))
 
 
 def recipe(options: argparse.Namespace) -> Recipe:
@@ -131,8 +136,9 @@ def executor(options: argparse.Namespace) -> AbstractContextManager[Executor | N
 def context(options: argparse.Namespace) -> Iterator[Context]:
     """Lock the output folder and return what the stages work with."""
     with Workspace(options.output_path).locked() as workspace, executor(options) as where:
-        found = Context(workspace, resources(options), where, progress(options))
         is_first, maps = options.command == "extract", options.command == "map"
+        said = by_hand(options) if maps else NOTHING
+        found = Context(workspace, resources(options), where, progress(options), by_hand=said)
         discards = is_first and options.overwrite
         with watched(found, follows=not is_first, maps=maps, discards=discards):
             yield found

@@ -115,7 +115,8 @@ RECIPE = "--recipe --set"
 PAIRS = "--match-list-path --pairs --num-neighbors --max-distance-m"
 NETWORKS = "--weights --device"
 MAPPER = "--preset --mapper --mapper-options"
-MODEL = "--extend --refine-existing --random-seed --json --no-page"
+BY_HAND = "--tie-points --reject-pair --leave-out"
+MODEL = f"--extend --refine-existing {BY_HAND} --random-seed --json --no-page"
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("all stages: photographs in, COLMAP model out",

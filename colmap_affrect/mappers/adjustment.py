@@ -12,10 +12,13 @@ from typing import Any
 
 import numpy as np
 import pyceres
+from pycolmap.cost_functions import ReprojErrorCost
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.by_hand import SIGMA_PX
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
 from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.mappers.tie_points import NONE, TiePoints
 
 USUAL_FOCAL = 1.15  # longer sides: the median of usual lenses, which are of 25 to 70 mm on film
 USUAL_SIGMA = 0.4  # deviation of the logarithm of a focal length of which nothing is known
@@ -76,6 +79,7 @@ class Adjuster:
         refining: say which parameters of cameras are refined.
         constant: ids of the cameras of which nothing is refined.
         constant_frames: ids of the frames that stay where they are.
+        tie_points: observed by all models that have two of their images.
     """
 
     priors: Mapping[int, FocalPrior]
@@ -83,6 +87,7 @@ class Adjuster:
     refining: pycolmap.BundleAdjustmentOptions
     constant: frozenset[int] = frozenset()
     constant_frames: frozenset[int] = frozenset()
+    tie_points: TiePoints = NONE
 
     def begin(self, model: pycolmap.Reconstruction) -> None:
         """Give the cameras of a model that are not held the focal lengths of their priors."""
@@ -103,6 +108,7 @@ class Adjuster:
         Of some images only, the others stay, and so do the cameras that they share. The cost is in
         nats.
         """
+        self.tie_points.observe(model)
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
         options.refine_focal_length = self.refining.refine_focal_length
         options.refine_principal_point = self.refining.refine_principal_point
@@ -126,6 +132,7 @@ class Adjuster:
         if image_ids is None and not frames:
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+        self._add_tie_points(problem, model)
         for key in sorted(used - held):
             if self.priors[key].sigma:
                 self._add_prior(problem, model.cameras[key])
@@ -142,6 +149,22 @@ class Adjuster:
         model.update_point_3d_errors()
         usable = summary.IsSolutionUsable()
         return float(summary.final_cost) / self.noise_px**2 if usable else math.inf
+
+    def _add_tie_points(self, problem: Any, model: pycolmap.Reconstruction) -> None:
+        """Give tie points the weight of their noise, far from where they should be, too.
+
+        They are points as all others before, whose loss hardly pulls from there.
+        """
+        covariance = np.eye(2) * (SIGMA_PX / self.noise_px) ** 2
+        for _, image_id, mark in self.tie_points.observed(model):
+            image, place = model.images[image_id], model.points3D[mark.point3D_id].xyz
+            camera, frame = model.cameras[image.camera_id], model.frames[image.frame_id]
+            if frame.rig_from_world is None:
+                continue
+            blocks = [place, frame.rig_from_world.params, camera.params]
+            if all(map(problem.has_parameter_block, blocks)):
+                cost = ReprojErrorCost(camera.model, covariance, mark.xy)
+                problem.add_residual_block(cost, pyceres.CauchyLoss(4 * self.noise_px), blocks)
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
         if not problem.has_parameter_block(camera.params):

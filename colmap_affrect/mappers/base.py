@@ -52,6 +52,7 @@ class MappingTask:
         unmeasured: pairs of image names that only frames verify which were not measured one by one.
         cameras: what is known of the cameras, by id.
         may_share: images of one size may turn out to share a camera that nobody knows.
+        tie_points: which keypoints show the same by hand, by point and image name.
     """
 
     database_path: Path
@@ -63,6 +64,7 @@ class MappingTask:
     unmeasured: frozenset[tuple[str, str]] = frozenset()
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
     may_share: bool = False
+    tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     @property
     def colors_path(self) -> Path:
@@ -103,6 +105,7 @@ class MappedModel:
         bridges: by the names of images that came in by one verified pair, not by tracks through
             three images.
         moves: what made the model, in the words of a report.
+        tie_points: of it.
     """
 
     reconstruction: pycolmap.Reconstruction

@@ -19,8 +19,10 @@ from colmap_affrect.colmap.model_files import (
 )
 from colmap_affrect.errors import damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
+from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.reliability import Judgement, judge
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
+from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import DOUBTFUL, ModelSummary
@@ -119,7 +121,7 @@ def map_database(
         kept.sort(key=lambda found: -found[0].reconstruction.num_reg_images())
         for index, (model, sure, taken) in enumerate(kept):
             write_model(model.reconstruction, partial / str(index))
-            summaries.append(_summary(model, sure, taken))
+            summaries.append(_summary(model, sure, taken, task))
             write_summary(summaries[-1], partial / str(index))
         remove_own([sparse_path])
         partial.rename(sparse_path)
@@ -148,7 +150,9 @@ def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgeme
     return {}, taken
 
 
-def _summary(mapped: MappedModel, found: Judgements, taken: Judgements) -> ModelSummary:
+def _summary(
+    mapped: MappedModel, found: Judgements, taken: Judgements, task: MappingTask
+) -> ModelSummary:
     """Count what a model holds, and say how sure it is of each photograph."""
     model = mapped.reconstruction
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
@@ -165,4 +169,5 @@ def _summary(mapped: MappedModel, found: Judgements, taken: Judgements) -> Model
         taken_out={name: one.reason for name, one in taken.items()},
         focals_px=focals,
         moves=mapped.moves,
+        tie_points=tie_points_of(task, graph_of(task)).report(model) if task.tie_points else (),
     )

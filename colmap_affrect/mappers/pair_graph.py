@@ -126,7 +126,7 @@ class PairGraph:
         path: Path,
         min_num_matches: int = MIN_NUM_MATCHES,
     ) -> Self:
-        """Read the pairs with at least as many inliers."""
+        """Read the pairs with at least as many inliers, and all images."""
         with open_database(path) as database:
             images = {image.image_id: image for image in database.read_all_images()}
             cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
@@ -139,7 +139,9 @@ class PairGraph:
                 for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
                 if len(geometry.inlier_matches) >= min_num_matches
             ]
-            options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches)
+            options = pycolmap.DatabaseCacheOptions(
+                min_num_matches=min_num_matches, load_all_images=True
+            )
             cache = pycolmap.DatabaseCache.create(database, options)
             keypoints = {
                 image_id: np.array(database.read_keypoints(image_id)[:, :2], np.float32)

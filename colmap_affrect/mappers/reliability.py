@@ -36,6 +36,7 @@ from colmap_affrect.mappers.pair_graph import (
     graph_of,
     poses_of,
 )
+from colmap_affrect.mappers.tie_points import tie_points_of, tied_evidence
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.project.report import Bridge
 
@@ -79,6 +80,7 @@ class Measures:
         original: name of the photograph that it may be a mirrored copy of, or empty.
         zoom: longest by shortest focal length of the photographs of its size, where nobody knows
             them: parts of photographs have longer ones, and their middle is elsewhere.
+        tied: what its tie points by hand say for its place, in nats.
     """
 
     evidence: float
@@ -91,6 +93,7 @@ class Measures:
     bridge: Bridge | None
     original: str
     zoom: float
+    tied: float
 
 
 @dataclass(frozen=True)
@@ -190,7 +193,8 @@ def judge(mapped: MappedModel, task: MappingTask) -> dict[str, Judgement]:
 def judged(measures: Measures) -> Judgement:
     """Return the probability that a photograph stands right, and what takes most from it."""
     constant, weights = _coefficients()
-    log_odds, left, losses = constant, 0.0, []
+    log_odds, left = constant + measures.tied, 0.0
+    losses = [(-measures.tied, "its tie points disagree")]
     for name, (weight, usual) in weights.items():
         value = TERMS[name].value(measures)
         log_odds += weight * value
@@ -218,6 +222,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
     three, long = evidence.three_view_ratios(model), num_long_tracks(model)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
     growth, fitting_px = _focal_growths(model, task), fitting_focals(model, task)
+    tied = tied_evidence(tie_points_of(task, graph).residuals(model))
     zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
     found = {}
     for image_id, own in pairs_of.items():
@@ -244,6 +249,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             bridge=mapped.bridges.get(name),
             original=graph.names[originals[image_id]] if image_id in originals else "",
             zoom=zooms.get((camera.width, camera.height), 1.0),
+            tied=tied.get(image_id, 0.0),
         )
     return found
 

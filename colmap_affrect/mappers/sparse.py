@@ -1,6 +1,6 @@
 """The sparse mapper: mapping as one estimate, for small sets with few matches."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,6 +14,8 @@ from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOption
 from colmap_affrect.mappers.moves import MOVES
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, graph_of, poses_of
 from colmap_affrect.mappers.search import Search
+from colmap_affrect.mappers.tie_joining import TieJoiner
+from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
 SOME_TRACKS = "from some of the tracks"  # the move that makes easy models
@@ -57,14 +59,17 @@ class SparseMapper(IncrementalMapper):
 
         is_large = len(graph.keypoints) >= LARGE
         if is_large and task.before:
-            best = _again(self._search(task, graph, native, shown), graph, task.before)
+            search = self._search(task, graph, native, shown)
+            best = _joined_by_hand(search, graph, _again(search, graph, task.before))
         elif is_large or task.extend:
             found = super().map(task, output_path, random_seed, show)
-            if found and graph.is_explained_by(found[0].reconstruction):
+            is_whole = found and graph.is_explained_by(found[0].reconstruction)
+            if is_whole and not task.tie_points:
                 return found
             search = self._search(task, graph, native, shown)
             models = sorted((m.reconstruction for m in found), key=search.evidence.of, reverse=True)
             best = search.joined(graph, search.adjuster, models, num_starts=1)
+            best = _joined_by_hand(search, graph, best)
             if task.extend:
                 for model in best:
                     task.extend.restore(model.reconstruction)
@@ -103,6 +108,7 @@ class SparseMapper(IncrementalMapper):
             native.get_global_bundle_adjustment(),
             frozenset(constant),
             frozenset(frames),
+            tie_points_of(task, graph),
         )
         return Search(adjuster, Evidence(graph, priors), native, self.options.num_seeds, show)
 
@@ -155,9 +161,15 @@ class SparseMapper(IncrementalMapper):
                     )
                     best = [first, *others]
                     most = search.evidence_of(best)
-        return best or (
-            self._best(replace(task, may_share=False), own[0], native, show) if is_sharing else []
-        )
+        if not best and is_sharing:
+            return self._best(replace(task, may_share=False), own[0], native, show)
+        return _joined_by_hand(search, graph, best)
+
+
+def _joined_by_hand(
+    search: Search, graph: PairGraph, models: Sequence[MappedModel]
+) -> list[MappedModel]:
+    return TieJoiner(search.adjuster.tie_points, search.grower(graph)).join(models)
 
 
 def _again(search: Search, graph: PairGraph, before: MappedModel) -> list[MappedModel]:

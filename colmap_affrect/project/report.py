@@ -10,6 +10,7 @@ from typing import Any
 
 from colmap_affrect.errors import such_as
 
+NUM_WORST = 3  # tie points that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {
@@ -123,6 +124,15 @@ class Bridge:
 
 
 @dataclass(frozen=True)
+class Residual:
+    """How far a tie point is from where the model sees it, in px of the photograph."""
+
+    point: str
+    image: str
+    error_px: float
+
+
+@dataclass(frozen=True)
 class ModelSummary:
     """One COLMAP model; the error is the mean over observations in px.
 
@@ -134,6 +144,7 @@ class ModelSummary:
         taken_out: images that were surely wrong, with the reason.
         focals_px: focal length of each image's camera.
         moves: what made the model, by the sparse mapper.
+        tie_points: the residuals of those by hand, the worst first.
     """
 
     registered_names: tuple[str, ...]
@@ -147,6 +158,7 @@ class ModelSummary:
     taken_out: dict[str, str] = field(default_factory=dict)
     focals_px: dict[str, float] = field(default_factory=dict)
     moves: tuple[str, ...] = ()
+    tie_points: tuple[Residual, ...] = ()
 
     @property
     def sure(self) -> tuple[str, ...]:
@@ -165,8 +177,20 @@ class ModelSummary:
         return [
             f"sure        {len(self.sure)}, right with a probability of {SURE:.0%} or more",
             *lines,
+            *self._tie_point_lines(),
             f"points      {self.num_points3D}, each in {self.mean_track_length:.2f} images",
             f"error       {self.mean_reprojection_error_px:.2f} px on average",
+        ]
+
+    def _tie_point_lines(self) -> list[str]:
+        if not self.tie_points:
+            return []
+        worst = self.tie_points[:NUM_WORST]
+        texts = [f"{one.point} in {one.image} {one.error_px:.1f}" for one in worst]
+        num_points = len({one.point for one in self.tie_points})
+        return [
+            f"tie points  {num_points}, {len(self.tie_points)} marks; farthest off in px: "
+            f"{', '.join(texts)}"
         ]
 
 
@@ -186,6 +210,7 @@ class ReconstructionReport:
         guided: ``pairs`` that guided matching gave more inliers, and these inliers
             ``matches_before`` and ``matches_after``; empty where no pair needed it.
         cameras: for each its images, where its focal length is from, and its spread.
+        by_hand: what was done otherwise than matches alone say, in a few words each.
     """
 
     images_total: int
@@ -203,6 +228,7 @@ class ReconstructionReport:
     advice: tuple[str, ...] = ()
     guided: dict[str, int] = field(default_factory=dict)
     cameras: tuple[dict[str, Any], ...] = ()
+    by_hand: tuple[str, ...] = ()
 
     @property
     def status(self) -> str:
@@ -260,6 +286,7 @@ class ReconstructionReport:
             **found,
             "points3D": largest.num_points3D,
             "bridges": {name: asdict(bridge) for name, bridge in largest.bridges.items()},
+            "tie_points": [asdict(residual) for residual in largest.tie_points],
             "num_models": len(self.models),
             "models": [list(model.registered_names) for model in self.models],
             "added": self.added,
@@ -281,6 +308,7 @@ class ReconstructionReport:
             lines += [f"            new {name}" for name in self.added]
         lines += _some(f"        not {line}" for line in by_story(self.unregistered))
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
+        lines += _some(f"by hand     {text}" for text in self.by_hand)
         if self.guided:
             before, after = self.guided["matches_before"], self.guided["matches_after"]
             pairs = f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"

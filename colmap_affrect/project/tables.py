@@ -9,12 +9,17 @@ from colmap_affrect.options import suggestion
 
 
 def read_table(
-    path: Path, where: str, columns: Sequence[str], key: str = "name"
+    path: Path,
+    where: str,
+    columns: Sequence[str],
+    key: str = "name",
+    header: Sequence[str] = (),
 ) -> list[tuple[str, dict[str, str]]]:
     """Return the rows of a CSV file, without empty cells, and for each the place to name.
 
     It may have the columns in any order, and must have ``key``: else OptionError, which begins
-    with ``where``, such as ``--cameras-path FILE``.
+    with ``where``, such as ``--cameras-path FILE``. Where a ``header`` is given, a first line
+    that names no column is a row under it, and no key is asked for.
     """
     try:
         reader = csv.reader(path.read_text("utf-8-sig").splitlines(), skipinitialspace=True)
@@ -23,14 +28,17 @@ def read_table(
         reason = getattr(error, "strerror", None) or error
         raise OptionError(f"{where}: cannot be read ({reason})") from error
     rows = [(number, cells) for number, cells in lines if any(cells)]
-    header = rows[0][1] if rows else []
+    if header and rows and not {cell.lower() for cell in rows[0][1]} & set(columns):
+        rows.insert(0, (0, list(header)))
+    key = "" if header else key
+    header = [cell.lower() for cell in rows[0][1]] if rows else []
     if len(header) == 1 and ";" in header[0]:
         raise OptionError(f"{where}: separate cells by commas, and write numbers with a point")
     if unknown := [column for column in header if column not in columns]:
         raise OptionError(
             f"{where}: unknown column '{unknown[0]}'{suggestion(unknown[0], columns)}"
         )
-    if key not in header or len(set(header)) < len(header):
+    if (key and key not in header) or len(set(header)) < len(header):
         raise OptionError(f"{where}: its first line must have the column '{key}', and each once")
     for number, cells in rows[1:]:
         if len(cells) > len(header):

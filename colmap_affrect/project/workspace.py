@@ -57,6 +57,7 @@ class Workspace:
         """Name the folder, and a database of the user in the place of one there; never removed."""
         self.path, self.users_database = path, users_database
         self.database = users_database or path / "database.db"
+        self.mapped_database = path / "mapped.db"  # a copy with what is done by hand
         self.seal = path / "database.db.seal"  # what the last command left in it
         self.features = path / "features.h5"  # by image
         self.matches = path / "matches.h5"  # raw ones by pair
@@ -292,7 +293,7 @@ class Workspace:
     def _results(self, stage: str) -> list[Path]:
         """Return what a stage and those after it make."""
         made = {
-            "map": [self.sparse, self.snapshots, self.report, self.page],
+            "map": [self.sparse, self.snapshots, self.report, self.page, self.mapped_database],
             "guide": [self.guided],
             "verify": [self.cameras, self.seal, *database_files(self.database)],
             "match": [self.matches],

@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
+from colmap_affrect.colmap.by_hand import NOTHING, ByHand
 from colmap_affrect.colmap.cameras import read_given_cameras
 from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.colmap.initial_cameras import InitialCameras
+from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import AffrectError, ImageError, OptionError
 from colmap_affrect.features.weights import WEIGHT_FILES, find, install_hint
@@ -187,6 +189,7 @@ class Context:
     executor: Executor | None = None  # for images and pairs, e.g. a cluster; None: threads here
     progress: Progress = SILENT  # where to show progress
     deadline_s: float = math.inf  # of time.monotonic(): from then on nothing more is tried
+    by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
 
     @property
     def inputs(self) -> Inputs:
@@ -231,6 +234,11 @@ class Context:
         """How images are registered."""
         options: MapperOptions = self._part(MAPPERS, "map")
         return options
+
+    def verified_digest(self) -> str:
+        """Return digests of the verified pairs and, after a plus, of what is said by hand."""
+        said = self.by_hand.digest()
+        return rows_digest(self.workspace.database) + (f"+{said}" if said else "")
 
     def _built(
         self, cls: type[AnyOptions], stage: str, beside: type[Options] | None = None

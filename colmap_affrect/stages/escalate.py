@@ -21,7 +21,6 @@ from functools import cached_property
 from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import ImageError, such_as
 from colmap_affrect.geometry.neighbors import num_consistent_matches
@@ -112,13 +111,13 @@ class Escalation:
         return prepare(self.extraction, context.resources, names, context.progress)
 
     def num_inliers(self) -> dict[Pair, int]:
-        """Return the inliers of each pair that is in the database, 0 where it is not verified."""
+        """Return the inliers of pairs in the database that may be used, 0 of unverified ones."""
         ids = colmap_database.image_ids(self.path)
         verified = num_verified_inliers(self.context)
         return {
             (first, second): verified.get((first, second)) or verified.get((second, first), 0)
             for first, second in self.pairs
-            if first in ids and second in ids
+            if first in ids and second in ids and self.context.by_hand.allows(first, second)
         }
 
     def model(self) -> ModelSummary:
@@ -134,7 +133,7 @@ class Escalation:
         """
         workspace, names = self.context.workspace, self.features.names()
         lost = set(names) - set(model.sure)
-        if workspace.made_from("map") != rows_digest(self.path):
+        if workspace.made_from("map") != self.context.verified_digest():
             insecure = lost & self._insecure()  # the next model tells of what has been tied since
             maps_next = insecure != lost and workspace.sparse.exists() and len(names) < LARGE
             lost = set() if maps_next else insecure

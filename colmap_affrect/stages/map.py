@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
-from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
@@ -43,7 +43,7 @@ def map_images(
     workspace.require("verify")
     # Read first: it may be discarded now.
     existing = read_existing(extend, workspace.database) if extend else None
-    inputs = _inputs(workspace, extend)
+    inputs = _inputs(context, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
     known = workspace.made_from("map") if workspace.sparse.exists() else ""
     if known != inputs and " " in known and not extend:
@@ -56,7 +56,9 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     known_models = read_summaries(workspace.sparse)  # refuses edited ones
-    before = _read_before(workspace, known_models[0]) if goes_on and known_models else None
+    is_same = known.partition("+")[2] == inputs.partition("+")[2]  # as it was said by hand
+    goes_on = goes_on and bool(known_models) and is_same
+    before = _read_before(workspace, known_models[0]) if goes_on else None
     workspace.record_made_from(map="")  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
@@ -70,16 +72,22 @@ def _task(
     context: Context, existing: ExistingModel | None, before: MappedModel | None = None
 ) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
-    workspace = context.workspace
-    copied = workspace.is_foreign
+    workspace, by_hand = context.workspace, context.by_hand
+    copied, path = workspace.is_foreign, workspace.database
+    workspace.mapped_database.unlink(missing_ok=True)
+    tie_points: Mapping[str, Mapping[str, int]] = {}
+    if by_hand != NOTHING:
+        path = workspace.mapped_database
+        tie_points = by_hand.copy_database(workspace.database, path)
     return MappingTask(
-        workspace.database,
+        path,
         workspace.photographs(),
         existing,
         before,
         unmeasured=frozenset() if copied else frozenset(unmeasured_pairs(context)),
         cameras=read_camera_records(workspace.cameras),
         may_share=not copied and context.inputs.may_share,
+        tie_points=tie_points,
     )
 
 
@@ -88,13 +96,13 @@ def _read_before(workspace: Workspace, summary: ModelSummary) -> MappedModel:
     return MappedModel(model, moves=summary.moves)
 
 
-def _inputs(workspace: Workspace, extend: Extension | None) -> str:
-    """Return the digests of verified pairs and, after a space, of the model that is extended."""
-    geometry = rows_digest(workspace.database)
+def _inputs(context: Context, extend: Extension | None) -> str:
+    """Return digests of what is mapped and, after a space, of the model that is extended."""
+    verified = context.verified_digest()
     if not extend:
-        return geometry
-    own = extend.model_path.resolve().is_relative_to(workspace.sparse.resolve())
-    return f"{geometry} {'own' if own else extend.digest()}"
+        return verified
+    own = extend.model_path.resolve().is_relative_to(context.workspace.sparse.resolve())
+    return f"{verified} {'own' if own else extend.digest()}"
 
 
 def image_names(context: Context) -> list[str]:
@@ -130,6 +138,8 @@ def unregistered(
     for name in [name for name in names if name not in registered]:
         if name in elsewhere:
             reasons[name] = elsewhere[name]
+        elif name in context.by_hand.left_out:
+            reasons[name] = "left out by hand"
         elif name not in num_keypoints:
             reasons[name] = "unreadable"
         elif not num_keypoints[name]:
