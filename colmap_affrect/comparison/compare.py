@@ -96,10 +96,8 @@ def _checked(image_path: Path, options: CompareOptions) -> tuple[Inputs, list[st
     inputs.check()
     names = inputs.names()
     if len(names) < 2:
-        raise AffrectError(
-            f"{image_path}: only {names[0] if names else 'no image'} to use; a comparison "
-            "needs at least two images"
-        )
+        only = f"only {names[0] if names else 'no image'} to use"
+        raise AffrectError(f"{image_path}: {only}; a comparison needs at least two images")
     inputs.check_names(names)
     return inputs, names
 
@@ -110,24 +108,23 @@ def _same_for_all(
     """Return what all methods begin with, for the record; digests stand for the files."""
     files = {name: inputs.photographs.files(name) for name in names}
     files[""] = inputs.camera_files
-    sections = {"verification": options.verification, "mapping": options.mapping}
+    but_seeds: dict[str, Any] = {"mode": "json", "exclude_none": True, "exclude": {"random_seed"}}
     return {
         "photographs": {k: content_of(paths).digest[:NUM_DIGITS] for k, paths in files.items()},
         "pairs": {"number": len(pairs), "sha256": digest_of(pairs)},
         "camera": options.cameras.to_mapping(),
         "masks": {key: bool(path) for key, path in options.masks.to_mapping().items()},
-        **{
-            name: {k: value for k, value in section.to_mapping().items() if k != "random_seed"}
-            for name, section in sections.items()
-        },
+        "verification": options.verification.model_dump(**but_seeds),
+        "mapping": options.mapping.model_dump(**but_seeds),
     }
 
 
 def _settings(same: Mapping[str, Any], options: CompareOptions) -> dict[str, Any]:
-    places = ("image_list_path", "from_database", "ground_truth_path")
     return {
         **{key: value for key, value in same.items() if key != "photographs"},
-        **{key: str(getattr(options, key) or "") for key in places},
+        "image_list_path": str(options.image_list_path or ""),
+        "from_database": str(options.from_database or ""),
+        "ground_truth_path": str(options.ground_truth_path or ""),
         "match_list_path": options.pairs.match_list_path,
         "preset": options.mapping.preset_name,
     }

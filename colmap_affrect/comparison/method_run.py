@@ -50,10 +50,7 @@ from colmap_affrect.stages.verify import verify_matches
 
 
 def extract_sift(
-    database_path: Path,
-    image_path: Path,
-    image_names: Sequence[str],
-    masks: MaskOptions,
+    database_path: Path, image_path: Path, image_names: Sequence[str], masks: MaskOptions
 ) -> dict[str, str]:
     """Extract SIFT features of images of a database; those that have some are kept.
 
@@ -64,18 +61,9 @@ def extract_sift(
     photographs = Photographs(image_path, masks)
     impossible = {name: why for name in image_names if (why := photographs.why_impossible(name))}
     usable = [name for name in image_names if name not in impossible]
-    reader = pycolmap.ImageReaderOptions()
-    if masks.path:
-        reader.mask_path = Path(masks.path)
-    if masks.camera_path:
-        reader.camera_mask_path = Path(masks.camera_path)
+    reader = pycolmap.ImageReaderOptions(mask_path=masks.path, camera_mask_path=masks.camera_path)
     if usable:  # pycolmap takes no names for all
-        pycolmap.extract_features(
-            database_path,
-            image_path,
-            image_names=usable,
-            reader_options=reader,
-        )
+        pycolmap.extract_features(database_path, image_path, usable, reader_options=reader)
     ids = image_ids(database_path)
     with open_database(database_path) as database:
         failed = [name for name in usable if not database.exists_keypoints(ids[name])]
@@ -96,11 +84,8 @@ def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
     with temporary_folder(database_path.parent) as folder:
         list_path = folder / "pairs.txt"
         replace_text(list_path, "".join(f"{first} {second}\n" for first, second in pairs))
-        pycolmap.match_image_pairs(
-            database_path,
-            matching_options=options,
-            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=list_path),
-        )
+        listed = pycolmap.ImportedPairingOptions(match_list_path=list_path)
+        pycolmap.match_image_pairs(database_path, options, listed)
 
 
 METHODS = "methods"  # folder of all methods
@@ -147,10 +132,10 @@ class MethodRun:
             self.mapping = Recipe().mapper_options("colmap")
         self.workspace = Workspace(self.output_path / METHODS / self.method.folder_name)
         self.database = self.workspace.database
-        self.result = self._read_result()
 
-    def _read_result(self) -> MethodResult:
-        """Return what is done of the method."""
+    @property
+    def result(self) -> MethodResult:
+        """What is done of the method, as it is on disk."""
         with suppress(FileNotFoundError, ValidationError):  # of a version before: features stay
             return RESULT.validate_json((self.workspace.path / "result.json").read_bytes())
         return MethodResult(
@@ -162,9 +147,9 @@ class MethodRun:
 
     def finished(self) -> MethodResult | None:
         """Return the result of the method if it has been run with the same seeds."""
-        self.result = self._read_result()
-        seeds = [seed.seed for seed in self.result.seeds]
-        return self.result if seeds == list(self.options.seeds) else None
+        result = self.result
+        seeds = [seed.seed for seed in result.seeds]
+        return result if seeds == list(self.options.seeds) else None
 
     def begin(self, *, overwrite: bool) -> None:
         """Make the folder; StoreError where the method was run there on something else."""
@@ -187,7 +172,7 @@ class MethodRun:
 
     def run(self) -> None:
         """Extract, match, verify and map; what is there is kept."""
-        self.result = replace(self.result, failed="")
+        self.keep(failed="")
         if not self.result.wall_s:  # time that a killed run took does not count
             watch = Stopwatch()
             find = self._match_recipe if self.method.recipe else self._match_sift
@@ -202,8 +187,8 @@ class MethodRun:
     def keep(self, **values: Any) -> None:
         """Put what is new of the result on disk."""
         peak = max(self.result.peak_memory_bytes, peak_memory_bytes())
-        self.result = replace(self.result, peak_memory_bytes=peak, **values)
-        replace_bytes(self.workspace.path / "result.json", RESULT.dump_json(self.result, indent=1))
+        result = replace(self.result, peak_memory_bytes=peak, **values)
+        replace_bytes(self.workspace.path / "result.json", RESULT.dump_json(result, indent=1))
 
     def _match_sift(self, watch: Stopwatch) -> dict[str, str]:
         """Extract and match as COLMAP does; return why images cannot be used."""
@@ -245,24 +230,21 @@ class MethodRun:
         """Verify and map a copy of the database of the method, in a folder of the seed."""
         folder = self.workspace.path / f"seed-{seed}"
         remove_own([folder])
-        with new_results(folder) as (new,):
+        with new_results(folder) as (new,):  # gets its name when all is done
             new.mkdir()
-            return self._seed_result(seed, new, f"{self.result.folder}/{folder.name}/sparse/0")
-
-    def _seed_result(self, seed: int, folder: Path, model_path: str) -> SeedResult:
-        """Verify and map in a folder that is called after the seed when all is done."""
-        database_path, watch = folder / "database.db", Stopwatch()
-        copy_database(self.database, database_path)
-        with open_database(database_path) as database:
-            database.clear_two_view_geometries()
-        map_seed = self._map_recipe if self.method.recipe else self._map_sift
-        models = map_seed(seed, folder, watch, self.progress.titled(f"seed {seed}, "))
+            database_path, watch = new / "database.db", Stopwatch()
+            copy_database(self.database, database_path)
+            with open_database(database_path) as database:
+                database.clear_two_view_geometries()
+            map_seed = self._map_recipe if self.method.recipe else self._map_sift
+            models = map_seed(seed, new, watch, self.progress.titled(f"seed {seed}, "))
+            verified = verified_pairs(database_path, self.verification.min_num_inliers)
         largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
         return SeedResult(
             seed=seed,
             models=tuple(item.registered_names for item in models),
-            model_path=model_path if models else "",
-            verified_pairs=len(verified_pairs(database_path, self.verification.min_num_inliers)),
+            model_path=f"{self.result.folder}/{folder.name}/sparse/0" if models else "",
+            verified_pairs=len(verified),
             points3D=largest.num_points3D,
             mean_track_length=largest.mean_track_length,
             mean_reprojection_error_px=largest.mean_reprojection_error_px,

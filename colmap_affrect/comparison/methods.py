@@ -44,9 +44,7 @@ class Method:
     def folder_name(self) -> str:
         """Name of the folder of its results, different for every label."""
         plain = re.sub(r"[^\w-]+", "_", self.label)
-        if plain == self.label:
-            return plain
-        return f"{plain}-{zlib.crc32(self.label.encode()):08x}"
+        return plain if plain == self.label else f"{plain}-{zlib.crc32(self.label.encode()):08x}"
 
 
 def parse_methods(
@@ -63,9 +61,8 @@ def parse_methods(
             continue
         head, colon, settings = text.partition(":")
         *names, last = (name.strip() for name in head.split(","))
-        methods += [parse_method(name, depth_settings) for name in names if name]
-        if last:
-            methods.append(parse_method(last + colon + settings, depth_settings))
+        texts = [*names, last and last + colon + settings]
+        methods += [parse_method(each, depth_settings) for each in texts if each]
     if not methods:
         raise OptionError("no method given")
     labels = [method.label for method in methods]

@@ -51,9 +51,8 @@ class Mark:
 
 @dataclass(frozen=True)
 class Card:
-    """A photograph on the contact sheet; it has the same number everywhere on the page."""
+    """A photograph on the contact sheet."""
 
-    number: int
     name: str
     marks: tuple[Mark, ...]
     groups: tuple[str, ...]
@@ -79,8 +78,7 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
         "filters": FILTERS,
         "cards": cards,
         "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
-        "settings": flat(comparison.settings),
-        "method_options": [flat(column.method.options) for column in columns],
+        "flat": flat,
         "views": views,
         "kinds": KINDS,
     }
@@ -90,15 +88,14 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
 
 def columns_of(comparison: Comparison) -> list[Column]:
     """Give each method that finished a letter and a colour, the best first."""
-    letters = [*string.ascii_uppercase, *map(str, range(27, len(comparison.finished) + 1))]
-    marks = zip(letters, itertools.cycle(METHOD_COLORS), comparison.finished, strict=False)
-    return [Column(*mark) for mark in marks]
+    letters = itertools.chain(string.ascii_uppercase, map(str, itertools.count(27)))
+    return list(map(Column, letters, itertools.cycle(METHOD_COLORS), comparison.finished))
 
 
 def cards_of(columns: list[Column], comparison: Comparison) -> list[Card]:
     """Return the contact sheet."""
     cards = []
-    for number, name in enumerate(comparison.image_names, 1):
+    for name in comparison.image_names:
         marks = tuple(_mark(column, name) for column in columns)
         kinds = {mark.kind for mark in marks}
         registered = comparison.registered_by[name]
@@ -110,8 +107,7 @@ def cards_of(columns: list[Column], comparison: Comparison) -> list[Card]:
             "uncertain": "uncertain" in kinds,
             "none": not registered,
         }
-        groups = tuple(group for group, passes in tests.items() if passes)
-        cards.append(Card(number, name, marks, groups))
+        cards.append(Card(name, marks, tuple(group for group in tests if tests[group])))
     return cards
 
 

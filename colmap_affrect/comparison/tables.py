@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import zip_longest
 
-from colmap_affrect.comparison.methods import SIFT_COLMAP, SIFT_SUMMARIES
+from colmap_affrect.comparison.methods import SIFT, SIFT_COLMAP, SIFT_SUMMARIES
 from colmap_affrect.comparison.results import MEASURES, Comparison, Span
 from colmap_affrect.errors import such_as
 from colmap_affrect.project.report import by_story
@@ -60,36 +60,31 @@ def headline(comparison: Comparison) -> str:
         return "No method finished."
     most = max(method.registered.max for method in finished)
     if most < MIN_IMAGES <= total:
-        return (
-            f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
-            "photographs."
-        )
+        few = f"no method registers more than {most:g} of the {total} photographs"
+        return f"Nothing was reconstructed: {few}."
+    named = {method.name: method for method in finished}
+    ours = next((name for name in named if name not in SIFT_SUMMARIES), "")
     kinds = {
-        "COLMAP as it is": [m for m in finished if m.name == SIFT_COLMAP],
-        "our mapper with COLMAP's SIFT": [
-            m for m in finished if m.name in SIFT_SUMMARIES and m.name != SIFT_COLMAP
-        ],
-        "our features": [m for m in finished if m.name not in SIFT_SUMMARIES],
+        SIFT_COLMAP: "COLMAP as it is",
+        SIFT: f"our mapper with COLMAP's SIFT ({SIFT})",
+        ours: f"our features ({ours})",
     }
     what = "correct" if comparison.has_ground_truth else "sure"
     texts = [
-        f"{kind}{'' if best.name == SIFT_COLMAP else f' ({best.name})'} "
-        f"{span_text(best.registered)}, {span_text(best.right)} of them {what}"
-        for kind, methods in kinds.items()
-        for best in methods[:1]
+        f"{kind} {span_text(named[name].registered)}, {span_text(named[name].right)} of them {what}"
+        for name, kind in kinds.items()
+        if name in named
     ]
     return f"Of {total} photographs are registered: {'; '.join(texts)}."
 
 
 def notes(comparison: Comparison) -> list[str]:
     """Return what follows on the counts: what is missing or doubtful, and which methods failed."""
-    finished = comparison.finished
-    texts = []
-    if len(finished) > 1:
-        only = comparison.only_registered_by
-        for method in finished:
-            if names := [name for name, by in only.items() if by == method.name]:
-                texts.append(f"Only {method.name} registers {such_as(names, MAX_NAMES)}.")
+    finished, texts = comparison.finished, list[str]()
+    for method in finished if len(finished) > 1 else ():
+        only = comparison.only_registered_by.items()
+        if names := [name for name, by in only if by == method.name]:
+            texts.append(f"Only {method.name} registers {such_as(names, MAX_NAMES)}.")
     if finished and (missing := comparison.registered_by_none):
         texts.append(f"Registered by no method: {such_as(missing, MAX_NAMES)}.")
     texts += [f"{m.name} failed: {m.failed}" for m in comparison.methods if m.failed]

@@ -28,6 +28,7 @@ from colmap_affrect.project.outputs import leads_outside
 logger = logging.getLogger(__name__)
 
 Names = tuple[str, str]  # of the images of a pair
+Truth = TrueHomography | TruePose | Correspondences
 Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 """Cameras and cam_from_world poses by the name of the image without suffix."""
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
@@ -43,7 +44,7 @@ class EvaluationPair:
     name: str
     images: Names  # the keys of their features and depth maps
     paths: tuple[Path, Path]
-    truth: TrueHomography | TruePose | Correspondences
+    truth: Truth
     category: str = ""  # of difficulty, as tables group pairs; empty for none
 
     @property
@@ -274,20 +275,17 @@ def _entry(values: Any, where: str) -> _Entry:
 
 
 def _loaded(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Pairs:
-    load = partial(_pair, folder=folder, offset_px=offset_px)
-    return list(map_ordered(load, entries, available_cores()))
+    """Return pairs with their truth; ``offset_px`` is added to coordinates for pixel centres."""
+
+    def pair(entry: _Entry) -> EvaluationPair:
+        images = entry.image1, entry.image2
+        paths, truth = (folder / images[0], folder / images[1]), _truth(entry, folder, offset_px)
+        return EvaluationPair(entry.name, images, paths, truth, entry.category)
+
+    return list(map_ordered(pair, entries, available_cores()))
 
 
-def _pair(entry: _Entry, folder: Path, offset_px: float) -> EvaluationPair:
-    images, paths = (entry.image1, entry.image2), (folder / entry.image1, folder / entry.image2)
-    truth = _truth(entry, folder, offset_px)
-    return EvaluationPair(entry.name, images, paths, truth, entry.category)
-
-
-def _truth(
-    entry: _Entry, folder: Path, offset_px: float
-) -> TrueHomography | TruePose | Correspondences:
-    """Return the truth of an entry; ``offset_px`` is added to coordinates for pixel centres."""
+def _truth(entry: _Entry, folder: Path, offset_px: float) -> Truth:
     name, numbers = entry.name, entry.homography or entry.correspondences
     if isinstance(numbers, str):
         if leads_outside(numbers):
@@ -307,8 +305,10 @@ def _truth(
     if not isinstance(given, Mapping) or given.keys() != shapes.keys():
         raise AffrectError(f"{name}: relative_pose needs {', '.join(shapes)}")
     values = {k: finite_numbers(given[k], shape, f"{name}: {k}") for k, shape in shapes.items()}
-    cameras = []
-    for key in ("intrinsics1", "intrinsics2"):
+
+    def camera(key: str) -> pycolmap.Camera:
         values[key][:2, 2] = colmap_from_pixel(values[key][:2, 2] + offset_px)
-        cameras.append(pinhole(values[key], f"{name}: {key}"))
-    return TruePose((cameras[0], cameras[1]), (values["rotation"], values["translation"]))
+        return pinhole(values[key], f"{name}: {key}")
+
+    pose = values["rotation"], values["translation"]
+    return TruePose((camera("intrinsics1"), camera("intrinsics2")), pose)

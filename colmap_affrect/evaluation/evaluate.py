@@ -6,9 +6,8 @@ escalation the one with most inliers of COLMAP's verification counts.
 """
 
 import logging
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -89,9 +88,8 @@ class RecipeRun:
         self._matchings: dict[int, Matching] = {}
         for level in self._extractor.extractors:
             chosen = extraction.levels[level]
-            of, kind = chosen.matching or matching, chosen.features.name
-            task = Matching(self._store, of, level, chosen.base, kind, resources, limit)
-            self._matchings[level] = task
+            how = chosen.matching or matching, level, chosen.base, chosen.features.name
+            self._matchings[level] = Matching(self._store, *how, resources, limit)
         self.failures: dict[str, str] = {}  # images that could not be used in this run: why
         self._lock = Lock()  # of extraction and of the store
 
@@ -109,33 +107,31 @@ class RecipeRun:
     def _result(self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair) -> PairResult:
         """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
         watch = Stopwatch("extract", "match", "estimate")
-        result, points = self._matched(matchers, pair, watch)
-        if result.failure:
-            return result
+        found, points = self._matched(matchers, pair, watch)
         try:
             with watch.step("estimate"):
                 score = pair.truth.score(*points, self._options)
         except Exception as error:
             logger.exception("%s: %s cannot be scored", self.label, pair.name)
-            return self._failed(pair, f"{type(error).__name__}: {error}")
-        steps = watch.seconds
-        return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
-
-    def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
-        score = pair.truth.score(*NOTHING, self._options)
-        return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
+            score = pair.truth.score(*NOTHING, self._options)
+            found = {"failure": f"{type(error).__name__}: {error}"}
+        if "failure" not in found:
+            found |= {"seconds": sum(watch.seconds.values()), "seconds_by_step": watch.seconds}
+        return PairResult(**vars(score), name=pair.name, category=pair.category, **found)
 
     def _matched(
         self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair, watch: Stopwatch
-    ) -> tuple[PairResult, tuple[Array, Array]]:
-        """Return a result without score, and (M, 2) and (M, 2) points of the best level.
+    ) -> tuple[dict[str, Any], tuple[Array, Array]]:
+        """Return what a result says of matches, and (M, 2) and (M, 2) points, of the best level.
 
-        The result has a failure where an image cannot be used.
+        Of a pair with an image that cannot be used that is the failure.
         """
-        best, points, most = None, NOTHING, 0
+        found, points, most = dict[str, Any](), NOTHING, 0
         for level, matcher in matchers.items():
             with self._lock, watch.step("extract"):
-                if not self._extract(pair, level):
+                images = zip(pair.images, pair.paths, pair.intrinsics, strict=True)
+                usable = [self._extract(*image, level) for image in images]
+                if not all(usable):
                     break
                 first, second = map(matcher.prepared, pair.images)
             with watch.step("match"):
@@ -147,27 +143,16 @@ class RecipeRun:
                     decided = self.recipe.extraction.levels[level].name if count else "none"
             if count > most or not most:
                 most, points = count, (frames[0][:, :, 2], frames[1][:, :, 2])
-                best = PairResult(
-                    math.inf,
-                    0,
-                    name=pair.name,
-                    category=pair.category,
-                    num_matches=len(rows1),
-                    num_keypoints=(len(first.frames), len(second.frames)),
-                    level=decided,
-                )
+                num_keypoints = len(first.frames), len(second.frames)
+                found = {"num_matches": len(rows1), "num_keypoints": num_keypoints}
+                found["level"] = decided
             if most >= max(1, self.recipe.escalate.strong_num_inliers):
                 break
-        failures = (self.failures.get(name, "") for name in pair.images)
-        return best or self._failed(pair, "; ".join(filter(None, failures))), points
+        failures = filter(None, (self.failures.get(name) for name in pair.images))
+        return found or {"failure": "; ".join(failures)}, points
 
-    def _extract(self, pair: EvaluationPair, level: int) -> bool:
-        """Extract what the images lack of a level; tell whether both can be used."""
-        images = zip(pair.images, pair.paths, pair.intrinsics, strict=True)
-        usable = [self._extract_image(*image, level) for image in images]
-        return all(usable)
-
-    def _extract_image(self, name: str, path: Path, intrinsics: Array | None, level: int) -> bool:
+    def _extract(self, name: str, path: Path, intrinsics: Array | None, level: int) -> bool:
+        """Extract what an image lacks of a level; tell whether it can be used."""
         store, base = self._store, self.recipe.extraction.levels[level].base
         there = store.level_ranges(name) if name in store.names() else {}
         for missing in sorted({0, base, level} - there.keys()):

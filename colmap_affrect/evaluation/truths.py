@@ -7,7 +7,7 @@ all that it knows. Results of failed pairs have infinite errors.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from statistics import fmean, median_low
 from typing import Annotated, Any
@@ -170,14 +170,12 @@ class TrueHomography:
 
     def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
         """Score by the paper's RANSAC, in px."""
-        matrix, num_inliers = estimate_matrix(
-            cv2.findHomography, (points1, points2), cv2.RANSAC, options.threshold_px, options
-        )
+        given = cv2.findHomography, (points1, points2), cv2.RANSAC, options.threshold_px
+        matrix, num_inliers = estimate_matrix(*given, options)
         error = self.error_px(matrix)
         num_correct = int((transfer_errors(self.matrix, points1, points2) < CORRECT_PX).sum())
-        return PairScore(
-            error, num_inliers, num_correct, kind="homographies", solved=float(error < MAX_ERROR_PX)
-        )
+        solved = float(error < MAX_ERROR_PX)
+        return PairScore(error, num_inliers, num_correct, solved=solved, kind="homographies")
 
 
 def transfer_errors(matrix: Array, points1: Points, points2: Points) -> Array:
@@ -235,16 +233,14 @@ class Correspondences:
         ``error`` is the median of the symmetric epipolar distances of the correspondences, in px.
         The pair is solved as far as :func:`wxbs_score` says.
         """
-        estimate = partial(estimate_matrix, cv2.findFundamentalMat, (points1, points2))
+        given = cv2.findFundamentalMat, (points1, points2), cv2.USAC_MAGSAC, MAX_EPIPOLAR_NOISE_PX
         found = []
         for seed in range(options.random_seed, options.random_seed + NUM_ESTIMATES):
-            seeded = replace(options, random_seed=seed)
-            matrix, count = estimate(cv2.USAC_MAGSAC, MAX_EPIPOLAR_NOISE_PX, seeded)
+            matrix, count = estimate_matrix(*given, replace(options, random_seed=seed))
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
             found.append((float(np.median(distances)), count, seed, distances))
-        error, num_inliers, _, distances = median_low(found)
-        score = wxbs_score(distances)
-        return PairScore(error, num_inliers, solved=score, kind="correspondences")
+        error, count, _, distances = median_low(found)
+        return PairScore(error, count, solved=wxbs_score(distances), kind="correspondences")
 
 
 def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2: Points) -> Array:

@@ -41,9 +41,8 @@ MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 
 @dataclass(frozen=True)
 class Card:
-    """What became of a photograph, which has the same number everywhere on the page."""
+    """What became of a photograph."""
 
-    number: int
     name: str
     kind: str  # one of ``KINDS``, or ``missing``
     text: str
@@ -64,20 +63,18 @@ def write_run_page(
     are of the verified pairs.
     """
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
-    cards = [_card(number, name, report, model) for number, name in enumerate(names, 1)]
+    cards = [_card(name, report, model) for name in names]
     known = set(names)
     pair_inliers = {pair: n for pair, n in pair_inliers.items() if known >= set(pair)}
     view = read_view(workspace.sparse / "0" if report.models else None)
     kinds = Counter(card.kind for card in cards)
     content = {
+        "report": report,
+        "model": model,
         "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
-        "about": _about(report),
         "doubts": _doubts(report, model),
-        "doubts_title": "What to doubt" if report.models else "Why there is no model",
         "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
         "max_num_lines": MAX_LINES,
-        "advice": report.advice,
-        "tiles": _tiles(report, model),
         "view": view,
         "kinds": {kind: f"{text} ({kinds[kind]})" for kind, text in KINDS.items() if kinds[kind]},
         "cards": cards,
@@ -91,19 +88,11 @@ def write_run_page(
     return write_page(workspace.page, template, content, names, image_path, views, progress)
 
 
-def _about(report: ReconstructionReport) -> str:
-    by = f"recipe {report.recipe}" if report.recipe else "the database of another program"
-    return (
-        f"colmap-affrect {report.versions['colmap-affrect']}, {by}, {report.mapping['name']} "
-        f"mapper, preset {report.preset}."
-    )
-
-
-def _card(number: int, name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
+def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
     if name not in set(model.registered_names):
         text = report.unregistered.get(name, "not registered")
         text += f": {report.failures[name]}" if name in report.failures else ""
-        return Card(number, name, "missing", text, ("all", "missing"))
+        return Card(name, "missing", text, ("all", "missing"))
     bridge = model.bridges.get(name)
     kind, text = ("bridged", bridge.text()) if bridge else ("tracks", "registered")
     if name in report.extended:
@@ -114,7 +103,7 @@ def _card(number: int, name: str, report: ReconstructionReport, model: ModelSumm
     if name in model.doubtful:
         kind, text = "doubtful", f"{text}; doubtful: {model.doubtful[name]}"
         groups.append("doubtful")
-    return Card(number, name, kind, text, tuple(groups))
+    return Card(name, kind, text, tuple(groups))
 
 
 def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
@@ -126,44 +115,15 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     return [f"{why[0].upper()}{why[1:]}.", *by_story(fates)]
 
 
-def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
-    tiles = {
-        "photographs in the model": f"{len(model.registered_names)} of {report.images_total}",
-        "verified pairs": f"{report.num_verified_pairs:,} of {report.num_pairs:,}",
-    }
-    if report.models:
-        tiles |= {
-            "of them sure": f"{len(model.sure)}",
-            "points": f"{model.num_points3D:,}",
-            "photographs per point": f"{model.mean_track_length:.2f}",
-            "reprojection error": f"{model.mean_reprojection_error_px:.2f} px",
-        }
-    if len(report.models) > 1:
-        tiles["models"] = str(len(report.models))
-    seconds = sum(stage.wall_s for stage in report.stages)
-    return tiles | {"seconds": f"{seconds:,.1f}".removesuffix(".0")}
-
-
 def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, Any]:
-    index = {name: number for number, name in enumerate(names)}
-    rows = []
-    for camera in report.cameras[:MAX_NUM_CAMERAS]:
-        refined, source = camera["refined_px"], camera["source"]
-        listed = (f"{index[name] + 1} {name}" for name in camera["names"] if name in index)
-        rows.append(
-            {
-                "photographs": such_as(listed),
-                "focal": f"{camera['focal_px']:,.0f}",
-                "refined": f"{refined:,.0f}" if refined else "-",
-                "source": f"{SOURCES.get(source, source)}{camera['why'] and ': '}{camera['why']}",
-            }
-        )
-    counts, total = Counter(camera["source"] for camera in report.cameras), len(report.cameras)
-    sources = ", ".join(f"{count} {SOURCES.get(key, key)}" for key, count in counts.most_common())
-    note = f"{total} camera{'s' if total != 1 else ''}, focal lengths: {sources}."
-    if total > len(rows):
-        note += f" The first {len(rows)} are listed, report.json has all."
-    return {"cameras": rows, "camera_note": note}
+    """Return the cameras that are listed, with photographs, and how many lengths are from where."""
+    numbered = {name: f"{number} {name}" for number, name in enumerate(names, 1)}
+    cameras = [
+        (camera, such_as(numbered[name] for name in camera["names"] if name in numbered))
+        for camera in report.cameras[:MAX_NUM_CAMERAS]
+    ]
+    counts = Counter(camera["source"] for camera in report.cameras).most_common()
+    return {"cameras": cameras, "source_counts": counts, "source_texts": SOURCES}
 
 
 def _matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> str:
