@@ -7,29 +7,27 @@ Files are read as runs read them, and what their readers say is what is found.
 import dataclasses
 import json
 import shlex
-from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
-from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.project.record import STAGES
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 
 Read = TypeVar("Read")
 Severity = Literal["error", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+"""A program fails, or results are wrong; something is missing from results; worth knowing."""
+SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 
 MAX_ITEMS_SHOWN = 5
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
@@ -37,44 +35,33 @@ SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found.
-
-    Attributes:
-        severity: ``error`` (a program will fail, or results are wrong), ``warning`` (something
-            is missing from the results), or ``note`` (worth knowing).
-        where: file, folder or part of the installation.
-    """
+    """One thing that was found."""
 
     severity: Severity
-    where: str
+    where: str  # file, folder or part of the installation
     what: str
     advice: str
 
 
 @dataclass
 class Diagnosis:
-    """The result of an examination: what was found, and what was looked at."""
+    """The result of an examination: what was looked at, and what was found, the worst first."""
 
     checked: list[str] = field(default_factory=list)
-    _found: list[Finding] = field(default_factory=list, init=False)
+    findings: list[Finding] = field(default_factory=list)
 
     def add(self, severity: Severity, where: Path | str, what: str, advice: str) -> None:
         """Add what is wrong with a file, folder or part of the installation, and what helps."""
-        self._found.append(Finding(severity, str(where), what, advice))
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What was found, the worst first."""
-        return tuple(sorted(self._found, key=lambda found: SEVERITIES.index(found.severity)))
+        self.findings.append(Finding(severity, str(where), what, advice))
+        self.findings.sort(key=lambda found: SEVERITIES.index(found.severity))
 
     @property
     def num_errors(self) -> int:
         """Number of findings that are errors."""
-        return self._counts["error"]
+        return self._count("error")
 
-    @property
-    def _counts(self) -> Counter[str]:
-        return Counter(finding.severity for finding in self._found)
+    def _count(self, severity: Severity) -> int:
+        return sum(finding.severity == severity for finding in self.findings)
 
     def summary(self) -> str:
         """Return text for people."""
@@ -82,7 +69,7 @@ class Diagnosis:
         for finding in self.findings:
             lines.append(f"{finding.severity:8s} {finding.where}: {finding.what}")
             lines.append(f"         -> {finding.advice}")
-        counts = {severity: self._counts[severity] for severity in SEVERITIES[:2]}
+        counts = {severity: self._count(severity) for severity in SEVERITIES[:2]}
         found = [f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items() if count]
         return "\n".join([*lines, ", ".join(found) or "no problems found"])
 
@@ -90,7 +77,7 @@ class Diagnosis:
         """Return the same for programs."""
         content = {
             "num_errors": self.num_errors,
-            "num_warnings": self._counts["warning"],
+            "num_warnings": self._count("warning"),
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
             "checked": self.checked,
         }
@@ -103,15 +90,13 @@ def diagnose(path: Path | None = None, *, weights_path: Path | None = None) -> D
     OptionError when something that is given is not there.
     """
     if path is not None and not path.exists():
-        raise OptionError(
-            f"{path}: no such file or folder; give a COLMAP database or output folder"
-        )
+        wanted = "give a COLMAP database or output folder"
+        raise OptionError(f"{path}: no such file or folder; {wanted}")
     if weights_path is not None and not weights_path.is_dir():
         raise OptionError(f"--weights {weights_path}: no such folder")
     diagnosis = Diagnosis()
     if path is not None:
-        examine = _examine_folder if path.is_dir() else examine_database
-        examine(diagnosis, path)
+        (_examine_folder if path.is_dir() else examine_database)(diagnosis, path)
     _examine_installation(diagnosis, weights_path)
     return diagnosis
 
@@ -122,10 +107,10 @@ def _examine_installation(diagnosis: Diagnosis, weights_path: Path | None) -> No
     try:
         from colmap_affrect.features.networks import resolve_device
     except (ImportError, OSError) as error:
+        advice = "install them again; recipes with RootSIFT work without"
         diagnosis.add(
-            "error", "installation", f"torch or kornia cannot be loaded ({error})",
-            "install them again; recipes with RootSIFT work without",
-        )  # fmt: skip
+            "error", "installation", f"torch or kornia cannot be loaded ({error})", advice
+        )
         return
     diagnosis.checked.append(f"networks: run on {resolve_device('auto')}")
     found = {key: path for key in WEIGHT_FILES if (path := find(key, weights_path))}
@@ -151,13 +136,13 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         return False
     quoted = shlex.quote(str(path))
     if version < newest:
-        diagnosis.add(
-            "note", path,
+        older = (
             f"has the tables of an older COLMAP (schema {version}, now {newest}); COLMAP 4 and "
             "pycolmap change them as soon as they open it, and an older COLMAP cannot read it "
-            "any more",
-            f"keep a copy: cp {quoted} {shlex.quote(str(path.with_suffix('.old.db')))}",
-        )  # fmt: skip
+            "any more"
+        )
+        copy = f"cp {quoted} {shlex.quote(str(path.with_suffix('.old.db')))}"
+        diagnosis.add("note", path, older, f"keep a copy: {copy}")
     diagnosis.checked.append(f"{path}: {tables.summary()}")
     for kind in sorted(problems, key=list(CHECKS).index):
         what, usual = CHECKS[kind]
@@ -176,23 +161,24 @@ def _examine_folder(diagnosis: Diagnosis, path: Path) -> None:
         what = "neither an output folder of colmap-affrect nor one with a database.db"
         advice = "give the --output-path of a run, or a COLMAP database"
         diagnosis.add("error", path, what, advice)
-    elif not workspace.config.exists():
+        return
+    if not workspace.config.exists():
         what = "is no output folder of colmap-affrect (it has no config.toml)"
         advice = "use another --output-path for colmap-affrect"
         diagnosis.add("note", path, f"{what}; only its database is checked", advice)
         examine_database(diagnosis, workspace.database)
-    else:
-        with ExitStack() as stack:
-            try:
-                stack.enter_context(workspace.locked())
-            except (WorkspaceError, OptionError) as error:
-                in_use = isinstance(error.__cause__, TimeoutError)
-                writable = "make it writable before running anything in it"
-                advice = "run doctor again when it is done" if in_use else writable
-                diagnosis.add("warning", path, _without_path(path, error), advice)
-                if in_use:
-                    return
-            _examine_files(diagnosis, workspace)
+        return
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(workspace.locked())
+        except (WorkspaceError, OptionError) as error:
+            in_use = isinstance(error.__cause__, TimeoutError)
+            writable = "make it writable before running anything in it"
+            advice = "run doctor again when it is done" if in_use else writable
+            diagnosis.add("warning", path, _without_path(path, error), advice)
+            if in_use:
+                return
+        _examine_files(diagnosis, workspace)
 
 
 def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
@@ -213,10 +199,6 @@ def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
             diagnosis.add("error", path, "is missing", f"{SAME_RUN} to make it anew")
         return path.exists()
 
-    def num_images(model: Path) -> int:
-        read_summary(model)
-        return len(registered_names(model))
-
     done = read(workspace.config, _stages, diagnosis, context) or []
     read(workspace.cameras, read_camera_records, workspace.cameras)
     for store in (context.features, context.matches, context.guided) if done else ():
@@ -233,23 +215,20 @@ def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
     remake = f"remove it and {SAME_RUN}: it is made anew"
     advice = remake if done and not workspace.users_database else ""
     if examine_database(diagnosis, workspace.database, advice) and "map" in done:
-        sizes = [read(f, num_images, f) for f in model_folders(workspace.sparse)]
-        listed = ", ".join(str(size) for size in sizes if size) or "no"
+        models = [read(f, read_summary, f) for f in model_folders(workspace.sparse)]
+        listed = ", ".join(str(len(model.registered_names)) for model in models if model) or "no"
         diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
 
 
 def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:
     """Return the stages that have begun, after all options on record have been read."""
-    record = context.workspace.recorded()
-    if "extract" in context.workspace.begun:
+    workspace, done = context.workspace, context.workspace.begun
+    if "extract" in done:
         _ = context.inputs, context.extraction
     _ = context.pairing, context.matching, context.verification, context.escalation
     _ = context.guiding, context.mapping
-    done = [stage for stage in STAGES if stage in record.get("begun", [])]
-    stages, recipe = ", ".join(done) or "none", record.get("recipe", "")
-    diagnosis.checked.append(
-        f"{context.workspace.path}: stages on record: {stages}; recipe {recipe}"
-    )
+    stages = f"{', '.join(done) or 'none'}; recipe {workspace.recipe()}"
+    diagnosis.checked.append(f"{workspace.path}: stages on record: {stages}")
     return done
 
 

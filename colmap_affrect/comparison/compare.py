@@ -20,7 +20,7 @@ from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import digest_of
-from colmap_affrect.pairs.lists import Pair, PairOptions
+from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.record import content_of
@@ -49,7 +49,8 @@ def compare(
     Workspace(output_path).require_own(image_path)
     methods = parse_methods(options.methods)
     inputs, names = _checked(image_path, options)
-    pairs = list(options.pairs_of(names))
+    listed = options.pairs.match_list_path
+    pairs = list(read_pairs(Path(listed), names)) if listed else exhaustive_pairs(names)
     truth = _ground_truth(options.ground_truth_path, names)
     options = replace(options, mapping=MAPPERS.make(options.mapping).options)
     same = _same_for_all(inputs, names, pairs, options)

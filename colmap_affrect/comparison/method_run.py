@@ -29,7 +29,7 @@ from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.pairs.lists import Pair, PairList, exhaustive_pairs, read_pairs
+from colmap_affrect.pairs.lists import Pair, read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Progress, Stopwatch
@@ -94,24 +94,11 @@ RESULT = TypeAdapter(MethodResult)  # from and to JSON
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(InputOptions):
-    """Everything a comparison depends on beside its images and its output folder.
+    """Everything a comparison depends on beside its images and its output folder."""
 
-    The other attributes are those of :class:`~colmap_affrect.pipeline.InputOptions`.
-
-    Attributes:
-        methods: names of methods as the command line takes them, or methods.
-        seeds: of verification and mapping, which run once for each.
-        ground_truth_path: folder of a COLMAP model with true poses, in any frame; None for none.
-    """
-
-    methods: Sequence[str | Method] = DEFAULT_METHODS
-    seeds: Sequence[int] = (0, 1, 2)
-    ground_truth_path: Path | None = None
-
-    def pairs_of(self, names: Sequence[str]) -> PairList | list[Pair]:
-        """Return the pairs of images to match: those of the list if there is one, else all."""
-        listed = self.pairs.match_list_path
-        return read_pairs(Path(listed), names) if listed else exhaustive_pairs(names)
+    methods: Sequence[str | Method] = DEFAULT_METHODS  # also by name, as the command line has them
+    seeds: Sequence[int] = (0, 1, 2)  # of verification and mapping, which run once for each
+    ground_truth_path: Path | None = None  # of a COLMAP model with true poses, in any frame
 
 
 @dataclass
@@ -202,8 +189,8 @@ class MethodRun:
             failures |= extract_sift(self.database, self.image_path, taken, self.options.masks)
             advance(len(names))
         taken, pairs = list(image_ids(self.database)), None
-        if self.options.pairs.match_list_path:
-            pairs = [p for p in self.options.pairs_of(names) if set(taken) >= set(p)]
+        if listed := self.options.pairs.match_list_path:
+            pairs = [p for p in read_pairs(Path(listed), names) if set(taken) >= set(p)]
         num_pairs = math.comb(len(taken), 2) if pairs is None else len(pairs)
         with watch.step("match"), progress.stage("match", num_pairs, "pairs") as advance:
             match_sift(self.database, pairs)

@@ -1,6 +1,5 @@
 """A comparison of methods as one page, ``report.html``."""
 
-import itertools
 import string
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,19 +30,9 @@ KINDS = {"shared": "registered", "uncertain": "doubtful", "wrong": "at a wrong p
 
 
 @dataclass(frozen=True)
-class Column:
-    """A method that finished, as it is marked everywhere on the page."""
-
-    letter: str
-    color: str
-    method: MethodResult
-
-
-@dataclass(frozen=True)
 class Mark:
     """What one method does with one photograph."""
 
-    column: Column
     state: str  # ``always``, ``sometimes`` or ``never`` registered, over the seeds
     kind: str  # one of ``KINDS``
     text: str
@@ -54,7 +43,7 @@ class Card:
     """A photograph on the contact sheet."""
 
     name: str
-    marks: tuple[Mark, ...]
+    marks: tuple[Mark, ...]  # of the methods that finished, the best first
     groups: tuple[str, ...]
 
 
@@ -63,17 +52,17 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
 
     What is missing, as an unreadable photograph, is said in its place. Raises WorkspaceError.
     """
-    columns = columns_of(comparison)
-    names, folder = comparison.image_names, Path(comparison.image_path)
-    cards = cards_of(columns, comparison)
-    shown = [column.method.shown_seed for column in columns]
+    names, cards = comparison.image_names, cards_of(comparison)
+    shown = [method.shown_seed for method in comparison.finished]
     views = [read_view(output_path / seed.model_path if seed else None) for seed in shown]
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
     content = {
         "comparison": comparison,
         "headline": headline(comparison),
         "notes": notes(comparison),
-        "columns": columns,
+        "methods": comparison.finished,
+        "colors": METHOD_COLORS,
+        "letters": string.ascii_uppercase,
         "table": table(comparison),
         "filters": FILTERS,
         "cards": cards,
@@ -83,25 +72,20 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
         "kinds": KINDS,
     }
     drawn, path = zip(views, kinds, strict=True), output_path / "report.html"
+    folder = Path(comparison.image_path)
     return page.write_page(path, TEMPLATE, content, names, folder, drawn, progress)
 
 
-def columns_of(comparison: Comparison) -> list[Column]:
-    """Give each method that finished a letter and a colour, the best first."""
-    letters = itertools.chain(string.ascii_uppercase, map(str, itertools.count(27)))
-    return list(map(Column, letters, itertools.cycle(METHOD_COLORS), comparison.finished))
-
-
-def cards_of(columns: list[Column], comparison: Comparison) -> list[Card]:
+def cards_of(comparison: Comparison) -> list[Card]:
     """Return the contact sheet."""
-    cards = []
+    methods, cards = comparison.finished, []
     for name in comparison.image_names:
-        marks = tuple(_mark(column, name) for column in columns)
+        marks = tuple(_mark(method, name) for method in methods)
         kinds = {mark.kind for mark in marks}
         registered = comparison.registered_by[name]
         tests = {
             "all": True,
-            "differ": 0 < len(registered) < len(columns),
+            "differ": 0 < len(registered) < len(methods),
             "seeds": any(mark.state == "sometimes" for mark in marks),
             "wrong": "wrong" in kinds,
             "uncertain": "uncertain" in kinds,
@@ -111,15 +95,14 @@ def cards_of(columns: list[Column], comparison: Comparison) -> list[Card]:
     return cards
 
 
-def _mark(column: Column, name: str) -> Mark:
-    method, seeds = column.method, column.method.seeds
-    registering = [seed for seed in seeds if name in seed.registered_names]
+def _mark(method: MethodResult, name: str) -> Mark:
+    registering = [seed for seed in method.seeds if name in seed.registered_names]
     state, kind, text = "always", "shared", f"{method.name}: registered"
     if not registering:
-        return Mark(column, "never", kind, f"{method.name}: not registered")
-    if len(registering) < len(seeds):
+        return Mark("never", kind, f"{method.name}: not registered")
+    if len(registering) < len(method.seeds):
         state = "sometimes"
-        text += f" with {len(registering)} of {len(seeds)} seeds"
+        text += f" with {len(registering)} of {len(method.seeds)} seeds"
     scores = [seed.scores for seed in registering if seed.scores]
     num_correct = sum(name in each.correct_names for each in scores)
     doubt = method.usually_doubted.get(name)
@@ -132,4 +115,4 @@ def _mark(column: Column, name: str) -> Mark:
         kind = "uncertain"
     if doubt and kind != "shared":
         text += f", doubtful: {doubt}"
-    return Mark(column, state, kind, text)
+    return Mark(state, kind, text)

@@ -10,7 +10,6 @@ import pickle
 import signal
 import subprocess
 import sys
-from base64 import b64decode, b64encode
 
 from colmap_affrect.comparison.method_run import MethodRun
 from colmap_affrect.errors import AffrectError
@@ -21,27 +20,20 @@ from colmap_affrect.progress import Progress
 def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
     """Run a method in another process; return how that was lost, empty if it was not.
 
-    What it prints goes to ``run.log`` in its folder. The process is killed where this raises, also
-    for Ctrl-C.
+    What it prints goes to ``run.log`` in its folder. It is killed where this raises, as for Ctrl-C.
     """
-    argument, log_path = b64encode(pickle.dumps((run, title))).decode(), run.workspace.log
-    with (
-        log_path.open("a", encoding="utf-8") as log,
-        subprocess.Popen(  # noqa: S603  (this Python and this module)
+    log_path = run.workspace.log
+    with log_path.open("a", encoding="utf-8") as log:
+        code = subprocess.run(  # noqa: S603  (this Python and this module)
             # -P and the path: the package is found as it was here, not in the current folder.
-            [sys.executable, "-P", "-m", __name__, argument, str(os.getpid())],
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-P", "-m", __name__, str(os.getpid())],
+            check=False,
+            input=pickle.dumps((run, title)),  # too long for an argument, with many photographs
             stdout=progress.file_number,
             stderr=log,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             start_new_session=True,  # else Ctrl-C would reach it too
-        ) as process,
-    ):
-        try:
-            code = process.wait()
-        except BaseException:
-            process.kill()
-            raise
+        ).returncode
     if not code:
         return ""
     ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
@@ -51,11 +43,11 @@ def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
 
 def main() -> None:
     """Run the method that is asked for: progress to stdout, all else that is printed to stderr."""
-    end_with(int(sys.argv[2]))
+    end_with(int(sys.argv[1]))
     shown = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what others print
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s")
-    run, title = pickle.loads(b64decode(sys.argv[1]))  # noqa: S301 (of our parent)
+    run, title = pickle.load(sys.stdin.buffer)  # noqa: S301 (of our parent)
     run.progress = Progress(shown, 1).titled(title)
     try:
         with run.workspace.locked():

@@ -71,26 +71,25 @@ def load_evd(folder: Path) -> Pairs:
     """Find pairs with homographies; AffrectError when the layout is another one."""
     files = [file for part in "12h" for file in (folder / part).glob("*")]
     names = {file.stem for file in files if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES)}
-    found = [(name, f"1/{name}", f"2/{name}", f"h/{name}.txt") for name in sorted(names)]
-    for file in sorted(folder.glob("H_*.txt")):
-        if parts := re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", file.stem):
-            name, one, two = parts.groups()
-            found.append((f"{name} {one}-{two}", f"{name}_{one}", f"{name}_{two}", file.name))
-    if not found:
-        raise AffrectError(
-            f"{folder}: holds neither 1/NAME.png, 2/NAME.png, h/NAME.txt nor "
-            "NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
-        )
 
     def image(name: str) -> str:  # PNG where there is none
         names = (name + suffix for suffix in IMAGE_SUFFIXES)
         return next((name for name in names if (folder / name).is_file()), f"{name}.png")
 
-    entries = [
-        _Entry(name=name, image1=image(one), image2=image(two), homography=matrix)
-        for name, one, two, matrix in found
-    ]
-    return _loaded(entries, folder, 0.0)
+    def entry(name: str, one: str, two: str, matrix: str) -> _Entry:
+        return _Entry(name=name, image1=image(one), image2=image(two), homography=matrix)
+
+    found = [entry(name, f"1/{name}", f"2/{name}", f"h/{name}.txt") for name in sorted(names)]
+    for file in sorted(folder.glob("H_*.txt")):
+        if parts := re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", file.stem):
+            name, one, two = parts.groups()
+            found.append(entry(f"{name} {one}-{two}", f"{name}_{one}", f"{name}_{two}", file.name))
+    if not found:
+        raise AffrectError(
+            f"{folder}: holds neither 1/NAME.png, 2/NAME.png, h/NAME.txt nor "
+            "NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
+        )
+    return _loaded(found, folder, 0.0)
 
 
 def _scenes(pattern: str, load: Callable[[Path], Pairs], path: Path) -> Pairs:

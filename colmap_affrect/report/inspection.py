@@ -71,12 +71,11 @@ def draw_sheet(level: InspectedLevel, summary: str, path: Path) -> None:
     colors, items = warp_colors(level.plan), level.plan.items
     largest = sorted(range(len(items)), key=lambda index: -items[index].canvas_area_px)
     warps = [_warp(level, index, colors[index]) for index in sorted(largest[:MAX_NUM_WARPS])]
-    rows = [_row([_regions(level), _features(level, colors)], PANELS_PER_ROW)]
+    rows = [_row([(np.zeros((0, WIDTH_PX, 3), np.uint8), summary)], 1)]
+    rows.append(_row([_regions(level), _features(level, colors)], PANELS_PER_ROW))
     for first in range(0, len(warps), WARPS_PER_ROW):
         rows.append(_row(warps[first : first + WARPS_PER_ROW], WARPS_PER_ROW))
-    title = np.full((TITLE_PX, WIDTH_PX, 3), 255, np.uint8)
-    _write(title, summary, (MARGIN_PX, TITLE_PX - 8))
-    _, data = cv2.imencode(".png", np.concatenate([title, *rows])[:, :, ::-1])
+    _, data = cv2.imencode(".png", np.concatenate(rows)[:, :, ::-1])
     replace_bytes(path, data.tobytes())
 
 

@@ -45,9 +45,8 @@ def thumbnails(
 
     found = {}
     with progress.stage("pictures", len(shown), "images") as advance:
-        pictures = map_ordered(picture, shown, available_cores())
-        for name, made in zip(shown, pictures, strict=True):
-            if made is not None:
+        for name, made in zip(shown, map_ordered(picture, shown, available_cores()), strict=True):
+            if made:
                 found[name] = made
             advance(1)
     return found
