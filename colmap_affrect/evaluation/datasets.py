@@ -148,7 +148,7 @@ def _svp_scene(list_path: Path) -> Pairs:
     return _posed_pairs(scene, folder / "images", views, listed, category)
 
 
-load_svp = partial(_scenes, f"*{PAIR_LIST_SUFFIX}", _svp_scene)
+load_svp: Callable[[Path], Pairs] = partial(_scenes, f"*{PAIR_LIST_SUFFIX}", _svp_scene)
 
 
 def read_views(folder: Path) -> Views:
@@ -205,7 +205,7 @@ def _imc_scene(lists_path: Path) -> Pairs:
     return _posed_pairs(scene, root / "images", views, bins, lambda *names: bins[names])
 
 
-load_imc = partial(_scenes, "set_100/new-vis-pairs", _imc_scene)
+load_imc: Callable[[Path], Pairs] = partial(_scenes, "set_100/new-vis-pairs", _imc_scene)
 
 
 def _split(key: str, known: Views) -> Names:
@@ -259,6 +259,10 @@ def load_pairs(folder: Path) -> Pairs:
     if twice := [name for name in names if names.count(name) > 1]:
         raise AffrectError(f"{path}: two pairs are called '{twice[0]}'; give them names")
     return _loaded(entries, folder, offset_px)
+
+
+PROTOCOLS = {"evd": load_evd, "svp": load_svp, "imc": load_imc, "pairs": load_pairs}
+"""How datasets are read."""
 
 
 def _entry(values: Any, where: str) -> _Entry:

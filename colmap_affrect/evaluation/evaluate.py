@@ -6,7 +6,7 @@ escalation the one with most inliers of COLMAP's verification counts.
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,8 +21,8 @@ from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.evaluation import datasets, truths
-from colmap_affrect.evaluation.datasets import EvaluationPair, Pairs
+from colmap_affrect.evaluation import truths
+from colmap_affrect.evaluation.datasets import PROTOCOLS, EvaluationPair
 from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, published
 from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.features.weights import digests
@@ -65,8 +65,6 @@ class RecipeRun:
         output_path: Path,
         inputs: Mapping[str, Any],
         options: EvaluateOptions,
-        *,
-        overwrite: bool,
     ) -> None:
         """Find everything that the recipe needs before any image is worked on.
 
@@ -79,8 +77,6 @@ class RecipeRun:
         extraction, matching = self.recipe.extraction, self.recipe.matching
         images = {name for pair in pairs for name in pair.images}
         self._extractor = prepare(extraction, resources, sorted(images))
-        if overwrite:
-            remove_own(output_path.glob(f"features/{method.folder_name}-????????.h5"))
         made = digest_of([inputs, extraction.to_mapping(), digests(self._extractor.weights)])
         features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
         features.parent.mkdir(parents=True, exist_ok=True)
@@ -190,15 +186,6 @@ class RecipeRun:
         return len(estimate_geometry((first, second), rows, options, extracted_px).inlier_matches)
 
 
-PROTOCOLS: dict[str, Callable[[Path], Pairs]] = {
-    "evd": datasets.load_evd,
-    "svp": datasets.load_svp,
-    "imc": datasets.load_imc,
-    "pairs": datasets.load_pairs,
-}
-"""How datasets are read."""
-
-
 def evaluate(
     protocol: str,
     dataset_path: Path,
@@ -225,17 +212,20 @@ def evaluate(
     if not dataset_path.is_dir():
         raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
     Workspace(output_path).require_own(dataset_path)
-    scores, budget = asdict(options.scores), options.max_num_keypoints
     inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
     with Workspace(output_path).locked():
         pairs = PROTOCOLS[protocol](dataset_path)
-        given = pairs, output_path, inputs, options
-        runs = [RecipeRun(method, *given, overwrite=overwrite) for method in methods]
+        runs = [RecipeRun(method, pairs, output_path, inputs, options) for method in methods]
+        for method in methods if overwrite else ():
+            remove_own(output_path.glob(f"features/{method.folder_name}-????????.h5"))
         results = {run.label: run.results(progress) for run in runs}
         evaluation = Evaluation(
             protocol=protocol,
             dataset_path=inputs["dataset_path"],
-            settings={"scores": scores, "max_num_keypoints": budget},
+            settings={
+                "scores": asdict(options.scores),
+                "max_num_keypoints": options.max_num_keypoints,
+            },
             recipes=tuple(_summed(run, results[run.label]) for run in runs),
             published=published(protocol),
             versions=installed_versions(),

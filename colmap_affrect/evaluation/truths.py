@@ -285,12 +285,11 @@ def pose_columns(results: Results) -> dict[str, float]:
     And the area under the curve of recall over the larger of rotation and direction error, up to
     10 degrees, as a share of 1.
     """
-    groups: dict[str, list[bool]] = {}
-    for result in results:
-        if result.category:
-            groups.setdefault(result.category, []).append(result.error < MAX_ERROR_DEG)
-    groups["all"] = [result.error < MAX_ERROR_DEG for result in results]
-    shares = {title: sum(below) / len(below) for title, below in groups.items()}
+    titles = dict.fromkeys([*(result.category for result in results if result.category), "all"])
+    shares = {
+        title: fmean(one.error < MAX_ERROR_DEG for one in results if title in ("all", one.category))
+        for title in titles
+    }
     largest = [max(result.error, result.direction_error_deg) for result in results]
     area = fmean(max(0.0, 1.0 - error / MAX_AUC_ERROR_DEG) for error in largest)
     return {**shares, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": area}

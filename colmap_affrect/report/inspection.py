@@ -158,10 +158,9 @@ def _row(panels: Sequence[tuple[ColorImage, str]], per_row: int) -> ColorImage:
 
 def _write(image: ColorImage, text: str, place: tuple[int, int]) -> None:
     """Write black on white, from the left end of the base line on."""
-    for color, thickness in (((255, 255, 255), 3), ((0, 0, 0), 1)):
-        cv2.putText(
-            image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, thickness, cv2.LINE_AA
-        )
+    for gray, thickness in ((255, 3), (0, 1)):
+        how = cv2.FONT_HERSHEY_SIMPLEX, 0.4, (gray,) * 3, thickness, cv2.LINE_AA
+        cv2.putText(image, text, place, *how)
 
 
 def warp_colors(plan: RectificationPlan) -> list[Color]:
