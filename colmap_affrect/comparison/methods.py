@@ -67,9 +67,8 @@ def parse_methods(
         raise OptionError("no method given")
     labels = [method.label for method in methods]
     if twice := [label for label in labels if labels.count(label) > 1]:
-        raise OptionError(
-            f"two methods are called '{twice[0]}'; give one another name, as in NAME=RECIPE"
-        )
+        other = "give one another name, as in NAME=RECIPE"
+        raise OptionError(f"two methods are called '{twice[0]}'; {other}")
     return tuple(methods)
 
 

@@ -85,10 +85,8 @@ def load_evd(folder: Path) -> Pairs:
             name, one, two = parts.groups()
             found.append(entry(f"{name} {one}-{two}", f"{name}_{one}", f"{name}_{two}", file.name))
     if not found:
-        raise AffrectError(
-            f"{folder}: holds neither 1/NAME.png, 2/NAME.png, h/NAME.txt nor "
-            "NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
-        )
+        layouts = "1/NAME.png, 2/NAME.png, h/NAME.txt nor NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
+        raise AffrectError(f"{folder}: holds neither {layouts}")
     return _loaded(found, folder, 0.0)
 
 
@@ -217,11 +215,11 @@ def _split(key: str, known: Views) -> Names:
 
 def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
     """Read the camera and cam_from_world of an image; AffrectError says what is wrong."""
+    given, shapes = {}, {"K": (3, 3), "R": (3, 3), "T": (3,)}
     with _damaged(path), h5py.File(path) as file:
-        given = {key: np.squeeze(file[key][()]) for key in ("K", "R", "T")}
-    camera = pinhole(finite_numbers(given["K"], (3, 3), f"{path}: K"), f"{path}: K")
-    translation = finite_numbers(given["T"], (3,), f"{path}: T")
-    return camera, (finite_numbers(given["R"], (3, 3), f"{path}: R"), translation)
+        for key, shape in shapes.items():
+            given[key] = finite_numbers(np.squeeze(file[key][()]), shape, f"{path}: {key}")
+    return pinhole(given["K"], f"{path}: K"), (given["R"], given["T"])
 
 
 def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:

@@ -66,34 +66,30 @@ class RecipeRun:
         inputs: Mapping[str, Any],
         options: EvaluateOptions,
     ) -> None:
-        """Find everything that the recipe needs before any image is worked on.
-
-        Features depend on recipe and ``inputs``.
-        """
+        """Find everything that the recipe needs; features depend on it and on ``inputs``."""
         if method.recipe is None:
             raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
         self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
-        self._options, resources = options.scores, options.resources
-        extraction, matching = self.recipe.extraction, self.recipe.matching
+        self._options, extraction = options, self.recipe.extraction
         images = {name for pair in pairs for name in pair.images}
-        self._extractor = prepare(extraction, resources, sorted(images))
+        self._extractor = prepare(extraction, options.resources, sorted(images))
         made = digest_of([inputs, extraction.to_mapping(), digests(self._extractor.weights)])
         features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
         features.parent.mkdir(parents=True, exist_ok=True)
-        self._store, limit = FeatureStore(features), options.max_num_keypoints or 0
-        self._matchings: dict[int, Matching] = {}
-        for level in self._extractor.extractors:
-            chosen = extraction.levels[level]
-            how = chosen.matching or matching, level, chosen.base, chosen.features.name
-            self._matchings[level] = Matching(self._store, *how, resources, limit)
+        self._store = FeatureStore(features)
         self.failures: dict[str, str] = {}  # images that could not be used in this run: why
         self._lock = Lock()  # of extraction and of the store
 
     def results(self, progress: Progress) -> list[PairResult]:
         """Match and score all pairs; images whose features are there are not read again."""
-        results = []
+        results, matchers = [], dict[int, CachedMatcher]()
+        given = self._options.resources, self._options.max_num_keypoints or 0
+        for level in self._extractor.extractors:
+            chosen = self.recipe.extraction.levels[level]
+            options, kind = chosen.matching or self.recipe.matching, chosen.features.name
+            matching = Matching(self._store, options, level, chosen.base, kind, *given)
+            matchers[level] = CachedMatcher(matching)
         with progress.stage(self.label, len(self._pairs), "pairs") as advance:
-            matchers = {level: CachedMatcher(task) for level, task in self._matchings.items()}
             work = partial(self._result, matchers)
             for result in map_ordered(work, self._pairs, available_cores()):
                 results.append(result)
@@ -106,10 +102,10 @@ class RecipeRun:
         found, points = self._matched(matchers, pair, watch)
         try:
             with watch.step("estimate"):
-                score = pair.truth.score(*points, self._options)
+                score = pair.truth.score(*points, self._options.scores)
         except Exception as error:
             logger.exception("%s: %s cannot be scored", self.label, pair.name)
-            score = pair.truth.score(*NOTHING, self._options)
+            score = pair.truth.score(*NOTHING, self._options.scores)
             found = {"failure": f"{type(error).__name__}: {error}"}
         if "failure" not in found:
             found |= {"seconds": sum(watch.seconds.values()), "seconds_by_step": watch.seconds}

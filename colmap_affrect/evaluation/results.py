@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
-from colmap_affrect.evaluation.truths import Number, PairResult
+from colmap_affrect.evaluation.truths import PairResult
 
 DATA = Path(__file__).with_name("published.toml")
 SECONDS = "seconds"  # the column of all time that a recipe took
@@ -31,7 +31,7 @@ class RecipeResult:
     """What one recipe reached."""
 
     name: str  # its label
-    summary: Mapping[str, Mapping[str, Number]]  # columns of tables, by the kind of truth
+    summary: Mapping[str, Mapping[str, float]]  # columns of tables, by the kind of truth
     # number of failed pairs, seconds in all, and means over the pairs: ``solved`` from 0 to 1,
     # ``keypoints`` of an image, ``matches``, ``inliers``
     costs: Mapping[str, float]

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean, median_low
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BeforeValidator
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose, pose_errors
@@ -43,10 +42,6 @@ MAX_AUC_ERROR_DEG = 10.0
 NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
 
 
-Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
-"""Infinite where JSON has null."""
-
-
 @dataclass(frozen=True)
 class ScoreOptions:
     """How models are estimated from matches; the seed is of the order that these are taken in."""
@@ -60,10 +55,10 @@ class ScoreOptions:
 class PairScore:
     """How good the matches of one pair are."""
 
-    error: Number  # of the protocol, px or degrees; infinite where no model was found
+    error: float  # of the protocol, px or degrees; infinite where no model was found
     num_inliers: int  # of the model that was estimated
     num_correct: int | None = None  # matches that agree with the truth; None where it cannot say
-    direction_error_deg: Number = math.inf  # of poses, beside the error of the rotation
+    direction_error_deg: float = math.inf  # of poses, beside the error of the rotation
     solved: float = 0.0  # how far it counts as matched: 1 or 0 where there is a threshold
     kind: str = ""  # of the truth, as tables name it; empty without one
 
