@@ -1,6 +1,5 @@
 """A comparison of methods as one page, ``report.html``."""
 
-import string
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,28 +12,13 @@ from colmap_affrect.report.scene import read_view
 
 TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
 
-METHOD_COLORS = (
-    "#0b62a8", "#a34700", "#00714f", "#9b2d79", "#5d4bb0", "#7a5c00", "#a3213b", "#46606e",
-)  # fmt: skip
-"""Of the marks of methods; white text on them is readable."""
-FILTERS = {
-    "all": "All",
-    "differ": "Methods differ",
-    "seeds": "Seeds disagree",
-    "wrong": "Registered wrongly",
-    "uncertain": "Doubtful",
-    "none": "Registered by none",
-}
-KINDS = {"shared": "registered", "uncertain": "doubtful", "wrong": "at a wrong place"}
-"""How cameras are drawn; each has a colour of this name."""
-
 
 @dataclass(frozen=True)
 class Mark:
     """What one method does with one photograph."""
 
     state: str  # ``always``, ``sometimes`` or ``never`` registered, over the seeds
-    kind: str  # one of ``KINDS``
+    kind: str  # ``shared`` (nothing is the matter), ``uncertain`` or ``wrong``: names of colours
     text: str
 
 
@@ -44,7 +28,7 @@ class Card:
 
     name: str
     marks: tuple[Mark, ...]  # of the methods that finished, the best first
-    groups: tuple[str, ...]
+    groups: tuple[str, ...]  # what the buttons above the sheet choose by
 
 
 def write_page(comparison: Comparison, output_path: Path, progress: Progress = SILENT) -> Path:
@@ -61,15 +45,11 @@ def write_page(comparison: Comparison, output_path: Path, progress: Progress = S
         "headline": headline(comparison),
         "notes": notes(comparison),
         "methods": comparison.finished,
-        "colors": METHOD_COLORS,
-        "letters": string.ascii_uppercase,
         "table": table(comparison),
-        "filters": FILTERS,
         "cards": cards,
         "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
         "flat": flat,
         "views": views,
-        "kinds": KINDS,
     }
     drawn, path = zip(views, kinds, strict=True), output_path / "report.html"
     folder = Path(comparison.image_path)

@@ -53,15 +53,11 @@ def correct_images(errors: PairErrors) -> tuple[str, ...]:
 
 def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> PoseScores:
     """Measure the poses of registered images against ground truth, of the images given only."""
-    given = {name: pose for name, pose in truth.items() if name in set(image_names)}
-    errors = pair_errors(estimated, given)
+    errors = pair_errors(estimated, {name: truth[name] for name in truth.keys() & image_names})
     correct = correct_images(errors)
-    names = {name for pair in errors for name in pair}
-    return PoseScores(
-        correct_names=correct,
-        wrong_names=tuple(sorted(names - set(correct))),
-        median_rotation_error_deg=median(r for r, _ in errors.values()) if errors else None,
-    )
+    wrong = {name for pair in errors for name in pair} - set(correct)
+    rotations_deg = [rotation for rotation, _ in errors.values()]
+    return PoseScores(correct, tuple(sorted(wrong)), median(rotations_deg) if errors else None)
 
 
 @dataclass(frozen=True)

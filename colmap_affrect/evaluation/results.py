@@ -60,25 +60,18 @@ class Evaluation:
         """Return a table for each kind of truth with the paper's numbers, and costs."""
         parts = [f"{self.protocol}: {len(self.recipes[0].pairs)} pairs"]
         for kind, columns in self.recipes[0].summary.items():
-            rows: list[tuple[str, Mapping[str, float]]] = [
-                (r.name, {**r.summary[kind], SECONDS: r.costs[SECONDS]}) for r in self.recipes
-            ]
-            rows += [row for row in self.published.items() if row[1].keys() & columns.keys()]
-            parts.append(_table(kind, [*columns, SECONDS], rows))
-        costs = [(recipe.name, recipe.costs) for recipe in self.recipes]
-        return "\n\n".join([*parts, _table("recipe", costs[0][1], costs)])
+            rows = {r.name: {**r.summary[kind], SECONDS: r.costs[SECONDS]} for r in self.recipes}
+            papers = {k: row for k, row in self.published.items() if row.keys() & columns.keys()}
+            parts.append(_table(kind, [*columns, SECONDS], {**rows, **papers}))
+        costs = {recipe.name: recipe.costs for recipe in self.recipes}
+        return "\n\n".join([*parts, _table("recipe", self.recipes[0].costs, costs)])
 
 
-def _table(
-    title: str, columns: Iterable[str], rows: Iterable[tuple[str, Mapping[str, float]]]
-) -> str:
+def _table(title: str, columns: Iterable[str], rows: Mapping[str, Mapping[str, float]]) -> str:
     """Format rows with two decimals, but for whole numbers; what a row lacks is empty."""
 
     def cell(value: float | None) -> str:
-        if value is None:
-            return ""
-        return f"{value:.0f}" if value == round(value) else f"{value:.2f}"
+        return "" if value is None else f"{value:.{0 if value == round(value) else 2}f}"
 
-    lines = [[title, *columns]]
-    lines += [[name, *(cell(values.get(column)) for column in columns)] for name, values in rows]
-    return aligned(lines)
+    lines = [[name, *(cell(row.get(column)) for column in columns)] for name, row in rows.items()]
+    return aligned([[title, *columns], *lines])

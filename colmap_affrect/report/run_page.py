@@ -30,10 +30,6 @@ KINDS = {
     "doubtful": "doubtful",
 }
 """How cameras came in; each has a colour of this name."""
-FILTERS = {
-    "all": "All", "missing": "Missing", "doubtful": "Doubtful", "added": "New",
-    "bridged": "Bridged",
-}  # fmt: skip
 
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
@@ -78,7 +74,6 @@ def write_run_page(
         "view": view,
         "kinds": {kind: f"{text} ({kinds[kind]})" for kind, text in KINDS.items() if kinds[kind]},
         "cards": cards,
-        "filters": FILTERS,
         "num_pairs": len(pair_inliers),
         "matrix": _matrix(names, pair_inliers),
         **_cameras(report, names),
