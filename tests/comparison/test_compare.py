@@ -30,6 +30,7 @@ from colmap_affrect.errors import (
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.lists import PairOptions
+from colmap_affrect.progress import SILENT
 from colmap_affrect.stages.context import Resources
 
 CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
@@ -233,13 +234,23 @@ os.kill(os.getpid(), signal.SIGSEGV)
 """
 
 
-@pytest.mark.usefixtures("no_page")
-def test_method_whose_process_dies_is_reported(
-    scene, options, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def dying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "dying_worker.py").write_text(DYING)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(worker, "__name__", "dying_worker")
+
+
+@pytest.mark.usefixtures("no_page", "dying")
+def test_record_of_many_photographs_reaches_the_process(scene, options, tmp_path, asked) -> None:
+    """It is longer than an argument of a command may be."""
+    compare(scene / "images", tmp_path / "out", replace(options, methods=["sift"]))
+    many = replace(asked[0], inputs={"photographs": "x" * 200_000})
+    assert "SIGSEGV" in worker.run_alone(many, "", SILENT)
+
+
+@pytest.mark.usefixtures("no_page", "dying")
+def test_method_whose_process_dies_is_reported(scene, options, tmp_path) -> None:
     (method,) = compare(
         scene / "images", tmp_path / "out", replace(options, methods=["sift"])
     ).methods
