@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap.model_files import camera_like
 from colmap_affrect.colmap.tables import (
     DAMAGED,
+    MAX_NUM_IMAGES,
     Tables,
     columns_of,
     open_read_only,
-    pair_images,
     read_tables,
     rows_of,
 )
@@ -196,8 +196,9 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
 def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
         for pair_id, rows, columns, blob in rows_of(connection, "pair_id rows cols data", table):
-            label = f"{' - '.join(tables.pair_names(pair_id))} ({what})"
-            images = pair_images(pair_id)
+            images = divmod(pair_id, MAX_NUM_IMAGES)
+            names = (tables.names.get(image, f"image {image}") for image in images)
+            label = f"{' - '.join(names)} ({what})"
             indices = _array(blob, rows, columns, np.dtype("<u4"))
             is_known = images[0] != images[1] and tables.names.keys() >= set(images)
             if not is_known or indices is None or (rows and columns != 2):

@@ -211,19 +211,6 @@ def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: F
     database.write_descriptors(image_id, pycolmap.FeatureDescriptors(type=sift, data=rows))
 
 
-def replace_matches(
-    database: pycolmap.Database, image_id1: int, image_id2: int, indices: NDArray[np.integer]
-) -> None:
-    """Write raw matches; different ones are replaced, and their two-view geometry is deleted."""
-    if database.exists_matches(image_id1, image_id2):
-        if np.array_equal(database.read_matches(image_id1, image_id2), indices):
-            return
-        database.delete_matches(image_id1, image_id2)
-        if database.exists_two_view_geometry(image_id1, image_id2):
-            database.delete_two_view_geometry(image_id1, image_id2)
-    write_matches(database, image_id1, image_id2, indices)
-
-
 def camera_matrix(camera: pycolmap.Camera) -> Array:
     """Return (3, 3) intrinsics in pixel-centre px, without distortion."""
     matrix = np.asarray(camera.calibration_matrix(), dtype=np.float64)
@@ -247,9 +234,10 @@ def cameras_of_images(database: pycolmap.Database) -> dict[int, pycolmap.Camera]
 def write_matches(
     database: pycolmap.Database, image_id1: int, image_id2: int, indices: NDArray[np.integer]
 ) -> None:
-    """Write (M, 2) raw matches of one pair unless it has some; every index is checked first."""
-    if database.exists_matches(image_id1, image_id2):
-        return
+    """Write (M, 2) raw matches of one pair; every index is checked first.
+
+    Different ones are replaced, and their two-view geometry is deleted.
+    """
     if image_id1 == image_id2:
         raise DatabaseError(f"image {image_id1} cannot be matched with itself")
     if indices.ndim != 2 or indices.shape[1] != 2 or not np.issubdtype(indices.dtype, np.integer):
@@ -261,4 +249,10 @@ def write_matches(
             f"(largest {indices.max(axis=0).tolist()}, keypoints {counts}); match "
             "them again"
         )
+    if database.exists_matches(image_id1, image_id2):
+        if np.array_equal(database.read_matches(image_id1, image_id2), indices):
+            return
+        database.delete_matches(image_id1, image_id2)
+        if database.exists_two_view_geometry(image_id1, image_id2):
+            database.delete_two_view_geometry(image_id1, image_id2)
     database.write_matches(image_id1, image_id2, indices.astype(np.uint32))

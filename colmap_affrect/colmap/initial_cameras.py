@@ -161,16 +161,16 @@ class InitialCameras:
     def _set_focal(
         self, camera: pycolmap.Camera, given: GivenCamera, names: Sequence[str]
     ) -> tuple[Source, str]:
+        if given.params:
+            return "given", ""
         source: Source = "given"
-        focal, why = given.focal_px or 0.0, ""
+        focal, why = given.focal_px, ""
         if given.focal_mm and given.plate_width_mm:
             focal = given.focal_mm / given.plate_width_mm * camera.width
-        if given.params:
-            return source, why
         if not focal:
             found = self._exif_focal(names)
-            focal = found.focal_px or 0.0
-            source, why = ("exif-rescaled" if found.is_rescaled else "exif"), found.why
+            source = "exif-rescaled" if found.is_rescaled else "exif"
+            focal, why = found.focal_px, found.why
         if not focal:
             return "guess", why
         for index in camera.focal_length_idxs():

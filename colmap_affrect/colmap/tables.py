@@ -76,11 +76,6 @@ class Tables:
     num_matched: int  # pairs with raw matches
     num_verified: int  # pairs with inliers
 
-    def pair_names(self, pair_id: int) -> tuple[str, str]:
-        """Return the names of a pair, the image with the smaller id first."""
-        first, second = (self.names.get(i, f"image {i}") for i in pair_images(pair_id))
-        return first, second
-
     def summary(self) -> str:
         """Return the numbers of what there is."""
         features = sum(rows for rows, _ in self.keypoints.values())
@@ -90,11 +85,6 @@ class Tables:
             f"{features} keypoints, {self.num_matched} matched and {self.num_verified} verified "
             "pairs"
         )
-
-
-def pair_images(pair_id: int) -> tuple[int, int]:
-    """Return the image ids of a pair, the smaller one first."""
-    return pair_id // MAX_NUM_IMAGES, pair_id % MAX_NUM_IMAGES
 
 
 def read_tables(connection: sqlite3.Connection) -> Tables:

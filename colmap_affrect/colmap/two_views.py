@@ -10,12 +10,12 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose
+from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.epipolar import (
     EpipolarModel,
     HomographyModel,
     PairModel,
-    Points,
     Rows,
     common_sign,
 )
@@ -40,21 +40,24 @@ MIN_VARIETY = 0.05  # of elements of shapes of area one; below they have no dire
 MIN_TRANSLATION = 1e-9  # of a decomposed homography, in units of the distance of its plane
 
 
-def epipolar_pair(
+def pair_model(
     geometry: pycolmap.TwoViewGeometry, cameras: Cameras, keypoints: Keypoints
-) -> EpipolarModel | None:
-    """Return the epipolar geometry of a pair and all keypoints; None where it has none.
+) -> PairModel | None:
+    """Return what keypoints, twice (M, 2 or more), can be tested with; None of a watermark.
 
-    Of calibrated pairs it holds in pixels without distortion. Keypoints are twice (N, 2 or more).
+    The epipolar geometry of calibrated pairs holds in pixels without distortion.
     """
     points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
+    if geometry.config in PLANAR and geometry.H is not None:
+        return HomographyModel(np.asarray(geometry.H, np.float64), (points1, points2))
+    if geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
+        return None
     essential, fundamental = geometry.E, geometry.F
     is_calibrated = geometry.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
     if is_calibrated and essential is not None and np.any(essential):
         matrices = [camera.calibration_matrix() for camera in cameras]
         fundamental = np.linalg.inv(matrices[1]).T @ essential @ np.linalg.inv(matrices[0])
-        points1 = undistorted(cameras[0], points1)
-        points2 = undistorted(cameras[1], points2)
+        points1, points2 = map(undistorted, cameras, (points1, points2))
     if fundamental is None or not np.any(fundamental):
         return None
     sample_size = 5 if geometry.config == CALIBRATED else 7
@@ -71,18 +74,6 @@ def undistorted(camera: pycolmap.Camera, points: Array) -> Array:
     matrix = np.asarray(camera.calibration_matrix(), np.float64)
     rays = np.asarray(camera.cam_from_img(points), np.float64)
     return np.asarray(rays @ matrix[:2, :2].T + matrix[:2, 2])
-
-
-def _keypoint_shapes(keypoints: Floats) -> Array | None:
-    """Return the (N, 2, 2) linear parts of keypoints of 6 or 4 columns, up to a factor."""
-    keypoints = np.asarray(keypoints, np.float64)
-    if keypoints.shape[1] == 6:
-        return np.asarray(keypoints[:, 2:].reshape(-1, 2, 2), np.float64)
-    if keypoints.shape[1] == 4:
-        scales, angles = keypoints[:, 2], keypoints[:, 3]
-        cosines, sines = scales * np.cos(angles), scales * np.sin(angles)
-        return np.asarray(np.stack([cosines, -sines, sines, cosines], axis=1).reshape(-1, 2, 2))
-    return None
 
 
 def decomposed_homography(homography: Array, cameras: Cameras) -> list[Pose]:
@@ -124,34 +115,28 @@ def significance(
         hits = model.errors(*shuffled(len(rows))) <= max_error_px
         chance = max(float(hits.mean()), 1.0 / len(hits))
         alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
-        shapes = (telling_shapes(keypoints[0]), telling_shapes(keypoints[1]))
-        if math.isinf(alarms) or shapes[0] is None or shapes[1] is None:
+        first, second = map(_telling_shapes, keypoints)
+        if math.isinf(alarms) or first is None or second is None:
             return -alarms
-        return _frame_evidence(model, inliers, (shapes[0], shapes[1])) - alarms
+        return _frame_evidence(model, inliers, (first, second)) - alarms
 
 
-def telling_shapes(keypoints: Floats) -> Points | None:
-    """Return the shapes of keypoints; None without any, if all are alike, or only views differ."""
-    shapes = _keypoint_shapes(keypoints)
-    if shapes is None or not len(shapes):
+def _telling_shapes(keypoints: Floats) -> Array | None:
+    """Return the (N, 2, 2) shapes of keypoints of 4 or 6 columns, up to a factor.
+
+    None without any, if all are alike, or only views differ.
+    """
+    parts: Array = np.asarray(keypoints[:, 2:], np.float64)
+    if not parts.size:
         return None
+    shapes: Array = parts.reshape(len(parts), -1, 2)
+    if parts.shape[1] == 2:
+        shapes = parts[:, 0, None, None] * rotation(parts[:, 1])
     alike = np.ptp(of_unit_area(shapes), axis=0).max() < MIN_VARIETY
     return None if alike or not vary_singly(shapes) else shapes
 
 
-def pair_model(
-    geometry: pycolmap.TwoViewGeometry, cameras: Cameras, keypoints: Keypoints
-) -> PairModel | None:
-    """Return what (M, 2 or more) matched keypoints can be tested with; None of a watermark."""
-    if geometry.config in PLANAR and geometry.H is not None:
-        points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
-        return HomographyModel(np.asarray(geometry.H, np.float64), (points1, points2))
-    if geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
-        return None
-    return epipolar_pair(geometry, cameras, keypoints)
-
-
-def _frame_evidence(model: PairModel, inliers: Rows, shapes: tuple[Points, Points]) -> float:
+def _frame_evidence(model: PairModel, inliers: Rows, shapes: tuple[Array, Array]) -> float:
     """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
     cosines = model.cosines(inliers, inliers, shapes)
     first, second = shuffled(len(inliers))

@@ -239,22 +239,15 @@ class PairVerifier:
 
     def geometry(self, names: Names, frames: Frames, indices: Matches) -> pycolmap.TwoViewGeometry:
         """Return the geometry of the same from the image with the lower id; empty if rejected."""
-        ids, sides, indices = self._ordered(names, frames, indices)
-        size_px = of_pair(self._extracted_px, ids)
-        return estimate_geometry(sides, indices, self._options, size_px)
-
-    def _ordered(
-        self, names: Names, frames: Frames, indices: Matches
-    ) -> tuple[tuple[int, int], tuple[Side, Side], Matches]:
-        """Return ids, sides and (M, 2) matches of a pair from the image with the lower id."""
         ids = self._ids[names[0]], self._ids[names[1]]
         first, second = (
             Side(self._cameras[name], colmap_keypoints(lafs))
             for name, lafs in zip(names, frames, strict=True)
         )
         if ids[0] > ids[1]:
-            return ids[::-1], (second, first), indices[:, ::-1]
-        return ids, (first, second), indices
+            ids, first, second, indices = ids[::-1], second, first, indices[:, ::-1]
+        size_px = of_pair(self._extracted_px, ids)
+        return estimate_geometry((first, second), indices, self._options, size_px)
 
 
 def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:

@@ -192,7 +192,7 @@ def write_matches(context: Context, pairs: Sequence[Pair], *, replaces: bool = F
         todo = listed.at(wanted)
         for found in context.matches.read(todo) if todo else ():
             first, second = (ids[name] for name in found.names)
-            colmap_database.replace_matches(database, first, second, found.indices)
+            colmap_database.write_matches(database, first, second, found.indices)
 
 
 # What is done for one pair, in a thread of this process or on a worker of a cluster.

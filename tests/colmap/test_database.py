@@ -168,8 +168,12 @@ def test_write_matches_round_trips_in_the_order_of_the_pair(matchable_path: Path
             write_matches(database, *pair, indices)
             np.testing.assert_array_equal(database.read_matches(*pair), indices)
             np.testing.assert_array_equal(database.read_matches(*pair[::-1]), indices[:, ::-1])
-            write_matches(database, *pair, indices[:1])  # those that are there stay
-            np.testing.assert_array_equal(database.read_matches(*pair), indices)
+            database.write_two_view_geometry(*pair, pycolmap.TwoViewGeometry())
+            write_matches(database, *pair, indices)  # nothing has changed
+            assert database.exists_two_view_geometry(*pair)
+            write_matches(database, *pair, indices[:1])
+            np.testing.assert_array_equal(database.read_matches(*pair), indices[:1])
+            assert not database.exists_two_view_geometry(*pair)
             write_matches(database, 1, 3, np.zeros((0, 2), np.int64))
             assert database.exists_matches(1, 3)
 
