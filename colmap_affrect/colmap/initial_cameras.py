@@ -45,7 +45,7 @@ from colmap_affrect.images.exif import (
 )
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.reading import is_too_large
-from colmap_affrect.project.outputs import remove_database, temporary_folder
+from colmap_affrect.project.outputs import database_files, remove_own, temporary_folder
 
 MAX_LINES = 5  # that are logged; report.json says all
 
@@ -242,7 +242,7 @@ def import_images(
     initial = InitialCameras(image_path, options)
     is_new = not path.exists()
     if is_new:
-        remove_database(path)  # what is beside it, of one that was removed
+        remove_own(database_files(path))  # what is beside it, of one that was removed
     with temporary_folder(path.parent) as folder:
         new, read = folder / "new.db" if is_new else path, folder / "read.db"
         missing = sorted(set(names) - set(image_ids(new)))

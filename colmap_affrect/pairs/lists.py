@@ -14,7 +14,7 @@ from pydantic import Field
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.options import Options, within
-from colmap_affrect.project.atomic_files import replace_lines
+from colmap_affrect.project.atomic_files import replace_text
 
 Pair = tuple[str, str]  # names of two photographs, in order
 
@@ -204,7 +204,7 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
         pairs = list(pairs)
         names = {name for pair in pairs for name in pair}
     separator = "\t" if any(re.search(r"\s", name) for name in names) else " "
-    replace_lines(path, (f"{first}{separator}{second}\n" for first, second in pairs))
+    replace_text(path, (f"{first}{separator}{second}\n" for first, second in pairs))
 
 
 def _split(line: str, known: Collection[str]) -> Pair | None:

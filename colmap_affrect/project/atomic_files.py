@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,7 +21,6 @@ from colmap_affrect.errors import WorkspaceError
 logger = logging.getLogger(__name__)
 
 PAGE_BYTES = 4096
-LINES_AT_ONCE = 10_000
 NEW_SUFFIX = ".affrect-new"  # of files that are being written; a killed program leaves them
 JOURNAL_MARK = b"AFFRECT2"
 JOURNAL_HEADER = struct.Struct("<8sQQ")
@@ -31,15 +29,10 @@ pages follow, and a SHA-256."""
 SHA256_BYTES = 32
 
 
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file as :func:`replace_bytes`."""
-    replace_lines(path, [text])
-
-
-def replace_lines(path: Path, lines: Iterable[str]) -> None:
-    """Write a text file that need not fit into memory, as :func:`replace_bytes`."""
-    remaining = iter(lines)
-    replace_bytes(path, iter(lambda: "".join(islice(remaining, LINES_AT_ONCE)).encode(), b""))
+def replace_text(path: Path, text: str | Iterable[str]) -> None:
+    """Write a text file, whose lines need not fit into memory, as :func:`replace_bytes`."""
+    lines = [text] if isinstance(text, str) else text
+    replace_bytes(path, (line.encode() for line in lines))
 
 
 def replace_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:

@@ -148,11 +148,6 @@ def database_files(path: Path) -> list[Path]:
     return [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal"))]
 
 
-def remove_database(path: Path) -> None:
-    """Remove a database and the files beside it, if they are there."""
-    remove_own(database_files(path))
-
-
 def remove_own(paths: Iterable[Path]) -> None:
     """Remove what is ours in a work folder; of a link itself, not what it leads to."""
     for path in paths:

@@ -112,8 +112,7 @@ class FeatureStore(GroupStore):
     ) -> None:
         """Write the features of one image, and what the files hold that they are from."""
         with self._open("a") as file:
-            ends = {0: len(features)}
-            self._write_features(file, name, features, image_size, ends, content)
+            self._write_features(file, name, features, image_size, {0: len(features)}, content)
 
     def contents(self) -> dict[str, Content]:
         """Return for each image what the files hold that it was extracted from."""

@@ -137,9 +137,8 @@ class Workspace:
         Raises OptionError for a folder of somebody else, WorkspaceError when it cannot be used.
         """
         self.begin()
-        lock = FileLock(self.path / LOCK)
         try:
-            lock.acquire(timeout=LOCK_WAIT_S)
+            lock = FileLock(self.path / LOCK).acquire(timeout=LOCK_WAIT_S)
         except Timeout as error:
             raise WorkspaceError(
                 f"{self.path}: another colmap-affrect is working in this folder; wait for it "
@@ -148,10 +147,8 @@ class Workspace:
         except OSError as error:
             raise self._unusable(error) from error
         self._record = None
-        try:
+        with lock:
             yield self
-        finally:
-            lock.release()
 
     def recorded(self) -> Mapping[str, Any]:
         """Return the record, see :func:`~colmap_affrect.project.record.read_record`."""
