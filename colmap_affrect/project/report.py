@@ -29,7 +29,6 @@ SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
 
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
-
 REPORTED_PACKAGES = (
     "colmap-affrect", "pycolmap", "pyceres", "opencv-python-headless", "numpy", "h5py", "torch",
     "kornia",
@@ -65,22 +64,14 @@ def by_story(stories: Mapping[str, str]) -> list[str]:
 
 @dataclass(frozen=True)
 class StageReport:
-    """One stage of a run.
+    """One stage of a run."""
 
-    Attributes:
-        name: extract, pairs, match, verify, escalate, guide or map.
-        wall_s: seconds.
-        num_done: images, pairs, cameras or models made now.
-        num_kept: those found done already.
-        failures: image name to reason.
-        warnings: image name to what went less well than asked for.
-    """
-
-    name: str
+    name: str  # extract, pairs, match, verify, escalate, guide or map
     wall_s: float
-    num_done: int
-    num_kept: int = 0
-    failures: dict[str, str] = field(default_factory=dict)
+    num_done: int  # images, pairs, cameras or models made now
+    num_kept: int = 0  # those found done already
+    failures: dict[str, str] = field(default_factory=dict)  # image name to reason
+    # image name to what went less well than asked for
     warnings: dict[str, str] = field(default_factory=dict)
 
     def summary(self) -> str:
@@ -103,19 +94,12 @@ def summed(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
 
 @dataclass(frozen=True)
 class Bridge:
-    """How an image was registered by one verified pair whose scale comes from neighbouring depths.
+    """How one verified pair registered an image, with its scale by the depths of neighbours."""
 
-    Attributes:
-        by: the image of the pair that had been there.
-        num_agreeing: depths that agree on the scale.
-        num_ratios: depths compared.
-        scale_error_frac: standard error of the scale.
-    """
-
-    by: str
-    num_agreeing: int
-    num_ratios: int
-    scale_error_frac: float
+    by: str  # the image of the pair that had been there
+    num_agreeing: int  # depths that agree on the scale
+    num_ratios: int  # depths compared
+    scale_error_frac: float  # standard error of the scale
 
     def text(self) -> str:
         """Return a few words."""
@@ -134,31 +118,21 @@ class Residual:
 
 @dataclass(frozen=True)
 class ModelSummary:
-    """One COLMAP model; the error is the mean over observations in px.
-
-    Attributes:
-        probabilities: how probable it is that an image stands right, within 5 degrees.
-        gains: what more matches may add to these probabilities.
-        doubtful: images that are rather wrong than right, with the reason.
-        bridges: by what images were registered that came in by no track through three images.
-        taken_out: images that were surely wrong, with the reason.
-        focals_px: focal length of each image's camera.
-        moves: what made the model, by the sparse mapper.
-        tie_points: the residuals of those by hand, the worst first.
-    """
+    """One COLMAP model; mappings are by image name."""
 
     registered_names: tuple[str, ...]
     num_points3D: int
     mean_track_length: float
-    mean_reprojection_error_px: float
+    mean_reprojection_error_px: float  # over observations
+    # how probable it is that an image stands right, within 5 degrees
     probabilities: dict[str, float] = field(default_factory=dict)
-    gains: dict[str, float] = field(default_factory=dict)
-    doubtful: dict[str, str] = field(default_factory=dict)
-    bridges: dict[str, Bridge] = field(default_factory=dict)
-    taken_out: dict[str, str] = field(default_factory=dict)
-    focals_px: dict[str, float] = field(default_factory=dict)
-    moves: tuple[str, ...] = ()
-    tie_points: tuple[Residual, ...] = ()
+    gains: dict[str, float] = field(default_factory=dict)  # what more matches may add to these
+    doubtful: dict[str, str] = field(default_factory=dict)  # rather wrong than right: why
+    bridges: dict[str, Bridge] = field(default_factory=dict)  # in no track through three images
+    taken_out: dict[str, str] = field(default_factory=dict)  # surely wrong: why
+    focals_px: dict[str, float] = field(default_factory=dict)  # of the cameras of the images
+    moves: tuple[str, ...] = ()  # what made the model, by the sparse mapper
+    tie_points: tuple[Residual, ...] = ()  # those by hand, the worst first
 
     @property
     def sure(self) -> tuple[str, ...]:
@@ -196,39 +170,28 @@ class ModelSummary:
 
 @dataclass(frozen=True)
 class ReconstructionReport:
-    """A whole run; numbers of points and tracks are those of the largest model.
-
-    Attributes:
-        unregistered: image name to reason: unreadable, no features, no verified pair, not
-            registered (with its best pairs), taken out, or in another model.
-        models: all models, largest first, as written to sparse/0, sparse/1, ...
-        preset: of mapping: ``sparse``, ``colmap`` or ``custom``.
-        verification: options of two-view geometry.
-        mapping: the mapper and its options.
-        extended: names of the images of the model that was extended; empty where none was.
-        advice: what to try for the images that are missing.
-        guided: ``pairs`` that guided matching gave more inliers, and these inliers
-            ``matches_before`` and ``matches_after``; empty where no pair needed it.
-        cameras: for each its images, where its focal length is from, and its spread.
-        by_hand: what was done otherwise than matches alone say, in a few words each.
-    """
+    """A whole run; numbers of points and tracks are those of the largest model."""
 
     images_total: int
+    # image name to reason: unreadable, no features, no verified pair, not registered (with its
+    # best pairs), taken out, or in another model
     unregistered: dict[str, str]
-    models: tuple[ModelSummary, ...]
+    models: tuple[ModelSummary, ...]  # largest first, as written to sparse/0, sparse/1, ...
     num_verified_pairs: int
     num_pairs: int
     stages: tuple[StageReport, ...]
     recipe: str
     versions: dict[str, str]
-    preset: str
-    verification: dict[str, Any]
-    mapping: dict[str, Any]
-    extended: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
+    preset: str  # of mapping: ``sparse``, ``colmap`` or ``custom``
+    verification: dict[str, Any]  # options of two-view geometry
+    mapping: dict[str, Any]  # the mapper and its options
+    extended: tuple[str, ...] = ()  # names of the images of the model that was extended, if any
+    advice: tuple[str, ...] = ()  # what to try for the images that are missing
+    # ``pairs`` that guided matching gave more inliers, and these inliers ``matches_before`` and
+    # ``matches_after``; empty where no pair needed it
     guided: dict[str, int] = field(default_factory=dict)
-    cameras: tuple[dict[str, Any], ...] = ()
-    by_hand: tuple[str, ...] = ()
+    cameras: tuple[dict[str, Any], ...] = ()  # see ``CameraRecord.to_report``
+    by_hand: tuple[str, ...] = ()  # what was done otherwise than matches alone say
 
     @property
     def status(self) -> str:

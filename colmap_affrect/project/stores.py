@@ -29,14 +29,11 @@ from colmap_affrect.project.record import Content, stamp_of
 
 MAX_INT16 = 32767
 NOT_KNOWN = Content()
-STATIONARY = "stationary_cells"
-"""Note of matches: [size, cells] of the places that never move (stages/stationary)."""
-STEP = "step"
-"""Note of matches: level and pairs of the step of escalation that has begun and not ended."""
-FINISHED = "finished_list"
-"""Note of matches: digest of the list whose pairs have all been matched and looked at."""
-CLIMBING = "climbing_list"
-"""Note of matches: the same, of which there was a model before pairs were matched again."""
+# Notes of matches:
+STATIONARY = "stationary_cells"  # [size, cells] of the places that never move
+STEP = "step"  # level and pairs of the step of escalation that has begun and not ended
+FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
+CLIMBING = "climbing_list"  # the same, of which there was a model before pairs were matched again
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
@@ -329,8 +326,7 @@ class GuidedPair:
 
     names: tuple[str, str]  # of the two images, in the order of the columns
     exact: Indices  # (M, 2) inliers before; what adjusts models most accurately
-    # of the geometry that took the place of the one before; 0 where that stayed
-    num_inliers: int
+    num_inliers: int  # of the geometry that took the place of the one before; 0 where that stayed
 
 
 class GuidedStore(GroupStore):
