@@ -27,7 +27,7 @@ from colmap_affrect.geometry.arrays import Singles
 
 IMPORT_AGAIN = "import these images again into a new database"
 MATCH_AGAIN = "extract and match these images again"
-CHECKS = {
+CHECKS = {  # the problems of a database by kind: what they are, and what to do about them
     "no-parent": ("images whose camera does not exist, or rows of rigs and frames that belong to "
         "nothing", IMPORT_AGAIN),
     "camera-panorama": ("cameras that look all around, which have no focal length",
@@ -51,7 +51,6 @@ CHECKS = {
         "or of one with itself, or not in 2 columns, at which COLMAP crashes",
         "delete the matches of these pairs and match them again"),
 }  # fmt: skip
-"""The problems of a database by kind: what they are, and what to do about them."""
 
 FATAL_FOR_IMAGES = frozenset({"bad-name", "no-parent", "bad-camera", "camera-panorama"})
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
@@ -62,12 +61,11 @@ FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "
 
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
 
-MATRICES = {
+MATRICES = {  # columns that hold so many float64 or nothing, by table
     "two_view_geometries": {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
     "pose_priors": {"position": 3, "position_covariance": 9, "gravity": 3},
     "rig_sensors": {"sensor_from_rig": 7},
 }
-"""Columns that hold so many float64 or nothing, by table."""
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
 MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
@@ -111,14 +109,11 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         if not like:
             found["bad-camera"].append(f"{label}: model {camera.model}")
             continue
-        if not len(like.focal_length_idxs()):
+        focals = like.focal_length_idxs()
+        if not len(focals):
             found["camera-panorama"].append(f"{label}: {like.model.name}")
         params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
-        if (
-            params is None
-            or not np.isfinite(params).all()
-            or (params[0, like.focal_length_idxs()] <= 0.0).any()
-        ):
+        if params is None or not np.isfinite(params).all() or (params[0, focals] <= 0.0).any():
             found["bad-camera"].append(label)
         if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
             found["bad-camera"].append(f"{label}: {camera.width} x {camera.height} px")

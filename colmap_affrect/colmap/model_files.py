@@ -107,14 +107,13 @@ def _point(reader: _Reader) -> None:
     reader.skip(8 * length)
 
 
-RECORDS: dict[str, Callable[[_Reader], Any]] = {
+RECORDS: dict[str, Callable[[_Reader], Any]] = {  # what reads a record of each file of a model
     "cameras.bin": _camera,
     "rigs.bin": _rig,
     "frames.bin": _frame,
     "images.bin": _image,
     "points3D.bin": _point,
 }
-"""The files of a model, and what reads one record of each."""
 OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")  # of COLMAP before it knew rigs
 
 

@@ -17,11 +17,10 @@ DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # what sqlite3 raises, also quoti
 MAX_NUM_IMAGES = 2**31 - 1  # an id of a pair is the smaller image id times this, plus the larger
 SENSOR_CAMERA = 0
 
-DIGESTED = (
+DIGESTED = (  # tables that decide what is mapped
     "cameras", "rigs", "rig_sensors", "frames", "frame_data", "images", "pose_priors", "keypoints",
     "matches", "two_view_geometries",
 )  # fmt: skip
-"""Tables that decide what is mapped."""
 
 
 @contextmanager
@@ -38,8 +37,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     try:
         with closing(sqlite3.connect(address, uri=True)) as connection:
             rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-            missing = TABLES - {name for (name,) in rows}
-            if missing:
+            if missing := TABLES - {name for (name,) in rows}:
                 raise DatabaseError(
                     f"{path}: not a COLMAP database (it has no table {min(missing)})"
                 )

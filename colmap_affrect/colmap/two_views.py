@@ -25,12 +25,11 @@ from colmap_affrect.geometry.tilts import of_unit_area, vary_singly
 Cameras = tuple[pycolmap.Camera, pycolmap.Camera]  # of the two images
 Keypoints = tuple[Floats, Floats]  # (N, 2, 4 or 6) of each image, as in the database
 
-PLANAR = (
+PLANAR = (  # pairs that a homography explains: their epipolar geometry is arbitrary
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
     pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
     pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
 )
-"""Pairs that a homography explains: their epipolar geometry is arbitrary."""
 
 CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
 MAX_FRAME_ANGLE_DEG = 20.0  # frames of right matches are off by 5 to 10 degrees

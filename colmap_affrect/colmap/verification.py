@@ -58,10 +58,7 @@ class VerificationOptions(PresetOptions):
     COLMAP: ClassVar[Mapping[str, Any]] = {
         "max_error_px": 4.0,
         "scale_max_error": False,
-        "min_num_inliers": 15,
-        "min_inlier_ratio": 0.0,
         "min_significance": 0.0,
-        "max_num_trials": 10000,
         "ransac_min_inlier_ratio": 0.25,
     }
 

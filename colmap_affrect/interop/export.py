@@ -161,8 +161,7 @@ FORMATS: dict[str, tuple[Callable[[Source, Path], Path], str]] = {
     "ply": (_points, "points3D.ply"),
     "text": (_text, "text"),
     "undistorted": (_undistorted, DENSE),
-    "nerfstudio": (_nerfstudio, DENSE),
+    "nerfstudio": (_nerfstudio, DENSE),  # comes after ``undistorted``, whose folder it uses
     "cameras": (_cameras, "cameras.csv"),
 }
-"""What writes each format into a folder, and what it leaves there; ``undistorted`` comes before
-``nerfstudio``, which uses its folder."""
+"""What writes each format into a folder, and what it leaves there."""

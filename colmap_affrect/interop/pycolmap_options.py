@@ -20,7 +20,7 @@ from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 
 Native = TypeVar("Native")  # an option class of pycolmap
 
-VERIFICATION_NAMES = {
+VERIFICATION_NAMES = {  # in pycolmap's TwoViewGeometryOptions and in ours
     "min_num_inliers": "min_num_inliers",
     "min_inlier_ratio": "min_inlier_ratio",
     "ransac.max_error": "max_error_px",
@@ -28,12 +28,11 @@ VERIFICATION_NAMES = {
     "ransac.min_inlier_ratio": "ransac_min_inlier_ratio",
     "ransac.random_seed": "random_seed",
 }
-"""Names in pycolmap's TwoViewGeometryOptions and in ours."""
 
+# where the work is done; of ``use_gpu`` the argument ``device`` decides, as in pycolmap
 WHERE = ("num_threads", "use_gpu")
-"""Where the work is done; of ``use_gpu`` the argument ``device`` decides, as in pycolmap."""
 
-HONOURED: dict[type, tuple[str, ...]] = {
+HONOURED: dict[type, tuple[str, ...]] = {  # fields that may differ from their defaults
     pycolmap.FeatureExtractionOptions: ("max_image_size", *WHERE),
     pycolmap.FeatureMatchingOptions: (
         "skip_geometric_verification", "skip_image_pairs_in_same_frame", "guided_matching",
@@ -52,7 +51,6 @@ HONOURED: dict[type, tuple[str, ...]] = {
         "camera_mask_path",
     ),
 }  # fmt: skip
-"""Fields that may differ from their defaults."""
 
 SET_OTHERWISE = ("random_seed", "image_path", "fix_existing_frames")
 """Options of pycolmap's mapper, in any section, that reach ours by other ways."""

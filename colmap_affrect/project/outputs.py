@@ -18,13 +18,11 @@ from colmap_affrect.project.atomic_files import cannot_write, require_space, uni
 
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
 LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works there
-MARKS = {"config.toml": b"format_version", "run.log": b"colmap-affrect"}
-"""Files of ours, and what each has at its beginning."""
+MARKS = {"config.toml": b"format_version", "run.log": b"colmap-affrect"}  # files of ours begin so
 SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
 BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
+# what file managers and file systems put, beside hidden files, into folders that look empty
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}
-"""What file managers and file systems put into folders that are empty for their user, beside hidden
-files."""
 
 
 def is_output_folder(path: Path) -> bool:
@@ -79,17 +77,10 @@ def new_results(
 ) -> Iterator[list[Path]]:
     """Yield paths for files or folders to be made, which get their names when all are whole.
 
-    When the block fails or is interrupted nothing of it stays.
-
-    Args:
-        *targets: what is to be made; missing folders above are made.
-        names: of the photographs: nothing is made in the folder where they lie.
-        replaces: files that are there give way; else nothing is overwritten.
-
-    Raises:
-        OptionError: before anything is made, where a target is there already, is a symbolic link,
-            or lies among the photographs.
-        WorkspaceError: when something cannot be written.
+    Missing folders above are made. When the block fails or is interrupted nothing of it stays.
+    With ``replaces`` files that are there give way; else nothing is overwritten. Raises
+    OptionError, before anything is made, where a target is there already, is a symbolic link, or
+    lies among photographs of these ``names``, WorkspaceError when something cannot be written.
     """
     for target in targets:
         refuse_link(target)
@@ -102,9 +93,8 @@ def new_results(
         if not replaces:
             _refuse_existing(target)
     with ExitStack() as stack:
-        folders = {}
-        for parent in dict.fromkeys(target.parent for target in targets):
-            folders[parent] = stack.enter_context(temporary_folder(parent))
+        parents = dict.fromkeys(target.parent for target in targets)
+        folders = {parent: stack.enter_context(temporary_folder(parent)) for parent in parents}
         made = [folders[target.parent] / target.name for target in targets]
         yield made
         for temporary in folders.values():  # native writers say nothing of a full disk

@@ -13,17 +13,15 @@ from colmap_affrect.errors import such_as
 NUM_WORST = 3  # tie points that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
-SOURCES = {
+SOURCES = {  # how a summary calls where focal lengths are from; others by their own names
     "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size",
     "guess": "not known beforehand",
 }  # fmt: skip
-"""How a summary calls where focal lengths are from; others are called by their own names."""
 
-OF_LARGEST = (
+OF_LARGEST = (  # what ``report.json`` has of the largest model under its own name
     "registered_names", "probabilities", "doubtful", "mean_track_length",
     "mean_reprojection_error_px", "moves",
 )  # fmt: skip
-"""What ``report.json`` has of the largest model under its own name."""
 
 SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
 

@@ -36,11 +36,10 @@ FILES_OF_MODEL = {
     "cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin", "summary.json",
 }  # fmt: skip
 LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends
-OWN_STEMS = {
+OWN_STEMS = {  # how names of files and folders begin that are written here
     "cameras", "config", "database", "features", "guided", "matches", "methods", "pairs",
     "report", "run", "shared", "sparse",
 }  # fmt: skip
-"""How names of files and folders begin that are written here."""
 
 
 class Workspace:
