@@ -43,9 +43,6 @@ class Alignment:
 
     scale: float  # metres for a unit of the model as it was
     residuals: Mapping[str, float]  # how far each position, point or distance is off, metres
-    origin: tuple[
-        float, ...
-    ] = ()  # latitude, longitude, altitude (WGS 84) of x, y, z east, north, up
 
     def summary(self) -> str:
         """Return a few lines."""
@@ -92,13 +89,16 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
         if origin:
             content = dict(zip(ON_EARTH, origin, strict=True))
             replace_text(folder / GEOREFERENCE, json.dumps(content, indent=1) + "\n")
-    return Alignment(float(new_from_old.scale), residuals, origin)
+    return Alignment(float(new_from_old.scale), residuals)
 
 
 def _similarity(
     old: Places, true: Places, *, is_on_earth: bool
 ) -> tuple[pycolmap.Sim3d, dict[str, float], tuple[float, ...]]:
-    """Return the similarity of least squares, its residuals, and the origin if on earth."""
+    """Return the similarity of least squares, its residuals, and the origin if on earth.
+
+    The origin is latitude, longitude and altitude (WGS 84); x, y, z are east, north, up of it.
+    """
     names = sorted(old.keys() & true.keys())
     if len(names) < 3:
         raise OptionError(
