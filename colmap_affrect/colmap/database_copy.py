@@ -10,7 +10,7 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database, write_frame
-from colmap_affrect.colmap.tables import DAMAGED, open_read_only
+from colmap_affrect.colmap.tables import open_read_only
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.outputs import temporary_folder
 
@@ -62,11 +62,8 @@ def copy_database(
         refuse_unusable(source, refused)
     with temporary_folder(target.parent) as folder:
         new = folder / target.name
-        try:
-            with open_read_only(source) as original, closing(sqlite3.connect(new)) as copy:
-                original.backup(copy)
-        except DAMAGED as error:
-            raise DatabaseError(f"cannot copy {source} to {target}: {error}") from error
+        with open_read_only(source) as original, closing(sqlite3.connect(new)) as copy:
+            original.backup(copy)
         with open_database(new) as database:  # COLMAP migrates it
             if change:
                 change(database)

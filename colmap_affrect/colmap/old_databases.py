@@ -23,6 +23,9 @@ MAPPER_OPTIONS = (
 # COLMAP 3.8 has camera models up to this number
 LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
 
+ROWS = "rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB"
+OF_IMAGES = f"""(image_id INTEGER PRIMARY KEY NOT NULL, {ROWS},
+    FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE)"""
 TABLES = f"""
 PRAGMA user_version = {VERSION};
 CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
@@ -35,17 +38,11 @@ CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
     CONSTRAINT image_id_check CHECK (image_id >= 0 and image_id < 2147483647),
     FOREIGN KEY (camera_id) REFERENCES cameras (camera_id));
 CREATE UNIQUE INDEX index_name ON images (name);
-CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY NOT NULL,
-    rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
-    FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE);
-CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY NOT NULL,
-    rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
-    FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE);
-CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL,
-    rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB);
-CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL,
-    rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL,
-    F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB);
+CREATE TABLE keypoints {OF_IMAGES};
+CREATE TABLE descriptors {OF_IMAGES};
+CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, {ROWS});
+CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, {ROWS},
+    config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB);
 """
 
 CONTENT = """
