@@ -145,7 +145,7 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         diagnosis.add("note", path, older, f"keep a copy: {copy}")
     diagnosis.checked.append(f"{path}: {tables.summary()}")
     for kind in sorted(problems, key=list(CHECKS).index):
-        what, usual = CHECKS[kind]
+        what, usual = CHECKS[kind]["what"], CHECKS[kind]["advice"]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
         severity: Severity = "warning" if kind == "camera-panorama" else "error"  # of use to COLMAP
         diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))

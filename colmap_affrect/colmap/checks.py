@@ -4,6 +4,7 @@ Rows that COLMAP does not expect end the process inside COLMAP, so SQLite reads 
 """
 
 import sqlite3
+import tomllib
 from collections import defaultdict
 from collections.abc import Collection
 from pathlib import Path
@@ -25,32 +26,10 @@ from colmap_affrect.colmap.tables import (
 from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.geometry.arrays import Singles
 
-IMPORT_AGAIN = "import these images again into a new database"
-MATCH_AGAIN = "extract and match these images again"
-CHECKS = {  # the problems of a database by kind: what they are, and what to do about them
-    "no-parent": ("images whose camera does not exist, or rows of rigs and frames that belong to "
-        "nothing", IMPORT_AGAIN),
-    "camera-panorama": ("cameras that look all around, which have no focal length",
-        "cut perspective views out of the panoramas, as COLMAP's example panorama.py does"),
-    "bad-camera": ("cameras of a model that COLMAP does not have, of a size that no photograph "
-        "has, with more or fewer parameters than their model, or without a finite and positive "
-        "focal length", IMPORT_AGAIN),
-    "no-frame": ("images without a frame while others have one, at which mapping aborts",
-        "'colmap-affrect map --from-database {path}' adds frames to its copy"),
-    "matrix-data": ("rows whose matrices have more or less data than they should",
-        "delete these rows; two-view geometries are made anew by 'colmap geometric_verifier'"),
-    "bad-name": ("images without a name, or with one that is not UTF-8",
-        "rename these files and import them again into a new database"),
-    "keypoint-data": ("images whose keypoints do not have 2, 4 or 6 columns, or are more or fewer "
-        "than recorded", MATCH_AGAIN),
-    "keypoints-not-finite": ("images with keypoints that are not finite numbers, or are where no "
-        "image reaches", MATCH_AGAIN),
-    "keypoints-at-one-place": ("images with most keypoints at one place, at which COLMAP may never "
-        "end", MATCH_AGAIN),
-    "match-data": ("pairs with matches of keypoints that do not exist, of images that do not exist "
-        "or of one with itself, or not in 2 columns, at which COLMAP crashes",
-        "delete the matches of these pairs and match them again"),
-}  # fmt: skip
+# by kind what the problems are, and what to do about them
+CHECKS: dict[str, dict[str, str]] = tomllib.loads(
+    Path(__file__).with_name("checks.toml").read_text(encoding="utf-8")
+)
 
 FATAL_FOR_IMAGES = frozenset({"bad-name", "no-parent", "bad-camera", "camera-panorama"})
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
@@ -76,9 +55,8 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
     """Refuse a damaged database, or one with some ``kinds`` of problems; DatabaseError."""
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
-        what, advice = CHECKS[kind]
-        items = such_as(problems[kind])
-        raise DatabaseError(f"{path}: {what} ({items}); {advice.format(path=path)}")
+        what, advice = CHECKS[kind]["what"], CHECKS[kind]["advice"].format(path=path)
+        raise DatabaseError(f"{path}: {what} ({such_as(problems[kind])}); {advice}")
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:

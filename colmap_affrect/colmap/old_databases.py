@@ -12,8 +12,6 @@ from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import new_results
 
-VERSION = 3800  # ``user_version`` of COLMAP 3.8; newer ones take the tables over by it
-
 MAPPER_OPTIONS = (
     "--Mapper.tri_ignore_two_view_tracks 0 --Mapper.init_min_num_inliers 50 "
     "--Mapper.init_min_tri_angle 8 --Mapper.abs_pose_min_num_inliers 12 --Mapper.min_model_size 2"
@@ -23,42 +21,7 @@ MAPPER_OPTIONS = (
 # COLMAP 3.8 has camera models up to this number
 LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
 
-ROWS = "rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB"
-OF_IMAGES = f"""(image_id INTEGER PRIMARY KEY NOT NULL, {ROWS},
-    FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE)"""
-TABLES = f"""
-PRAGMA user_version = {VERSION};
-CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
-    model INTEGER NOT NULL, width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB,
-    prior_focal_length INTEGER NOT NULL);
-CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
-    name TEXT NOT NULL UNIQUE, camera_id INTEGER NOT NULL,
-    prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL,
-    prior_tx REAL, prior_ty REAL, prior_tz REAL,
-    CONSTRAINT image_id_check CHECK (image_id >= 0 and image_id < 2147483647),
-    FOREIGN KEY (camera_id) REFERENCES cameras (camera_id));
-CREATE UNIQUE INDEX index_name ON images (name);
-CREATE TABLE keypoints {OF_IMAGES};
-CREATE TABLE descriptors {OF_IMAGES};
-CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, {ROWS});
-CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, {ROWS},
-    config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB);
-"""
-
-CONTENT = """
-INSERT INTO cameras SELECT camera_id, model, width, height, params, prior_focal_length
-    FROM new.cameras;
-INSERT INTO images (image_id, name, camera_id) SELECT image_id, name, camera_id FROM new.images;
-INSERT INTO keypoints SELECT image_id, rows, cols, data FROM new.keypoints;
-INSERT INTO descriptors SELECT image_id, rows, cols, data FROM new.descriptors
-    WHERE type = 0 AND cols = 128;
-INSERT INTO matches SELECT pair_id, rows, cols, data FROM new.matches;
-INSERT INTO two_view_geometries
-    SELECT pair_id, rows, cols, data, CASE config WHEN 9 THEN 2 ELSE config END,
-    F, E, H, qvec, tvec FROM new.two_view_geometries;
-"""
-"""What fills the tables, from a database of the installed pycolmap: descriptors of type 0, SIFT;
-geometries of configuration 9, calibrated with rigs, as 2, calibrated."""
+FILL = Path(__file__).with_name("colmap_3_8.sql")  # makes the tables, from an attached ``new``
 
 
 def export_database(source: Path, target: Path) -> None:
@@ -83,7 +46,7 @@ def export_database(source: Path, target: Path) -> None:
         try:
             with closing(sqlite3.connect(old)) as connection:
                 connection.execute("ATTACH ? AS new", (str(new),))
-                connection.executescript(f"{TABLES} BEGIN; {CONTENT} COMMIT;")
+                connection.executescript(FILL.read_text(encoding="utf-8"))
                 connection.executemany(
                     "UPDATE images SET prior_tx = ?, prior_ty = ?, prior_tz = ? WHERE image_id = ?",
                     [(*prior.position.tolist(), prior.corr_data_id.id) for prior in priors],

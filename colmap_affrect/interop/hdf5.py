@@ -248,7 +248,7 @@ def _write_keypoints(database: pycolmap.Database, image: pycolmap.Image, source:
             )
     keypoints = _keypoint_rows(source, name)
     for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints)):
-        raise StoreError(f"{source.path}: {CHECKS[kind][0]}: {name}")
+        raise StoreError(f"{source.path}: {CHECKS[kind]['what']}: {name}")
     database.write_keypoints(image.image_id, keypoints)
 
 
