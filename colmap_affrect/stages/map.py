@@ -11,7 +11,7 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.errors import StoreError
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
-from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
+from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, read_summaries
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.pairs.lists import Pair
@@ -41,8 +41,6 @@ def map_images(
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("verify")
-    # Read first: it may be discarded now.
-    existing = read_existing(extend, workspace.database) if extend else None
     inputs = _inputs(context, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
     known = workspace.made_from("map") if workspace.sparse.exists() else ""
@@ -59,17 +57,18 @@ def map_images(
     is_same = known.partition("+")[2] == inputs.partition("+")[2]  # as it was said by hand
     goes_on = goes_on and bool(known_models) and is_same
     before = _read_before(workspace, known_models[0]) if goes_on else None
+    task = _task(context, extend, before)
     workspace.record_made_from(map="")  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
-        models = map_database(mapper, _task(context, existing, before), workspace.sparse, advance)
+        models = map_database(mapper, task, workspace.sparse, advance)
     workspace.record_made_from(map=inputs)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models)), models
 
 
 def _task(
-    context: Context, existing: ExistingModel | None, before: MappedModel | None = None
+    context: Context, extend: Extension | None, before: MappedModel | None = None
 ) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace, by_hand = context.workspace, context.by_hand
@@ -82,7 +81,7 @@ def _task(
     return MappingTask(
         path,
         workspace.photographs(),
-        existing,
+        read_existing(extend, path) if extend else None,
         before,
         unmeasured=frozenset() if copied else frozenset(unmeasured_pairs(context)),
         cameras=read_camera_records(workspace.cameras),
