@@ -93,9 +93,7 @@ def verification(
 
 
 def mapping(
-    options: argparse.Namespace,
-    recipe: Recipe | None = None,
-    known: MapperOptions | None = None,
+    options: argparse.Namespace, recipe: Recipe | None = None, known: MapperOptions | None = None
 ) -> MapperOptions:
     """Return the mapper that is given, or what is known."""
     given: dict[str, Any] = _seed(options)

@@ -131,9 +131,7 @@ def map_ordered(
 
 
 def in_order(
-    submit: Callable[[Task], Any],
-    tasks: Iterable[Task],
-    limit: Callable[[], int],
+    submit: Callable[[Task], Any], tasks: Iterable[Task], limit: Callable[[], int]
 ) -> Iterator[Any]:
     """Yield results of futures in task order; fewer than ``limit()`` are submitted beforehand.
 

@@ -11,13 +11,7 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
-from colmap_affrect.errors import (
-    DatabaseError,
-    ImageError,
-    StoreError,
-    one_line,
-    such_as,
-)
+from colmap_affrect.errors import DatabaseError, ImageError, StoreError, one_line, such_as
 from colmap_affrect.features.weights import digests
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options

@@ -10,13 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_affrect.data import (
-    LocalFeatures,
-    Mask,
-    Photograph,
-    RectificationPlan,
-    in_mask,
-)
+from colmap_affrect.data import LocalFeatures, Mask, Photograph, RectificationPlan, in_mask
 from colmap_affrect.errors import MEMORY_HINT, DepthError, ImageError, lacks_memory
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import digests, resolve
@@ -33,10 +27,7 @@ from colmap_affrect.images.reading import (
     shrink_to,
     tones,
 )
-from colmap_affrect.parallel.executor import (
-    available_cores,
-    available_memory_bytes,
-)
+from colmap_affrect.parallel.executor import available_cores, available_memory_bytes
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions, Level
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
