@@ -137,7 +137,7 @@ class Registry(Generic[Part]):
             raise OptionError(f"unknown {self.kind} '{name}'{suggestion(name, known)}")
         return known[name].load()
 
-    def options(self, given: Any, *, where: str = "") -> Any:
+    def options(self, given: Any, where: str = "") -> Any:
         """Return the options of a part: as they are, by its name, or from a mapping with ``name``.
 
         Raises OptionError for an unknown part or option, naming ``where`` it is given.

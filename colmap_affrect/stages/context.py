@@ -1,10 +1,10 @@
 """What all stages of a run have in common: photographs, options on record, files, resources."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand
 from colmap_affrect.colmap.cameras import read_given_cameras
@@ -25,7 +25,7 @@ from colmap_affrect.images.photographs import (
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.options import Options, Registry
+from colmap_affrect.options import Options
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
@@ -35,7 +35,7 @@ from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
 
-AnyOptions = TypeVar("AnyOptions", bound=Options)
+Built = TypeVar("Built")
 
 
 class Inputs(Options):
@@ -175,6 +175,25 @@ def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) 
             )
 
 
+class OnRecord(Generic[Built]):
+    """Options of a stage, as an attribute of a :class:`Context`, built from its section."""
+
+    def __init__(
+        self, stage: str, build: Callable[[Any, str], Built], beside: type[Options] | None = None
+    ) -> None:
+        """Take what builds them of values and of where these are; not of others ``beside`` them."""
+        self._stage, self._build = stage, build
+        self._others = beside.model_fields if beside else {}
+
+    def __get__(self, context: "Context", owner: object) -> Built:
+        workspace = context.workspace
+        if self._stage == "extract":
+            workspace.require("extract")
+        record = workspace.planned(self._stage) or {}
+        values = {key: value for key, value in record.items() if key not in self._others}
+        return self._build(values, str(workspace.config))
+
+
 @dataclass(frozen=True)
 class Context:
     """Where a run works and with what; but for the deadline none of it changes a result.
@@ -184,6 +203,15 @@ class Context:
     with or are still to be done with.
     """
 
+    inputs = OnRecord("extract", Inputs.from_mapping, beside=ExtractionOptions)
+    extraction = OnRecord("extract", ExtractionOptions.from_mapping, beside=Inputs)
+    pairing = OnRecord("pairs", PairOptions.from_mapping)
+    matching = OnRecord[MatcherOptions]("match", MATCHERS.options)
+    verification = OnRecord("verify", VerificationOptions.from_mapping)
+    escalation = OnRecord("escalate", EscalateOptions.from_mapping)
+    guiding = OnRecord("guide", GuidedOptions.from_mapping)
+    mapping = OnRecord[MapperOptions]("map", MAPPERS.options)
+
     workspace: Workspace  # the output folder
     resources: Resources = field(default_factory=Resources)  # weights and device
     executor: Executor | None = None  # for images and pairs, e.g. a cluster; None: threads here
@@ -191,67 +219,10 @@ class Context:
     deadline_s: float = math.inf  # of time.monotonic(): from then on nothing more is tried
     by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
 
-    @property
-    def inputs(self) -> Inputs:
-        """Which photographs the run is about, and what is known of them."""
-        self.workspace.require("extract")
-        return self._built(Inputs, "extract", ExtractionOptions)
-
-    @property
-    def extraction(self) -> ExtractionOptions:
-        """How features are extracted."""
-        self.workspace.require("extract")
-        return self._built(ExtractionOptions, "extract", Inputs)
-
-    @property
-    def pairing(self) -> PairOptions:
-        """How pairs are chosen."""
-        return self._built(PairOptions, "pairs")
-
-    @property
-    def matching(self) -> MatcherOptions:
-        """How pairs are matched."""
-        options: MatcherOptions = self._part(MATCHERS, "match")
-        return options
-
-    @property
-    def verification(self) -> VerificationOptions:
-        """How pairs are verified."""
-        return self._built(VerificationOptions, "verify")
-
-    @property
-    def escalation(self) -> EscalateOptions:
-        """Which pairs are escalated."""
-        return self._built(EscalateOptions, "escalate")
-
-    @property
-    def guiding(self) -> GuidedOptions:
-        """How verified pairs are matched again."""
-        return self._built(GuidedOptions, "guide")
-
-    @property
-    def mapping(self) -> MapperOptions:
-        """How images are registered."""
-        options: MapperOptions = self._part(MAPPERS, "map")
-        return options
-
     def verified_digest(self) -> str:
         """Return digests of the verified pairs and, after a plus, of what is said by hand."""
         said = self.by_hand.digest()
         return rows_digest(self.workspace.database) + (f"+{said}" if said else "")
-
-    def _built(
-        self, cls: type[AnyOptions], stage: str, beside: type[Options] | None = None
-    ) -> AnyOptions:
-        """Return options of a stage, without those ``beside`` them in its section."""
-        others = beside.model_fields if beside else {}
-        where, record = str(self.workspace.config), self.workspace.planned(stage) or {}
-        values = {key: value for key, value in record.items() if key not in others}
-        return cls.from_mapping(values, where)
-
-    def _part(self, registry: Registry[Any], stage: str) -> Any:
-        where, values = str(self.workspace.config), self.workspace.planned(stage) or {}
-        return registry.options(values, where=where)
 
     @property
     def features(self) -> FeatureStore:
