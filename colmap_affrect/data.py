@@ -120,10 +120,6 @@ class LocalFeatures:
         descriptors = np.zeros((0, descriptor_size), np.float32)
         return cls(np.zeros((0, 2, 3)), np.zeros(0, np.float32), descriptors)
 
-    def with_frames(self, lafs: Array) -> Self:
-        """Replace the frames."""
-        return replace(self, lafs=lafs)
-
     def with_rectification_id(self, rectification_id: int) -> Self:
         """Say which rectification all features come from."""
         return replace(self, rectification_ids=np.full(len(self), rectification_id, np.int32))

@@ -7,6 +7,7 @@ same area), the patch of that shape its orientation, the patch of both its descr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ from colmap_affrect.data import GrayImage, LocalFeatures, View, union
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry.affine import rotation
-from colmap_affrect.geometry.arrays import Array, Bools, Floats, Singles
+from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.tilts import frames_from_affnet
 
@@ -82,14 +83,14 @@ class AffNetHardNet:
         with torch.inference_mode():
             shapes, descriptors = self._describe(_sampler(images, counts, self.device), found)
         lengths = np.linalg.norm(descriptors, axis=1)
-        valid = _is_sound(shapes) & np.isfinite(lengths) & (lengths > 0.0)
-        rows = np.flatnonzero(valid)
-        frames = _frames(shapes[rows], found.scales[rows], found.keypoints[rows])
-        unit_rows = descriptors[rows] / lengths[rows, None]
-        described = LocalFeatures(
-            frames, found.responses[rows], unit_rows, found.rectification_ids[rows]
-        )
-        numbers = np.repeat(np.arange(len(detected)), counts)[rows]  # of the images
+        # The squared Frobenius norm of a shape of tilt t is t + 1 / t.
+        is_sound = (shapes**2).sum(axis=(1, 2)) <= MAX_TILT + 1.0 / MAX_TILT
+        valid = is_sound & np.isfinite(lengths) & (lengths > 0.0)
+        found, shapes = found.select(valid), shapes[valid]
+        frames = _frames(shapes, found.scales, found.keypoints)
+        unit_rows = descriptors[valid] / lengths[valid, None]
+        described = replace(found, lafs=frames, descriptors=unit_rows)
+        numbers = np.repeat(np.arange(len(detected)), counts)[valid]  # of the images
         return [described.select(numbers == number) for number in range(len(detected))]
 
     def _describe(
@@ -126,14 +127,11 @@ def _sampler(
 
     from colmap_affrect.features.networks import PatchSampler
 
-    pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
-    samplers = [
-        PatchSampler(image.astype(np.float32) / np.float32(255), device) for image, _ in pairs
-    ]
-    ends = np.cumsum([count for _, count in pairs])
+    grays = (image.astype(np.float32) / np.float32(255) for image in images)
+    samplers = [PatchSampler(gray, device) for gray in grays]
 
     def sample(lafs: Array) -> Tensor:
-        parts = np.split(lafs, ends[:-1])
+        parts = np.split(lafs, np.cumsum(counts)[:-1])
         return torch.cat([s.sample(part) for s, part in zip(samplers, parts, strict=True)])
 
     return sample
@@ -144,12 +142,6 @@ def _shapes_from_outputs(outputs: Floats) -> Array:
     shapes = frames_from_affnet(outputs)
     areas = shapes[:, 0, 0] * shapes[:, 1, 1]
     return shapes / np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]
-
-
-def _is_sound(shapes: Array) -> Bools:
-    """Tell which (N, 2, 2) shapes of determinant 1 are finite and of a tilt up to MAX_TILT."""
-    # The squared Frobenius norm of a shape of tilt t is t + 1 / t.
-    return np.asarray((shapes**2).sum(axis=(1, 2)) <= MAX_TILT + 1.0 / MAX_TILT)
 
 
 def _frames(shapes: Array, radii_px: Array, centers: Array) -> Array:

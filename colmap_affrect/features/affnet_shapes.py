@@ -114,12 +114,10 @@ class AffNet:
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
-        keypoints = self.detect(image)
-        order = np.argsort(-keypoints.responses, kind="stable")
-        keypoints = keypoints.select(order[: self.options.max_num_keypoints])
-        shapes = _frames(self._patch_outputs(image, keypoints.lafs))
+        lafs = self.detect(image).lafs[: self.options.max_num_keypoints]  # by falling response
+        shapes = _frames(self._patch_outputs(image, lafs))
         valid = np.isfinite(shapes).all(axis=(1, 2)) & (determinants(shapes) > 0)
-        return ShapeSamples(keypoints.keypoints[valid], rectifying_metrics(shapes[valid]))
+        return ShapeSamples(lafs[valid, :, 2], rectifying_metrics(shapes[valid]))
 
     def _mean_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics, the mean over all sizes of the image."""
@@ -129,8 +127,10 @@ class AffNet:
         levels = [level for level in resized if min(level.shape) >= min(PATCH_SIZE_PX, largest)]
         mean = np.zeros((ceil(size[1] / STEP_PX), ceil(size[0] / STEP_PX), 2), dtype=np.float32)
         for level in levels:
-            padded = _with_reflected_border(_locally_normalised(level))
-            logs = self._dense_logs(padded)
+            around, deviation = _mean_and_deviation(level)
+            normalised = (level - around) / (deviation + DEVIATION_FLOOR)
+            clipped = np.clip(normalised, -MAX_NORMALISED, MAX_NORMALISED).astype(np.float32)
+            logs = self._dense_logs(_with_reflected_border(clipped))
             level_from_image = resized_from_original((size[0], size[1]), level.shape[::-1])
             mean += _read_grid(logs, level_from_image, mean.shape[:2]) / len(levels)
         return mean
@@ -190,12 +190,6 @@ def _mean_and_deviation(image: GrayImage) -> tuple[Array, Array]:
     mean = np.asarray(cv2.boxFilter(image, cv2.CV_64F, window, borderType=border), np.float64)
     mean_square = cv2.sqrBoxFilter(image, cv2.CV_64F, window, borderType=border)
     return mean, np.sqrt(np.maximum(mean_square - mean**2, 0.0))
-
-
-def _locally_normalised(image: GrayImage) -> Singles:
-    mean, deviation = _mean_and_deviation(image)
-    normalised = (image - mean) / (deviation + DEVIATION_FLOOR)
-    return np.clip(normalised, -MAX_NORMALISED, MAX_NORMALISED).astype(np.float32)
 
 
 def _with_reflected_border(values: Floats) -> Floats:

@@ -5,12 +5,11 @@ Frames are upright circles of RADIUS_PX in the view, which a warp makes ellipses
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, Mask, View, in_mask
+from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, View, in_mask
 from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, NetworkContext
 from colmap_affrect.features.sift import is_searchable
 from colmap_affrect.geometry.affine import lafs_from_keypoints
@@ -23,9 +22,6 @@ if TYPE_CHECKING:
 RADIUS_PX = 12.0
 """Radius of all frames: a sigma of 2 px, within which the network finds a point again, so
 that a point that warps show again is known as the same."""
-
-Found = tuple["Tensor", "Tensor", Callable[["Tensor"], "Tensor"]]
-"""(N, 2) points in pixel-centre px, (N,) responses, and what describes those of some indices."""
 
 
 class AlikedOptions(FeatureOptions):
@@ -75,30 +71,19 @@ class Aliked(FeatureExtractor):
 
         allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
         with torch.inference_mode():
-            places, scores, describe = self._run(_pixels(image).to(self.device))
-            best = _best(places, scores, allowed, self.options.max_num_features)
-            found = places[best], scores[best], describe(best)
+            maps, score_map = self.network.extract_dense_map(_pixels(image).to(self.device))
+            (places,), (scores,), _ = self.network.dkd(score_map)  # places from -1 to 1
+            size = places.new_tensor([image.shape[1] - 1, image.shape[0] - 1])
+            pixels = (places + 1) / 2 * size
+            kept = np.flatnonzero(in_mask(allowed, _array(pixels)))
+            order = np.argsort(-_array(scores)[kept], kind="stable")
+            strongest = kept[order[: self.options.max_num_features]]
+            best = torch.from_numpy(strongest).to(self.device)
+            described = self.network.desc_head(maps, [places[best]])[0][0]
+            found = pixels[best], scores[best], described
         points, responses, descriptors = (_array(values) for values in found)
         lafs = lafs_from_keypoints(points, np.full(len(points), RADIUS_PX), np.zeros(len(points)))
         return LocalFeatures(lafs, responses, descriptors)
-
-    def _run(self, pixels: Tensor) -> Found:
-        """Return the features of a (1, 3, H, W) view in [0, 1]; descriptors are of unit length."""
-        features, scores = self.network.extract_dense_map(pixels)
-        (places,), (responses,), _ = self.network.dkd(scores)
-        size = places.new_tensor([pixels.shape[3] - 1, pixels.shape[2] - 1])
-        points = (places + 1) / 2 * size
-        head = self.network.desc_head
-        return points, responses, lambda chosen: head(features, [places[chosen]])[0][0]
-
-
-def _best(points: Tensor, responses: Tensor, allowed: Mask, limit: int) -> Tensor:
-    """Return the indices of the strongest features where they are allowed, by falling response."""
-    import torch
-
-    kept = np.flatnonzero(in_mask(allowed, _array(points)))
-    order = np.argsort(-_array(responses)[kept], kind="stable")[:limit]
-    return torch.from_numpy(kept[order]).to(points.device)
 
 
 def _pixels(image: GrayImage | ColorImage) -> Tensor:

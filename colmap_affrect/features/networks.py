@@ -5,7 +5,6 @@ kornia builds them empty; a file must have all parameters of its network and no 
 
 import re
 from collections import OrderedDict
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -20,11 +19,13 @@ from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
-from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import Floats, Singles
 from colmap_affrect.geometry.conventions import HALF_PIXEL
 from colmap_affrect.images.warping import halved
 
 Network = TypeVar("Network", bound=nn.Module)
+State = dict[str, Any]
+OF_TRAINING = "SIFT."  # begins what the file of HardTFeat has beside it
 
 
 def resolve_device(name: str) -> torch.device:
@@ -50,12 +51,8 @@ def load_affnet(path: Path, device: str) -> nn.Sequential:
     Standardized patches (B, 1, 32, 32) give (B, 3, 1, 1); an image of H x W px gives (ceil(H / 4) -
     7) x (ceil(W / 4) - 7) cells, where cell (i, j) has the patch whose first pixel is (4 j, 4 i).
     """
-    network = _with_state(
-        feature.LAFAffNetShapeEstimator(pretrained=False), load_state_dict(path), path, "AffNet"
-    )
-    kept = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU, nn.Tanh)
-    layers = nn.Sequential(*(layer for layer in network.features if isinstance(layer, kept)))
-    return _ready(folded(layers), device)
+    network = _with_state(feature.LAFAffNetShapeEstimator(pretrained=False), path, "AffNet")
+    return _ready(folded(network.features[:-1]), device)
 
 
 class OnPatches(nn.Sequential):
@@ -73,29 +70,25 @@ def load_orinet(path: Path, device: str) -> feature.OriNet:
     kornia's convention: an orientation a is a frame turned by [[cos a, sin a], [-sin a, cos a]],
     which is R(-a) here.
     """
-    network = _with_state(feature.OriNet(pretrained=False), load_state_dict(path), path, "OriNet")
+    network = _with_state(feature.OriNet(pretrained=False), path, "OriNet")
     network.features = folded(network.features)
     return _ready(network, device)
 
 
 def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
     """Build a network from (B, 1, 32, 32) patches in [0, 1] to (B, 128) rows of any length."""
-    state = load_state_dict(path)
     if name == "hardtfeat":
-        # The file also holds a SIFT that helped in its training.
-        state = {key: value for key, value in state.items() if not key.startswith("SIFT.")}
-        return _ready(_with_state(hardtfeat(), state, path, name), device)
-    network = _with_state(feature.HardNet(pretrained=False), state, path, name)
+        return _ready(_with_state(hardtfeat(), path, name), device)
+    network = _with_state(feature.HardNet(pretrained=False), path, name)
     network.features = folded(network.features)
     return _ready(network, device)
 
 
 def load_extractor(key: str, score_threshold: float, path: Path, device: str) -> nn.Module:
     """Build ALIKED by the key of its file; maxima above the threshold are kept."""
-    state = load_state_dict(path)
     aliked = feature.ALIKED(key, detection_threshold=score_threshold)
     grid = {"dkd.hw_grid": aliked.dkd.hw_grid}  # derived, and in no file
-    return _ready(_with_state(aliked, {**state, **grid}, path, key), device)
+    return _ready(_with_state(aliked, path, key, grid), device)
 
 
 def hardtfeat() -> OnPatches:
@@ -116,10 +109,10 @@ def standardized(patches: Tensor) -> Tensor:
     return (patches - means) / (deviations + 1e-6)  # as AffNet and OriNet in kornia
 
 
-def folded(layers: nn.Sequential) -> nn.Sequential:
+def folded(layers: nn.Module) -> nn.Sequential:
     """Fold batch normalisations into convolutions, for inference; twice as fast on a CPU."""
     kept: list[nn.Module] = []
-    for layer in layers.eval():
+    for layer in layers.eval().children():
         if isinstance(layer, nn.BatchNorm2d):
             kept.append(fuse_conv_bn_eval(cast(nn.Conv2d, kept.pop()), layer))
         elif isinstance(layer, nn.ReLU):
@@ -129,8 +122,10 @@ def folded(layers: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*kept)
 
 
-def _with_state(network: Network, state: Mapping[str, Any], path: Path, name: str) -> Network:
+def _with_state(network: Network, path: Path, name: str, derived: State | None = None) -> Network:
     """Give a network the parameters of a file; AffrectError when they are not exactly its own."""
+    state = load_state_dict(path) | (derived or {})
+    state = {k: v for k, v in state.items() if not k.startswith(OF_TRAINING)}
     try:
         network.load_state_dict(state)
     except RuntimeError as error:
@@ -177,7 +172,8 @@ class PatchSampler:
             given = torch.from_numpy(lafs.astype(np.float32)).to(image.device)
             return feature.extract_patches_from_pyramid(image, given[None], PATCH_SIZE_PX)[0]
         frames = np.where(np.isfinite(lafs), lafs, 0.0)
-        numbers = self._level_numbers(frames[:, :, :2])
+        steps_px = 2.0 * np.sqrt(np.abs(determinants(frames[:, :, :2]))) / PATCH_SIZE_PX
+        numbers = np.floor(np.log2(np.maximum(steps_px, 1.0))).clip(max=len(self.levels) - 1)
         pixel = 2.0 / np.array(image.shape[:1:-1])
         frames[:, :, 2] = (frames[:, :, 2] + HALF_PIXEL) * pixel - 1.0
         frames[:, :, :2] *= pixel[:, None]
@@ -189,12 +185,6 @@ class PatchSampler:
                 part = torch.from_numpy(rows[begin : begin + PATCHES_AT_ONCE]).to(image.device)
                 patches[part] = _sampled(level, normalized[part])
         return patches
-
-    def _level_numbers(self, matrices: Array) -> Indices:
-        """Return the (N,) levels to sample frames of (N, 2, 2) matrices from."""
-        steps_px = 2.0 * np.sqrt(np.abs(determinants(matrices))) / PATCH_SIZE_PX
-        numbers = np.floor(np.log2(np.maximum(steps_px, 1.0))).astype(np.int64)
-        return np.asarray(np.minimum(numbers, len(self.levels) - 1))
 
 
 def _sampled(level: Tensor, frames: Tensor) -> Tensor:

@@ -48,21 +48,19 @@ def resized_from_original(
 DEFAULT_FOCAL_RATIO = 1.2  # COLMAP's guess where EXIF has none, in units of the longer side
 
 
-def camera_matrix(
-    image_size: tuple[int, int], focal: tuple[float, float] | None = None
-) -> NDArray[np.float64]:
+def camera_matrix(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Return (3, 3) pinhole intrinsics in pixel-centre px, principal point in the middle.
 
-    From (width, height) and (fx, fy) in px, by default ``DEFAULT_FOCAL_RATIO`` longer sides.
+    From (width, height), with a focal length of ``DEFAULT_FOCAL_RATIO`` longer sides.
 
     >>> camera_matrix((10, 5))
     array([[12. ,  0. ,  4.5],
            [ 0. , 12. ,  2. ],
            [ 0. ,  0. ,  1. ]])
     """
-    fx, fy = focal or (DEFAULT_FOCAL_RATIO * max(image_size),) * 2
+    focal = DEFAULT_FOCAL_RATIO * max(image_size)
     cx, cy = (np.asarray(image_size, dtype=np.float64) / 2.0) - HALF_PIXEL
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
 
 
 def grid_origin(step_px: int) -> float:

@@ -135,7 +135,9 @@ def cluster_normals(
         best = int(np.argmax(np.where(far, votes, 0)))
         if not far[best] or votes[best] < max(min_votes_frac * known.size, 1):
             break
-        center = _mean_near(candidates[best], waiting, bin_cos)
+        near = waiting[waiting @ candidates[best].astype(waiting.dtype) >= bin_cos]
+        mean = np.ones(len(near)) @ near.astype(np.float64)
+        center = mean / np.linalg.norm(mean)
         centers = np.concatenate([centers, center[None]])
         taken = _cosines(waiting, center[None])[:, 0] >= bin_cos
         votes -= _votes(candidates, waiting[taken], bin_cos)
@@ -177,13 +179,6 @@ def _votes(candidates: Array, normals: Floats, bin_cos: float) -> Indices:
     by_axis = np.asfortranarray(normals)  # several times faster than rows of three
     counts = [np.count_nonzero(_cosines(by_axis, each[None]) >= bin_cos) for each in candidates]
     return np.array(counts)
-
-
-def _mean_near(center: Array, normals: Floats, bin_cos: float) -> Array:
-    """Return the unit mean of the normals near a direction."""
-    near = normals @ center.astype(normals.dtype) >= bin_cos
-    mean = np.ones(near.sum()) @ normals[near].astype(np.float64)
-    return np.asarray(mean / np.linalg.norm(mean))
 
 
 def _nearest(normals: Floats, centers: Array, bin_cos: float) -> NDArray[np.int32]:

@@ -207,7 +207,7 @@ def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
-    if name := _foreign(data[:16].tobytes()):
+    if name := foreign_format(path):
         raise ImageError(
             f"{path}: is of the format {name}, which COLMAP cannot read; convert it to PNG or "
             "JPEG (colmap-affrect convert)"
@@ -225,10 +225,7 @@ def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
 def foreign_format(path: Path) -> str:
     """Return the format of a file that COLMAP cannot read, whatever its suffix, else nothing."""
     with path.open("rb") as file:
-        return _foreign(file.read(16))
-
-
-def _foreign(beginning: bytes) -> str:
+        beginning = file.read(16)
     matching = (n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL))
     return next(matching, "")
 

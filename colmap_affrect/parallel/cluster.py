@@ -180,8 +180,11 @@ class Cluster:
             key = f"{name}-{next(numbers)}"
             return self._client.submit(_work, *job, pickle.dumps(task), key=key, pure=False)
 
+        def num_tasks() -> int:  # that may be on their way
+            return TASKS_PER_THREAD * max(1, int(sum(self._client.nthreads().values())))
+
         try:
-            yield from in_order(submit, tasks, self._num_tasks)
+            yield from in_order(submit, tasks, num_tasks)
         except KilledWorker as error:
             raise AffrectError(
                 f"{self._address}: {error.allowed_failures + 1} workers were lost while working on "
@@ -198,8 +201,3 @@ class Cluster:
                 f"{self._address}: scheduler or workers do not have this version of colmap-affrect "
                 f"({why}); install it on all machines of the cluster"
             ) from error
-
-    def _num_tasks(self) -> int:
-        """Return how many tasks may be on their way."""
-        num_threads: int = sum(self._client.nthreads().values())
-        return TASKS_PER_THREAD * max(1, num_threads)

@@ -20,6 +20,7 @@ import cv2
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 ASSUMED_MEMORY_BYTES = 8 << 30  # of systems that do not say what they have
+_loaded_libraries = cache(ThreadpoolController)
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -97,11 +98,6 @@ def one_openmp_thread() -> Iterator[None]:
     """
     with _loaded_libraries().limit(limits=1, user_api="openmp"):
         yield
-
-
-@cache
-def _loaded_libraries() -> ThreadpoolController:
-    return ThreadpoolController()
 
 
 def map_ordered(

@@ -77,7 +77,8 @@ def _warped(source: Singles, rectification: Rectification, mask: Mask | None) ->
 def _carried(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:
     if rectification is None:
         return features
-    return features.with_frames(transform_frames(rectification.image_from_rectified, features.lafs))
+    lafs = transform_frames(rectification.image_from_rectified, features.lafs)
+    return replace(features, lafs=lafs)
 
 
 def _usable(

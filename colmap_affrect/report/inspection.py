@@ -112,7 +112,7 @@ def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, 
     if mask is not None:
         outside = 255 - (255 - image) // 4
         image = np.where(mask if image.ndim == 2 else mask[:, :, None], image, outside)
-    features = kept.with_frames(transform_frames(item.rectified_from_image, kept.lafs))
+    features = replace(kept, lafs=transform_frames(item.rectified_from_image, kept.lafs))
     panel = _panel(image, WARPS_PER_ROW, features, [color] * len(kept), MAX_NUM_WARP_FEATURES)
     return panel, f"{index + 1}: tilt {item.tilt:.2f}, {len(kept)} of {len(found)} features"
 

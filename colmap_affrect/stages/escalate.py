@@ -51,11 +51,7 @@ LIKELY = 0.25
 
 
 def escalate(context: Context, options: EscalateOptions | None = None) -> StageReport:
-    """Go through the levels of the recipe; nothing happens when it has none.
-
-    ``options`` are by default those on record. ``num_done`` counts the pairs that were matched
-    again now.
-    """
+    """Go through the levels of the recipe, if any; count the pairs that are matched again now."""
     start = time.perf_counter()
     context.resources.require_device()
     context.workspace.require("verify")
@@ -134,7 +130,9 @@ class Escalation:
         workspace, names = self.context.workspace, self.features.names()
         lost = set(names) - set(model.sure)
         if workspace.made_from("map") != self.context.verified_digest():
-            insecure = lost & self._insecure()  # the next model tells of what has been tied since
+            limit = self.options.strong_num_inliers
+            insecure = lost & insecure_images(self.num_inliers(), limit, self._loose())
+            # The next model tells of what has been tied since.
             maps_next = insecure != lost and workspace.sparse.exists() and len(names) < LARGE
             lost = set() if maps_next else insecure
         worth = {name: LIKELY if name in model.likely else 1.0 for name in sorted(lost)}
@@ -148,10 +146,6 @@ class Escalation:
             if is_tied and not model.likely.isdisjoint(pair):
                 held.update(pair)
         return held.intersection(model.registered_names)
-
-    def _insecure(self) -> set[str]:
-        limit = self.options.strong_num_inliers
-        return insecure_images(self.num_inliers(), limit, self._loose())
 
     def _loose(self) -> set[str]:
         """Return the images with few features in tracks through three, where there are three."""

@@ -47,7 +47,7 @@ def extract(
     An image that cannot be read is reported and passed over. One that cannot be rectified, for
     want of a depth map, is extracted as it is, with a warning. The options of later stages are
     put on record too: ``later``, by name, beside those of the recipe. ``image_names`` are looked at
-    in the place of a list on record; ``overwrite`` discards what is there, and later stages.
+    in the place of a list on record.
     """
     start = time.perf_counter()
     workspace, folder = context.workspace, Path(inputs.image_path)
@@ -155,9 +155,8 @@ def extract_images(
     def task(name: str, level: int) -> ImageTask:
         camera, intrinsics = known.get(name), None
         if extractor.options.uses_depth:
-            intrinsics = (
-                colmap_database.camera_matrix(camera) if camera else initial.matrix(name, names)
-            )
+            matrix = colmap_database.camera_matrix
+            intrinsics = matrix(camera) if camera else initial.matrix(name, names)
         size = (camera.width, camera.height) if camera else None
         return ImageTask(inputs.photographs, name, level, intrinsics, size)
 

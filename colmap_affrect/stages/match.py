@@ -53,11 +53,7 @@ Found = TypeVar("Found")
 def match(
     context: Context, options: MatcherOptions | None = None, *, overwrite: bool = False
 ) -> StageReport:
-    """Match the listed pairs and put the raw matches into the database.
-
-    ``options`` are by default those on record; ``overwrite`` discards what is there, and later
-    stages.
-    """
+    """Match the listed pairs and put the raw matches into the database."""
     start = time.perf_counter()
     context.resources.require_device()
     pairs = listed_pairs(context)
@@ -119,10 +115,7 @@ def match_pairs(
     advance: Callable[[int], None],
     max_num: int = 0,
 ) -> None:
-    """Match pairs by the features that every image has, and store them batch by batch.
-
-    ``max_num``: those of the largest responses; 0: all.
-    """
+    """Match pairs by the features that every image has, ``max_num`` as in :class:`Matching`."""
     with closing(matched_at_level(context, pairs, options, 0, max_num)) as found_pairs:
         write_batches(found_pairs, context.matches.write, advance)
 
@@ -286,12 +279,8 @@ class CachedMatcher:
     def _prepare(self, name: str) -> PreparedImage:
         matching, store = self._matching, self._matching.store
         indices = store.level_indices(name, matching.level, matching.base)
-        end, limit, everything = (
-            int(indices.max(initial=-1)) + 1,
-            matching.max_num_features,
-            store.read(name),
-        )
-        is_part = 0 < limit < len(indices)
+        end, limit = int(indices.max(initial=-1)) + 1, matching.max_num_features
+        everything, is_part = store.read(name), 0 < limit < len(indices)
         if is_part:
             order = np.argsort(-everything.responses[indices], kind="stable")
             indices = np.sort(indices[order[:limit]])

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -124,7 +124,7 @@ class ImageExtractor:
         if photograph.size != original_size:
             resized = resized_from_original(original_size, photograph.size)
             frames = transform_frames(np.linalg.inv(resized), features.lafs)
-            features = features.with_frames(frames)
+            features = replace(features, lafs=frames)
         keep = features.inside(original_size)
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)

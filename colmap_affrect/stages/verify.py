@@ -34,11 +34,7 @@ logger = logging.getLogger(__name__)
 def verify_matches(
     context: Context, options: VerificationOptions | None = None, *, overwrite: bool = False
 ) -> StageReport:
-    """Estimate the two-view geometries of all matched pairs.
-
-    ``options`` are by default those on record; ``overwrite`` discards what is there, and later
-    stages.
-    """
+    """Estimate the two-view geometries of all matched pairs."""
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("match")
@@ -73,10 +69,8 @@ def copy_verified(
     digest = content_of(source_files(source)).digest
     if digest != workspace.made_from("copy") or not workspace.database.exists():
         refuse_unusable(source)
-    given = {
-        "database": str(source.resolve()),
-        "image_path": str(image_path.resolve()) if image_path else "",
-    }
+    photographs = str(image_path.resolve()) if image_path else ""
+    given = {"database": str(source.resolve()), "image_path": photographs}
     workspace.record_options("copy", given, overwrite=overwrite)
     warnings = {}
     if digest != (before := workspace.made_from("copy")):
