@@ -37,23 +37,8 @@ def sampson_errors(fundamental: Floats, points1: Floats, points2: Floats) -> Arr
     return np.asarray(np.abs(products) / np.sqrt(np.maximum(squares, np.finfo(float).tiny)))
 
 
-def direction_cosines(
-    fundamental: Floats, points1: Floats, points2: Floats, shapes1: Floats, shapes2: Floats
-) -> Array:
-    """Return (N,) cosines between epipolar directions of image 2 and those that frames carry over.
-
-    Up to one sign for all right matches of a pair (:func:`common_sign`): lines have no direction.
-    """
-    lines1, lines2 = epipolar_lines(fundamental, points1, points2)
-    along1 = np.stack([-lines1[:, 1], lines1[:, 0]], axis=1)
-    along2 = np.stack([-lines2[:, 1], lines2[:, 0]], axis=1)
-    carried = np.einsum("nij,njk,nk->ni", shapes2, adjugates(shapes1), along1)
-    lengths = np.linalg.norm(carried, axis=1) * np.linalg.norm(along2, axis=1)
-    return np.asarray((carried * along2).sum(axis=1) / np.maximum(lengths, np.finfo(float).tiny))
-
-
 def common_sign(cosines: Floats) -> float:
-    """Return the sign, 1 or -1, that most of the :func:`direction_cosines` of a pair have."""
+    """Return the sign, 1 or -1, that most of the cosines of an epipolar geometry have."""
     return -1.0 if np.sign(cosines).sum() < 0 else 1.0
 
 
@@ -61,7 +46,7 @@ def common_sign(cosines: Floats) -> float:
 class EpipolarModel:
     """What an epipolar geometry says of matches of features ``rows1`` with features ``rows2``."""
 
-    has_sign: ClassVar[bool] = True  # all cosines may have the other sign
+    has_sign: ClassVar[bool] = True  # cosines are up to one sign of all: lines have no direction
     fundamental: Points
     points: tuple[Points, Points]
     sample_size: int = 7
@@ -73,7 +58,14 @@ class EpipolarModel:
     def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
         """Return (M,) cosines between what frames carry over and what the geometry does."""
         points = self.points[0][rows1], self.points[1][rows2]
-        return direction_cosines(self.fundamental, *points, shapes[0][rows1], shapes[1][rows2])
+        lines1, lines2 = epipolar_lines(self.fundamental, *points)
+        along1 = np.stack([-lines1[:, 1], lines1[:, 0]], axis=1)
+        along2 = np.stack([-lines2[:, 1], lines2[:, 0]], axis=1)
+        maps = shapes[1][rows2], adjugates(shapes[0][rows1])
+        carried = np.einsum("nij,njk,nk->ni", *maps, along1)
+        lengths = np.linalg.norm(carried, axis=1) * np.linalg.norm(along2, axis=1)
+        cosines = (carried * along2).sum(axis=1) / np.maximum(lengths, np.finfo(float).tiny)
+        return np.asarray(cosines)
 
     def scaled(self, first: float, second: float) -> Self:
         """Return the same in px of images that are smaller by these factors."""

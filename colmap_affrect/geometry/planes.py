@@ -143,7 +143,9 @@ def cluster_normals(
         votes -= _votes(candidates, waiting[taken], bin_cos)
         waiting = waiting[~taken]
     labels = np.full(known.shape, -1, dtype=np.int32)
-    labels[known] = _nearest(normals[known], centers, bin_cos)
+    if len(centers):
+        cosines = _cosines(normals[known], centers)
+        labels[known] = np.where(cosines.max(axis=1) >= bin_cos, cosines.argmax(axis=1), -1)
     return PlaneClusters(centers, labels)
 
 
@@ -179,11 +181,3 @@ def _votes(candidates: Array, normals: Floats, bin_cos: float) -> Indices:
     by_axis = np.asfortranarray(normals)  # several times faster than rows of three
     counts = [np.count_nonzero(_cosines(by_axis, each[None]) >= bin_cos) for each in candidates]
     return np.array(counts)
-
-
-def _nearest(normals: Floats, centers: Array, bin_cos: float) -> NDArray[np.int32]:
-    if not len(centers):
-        return np.full(len(normals), -1, dtype=np.int32)
-    cosines = _cosines(normals, centers)
-    near = cosines.max(axis=1) >= bin_cos
-    return np.where(near, cosines.argmax(axis=1), -1).astype(np.int32)

@@ -12,14 +12,8 @@ import numpy as np
 
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError, OptionError, StoreError, one_line, such_as
-from colmap_affrect.images.reading import (
-    IMAGE_SUFFIXES,
-    OTHER_IMAGE_SUFFIXES,
-    header_size,
-    pages,
-    read_mask,
-    require_possible,
-)
+from colmap_affrect.images import reading
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.outputs import is_output_folder
 from colmap_affrect.project.stores import pair_key
@@ -72,11 +66,11 @@ class Photographs:
         """Return an image's (H, W) mask, if any; ImageError if it is unreadable or does not fit."""
         paths = [path for path in self._mask_paths(name) if path.is_file()][:1]
         paths += [Path(self.masks.camera_path)] if self.masks.camera_path else []
-        size, masks = header_size(self.folder / name), list[Mask]()
+        size, masks = reading.header_size(self.folder / name), list[Mask]()
         for path in paths:
-            found = header_size(path)
+            found = reading.header_size(path)
             if not size or found in (None, size):
-                masks.append(read_mask(path))
+                masks.append(reading.read_mask(path))
                 found = masks[-1].shape[1], masks[-1].shape[0]
             size = size or found
             if found != size:
@@ -115,7 +109,7 @@ class Photographs:
         """Say which of these files claims more pixels than photographs have; empty if none does."""
         try:
             for path in self.files(name):
-                require_possible(path)
+                reading.require_possible(path)
         except ImageError as error:
             return str(error)
         return ""
@@ -155,7 +149,7 @@ def left_out(image_path: Path) -> dict[str, str]:
             found.setdefault(f"*{suffix}", []).append(name)
         elif _odd(name):
             found.setdefault("names", []).append(name)
-        if suffix in TIFF_SUFFIXES and (count := len(pages(image_path / name))) > 1:
+        if suffix in TIFF_SUFFIXES and (count := len(reading.pages(image_path / name))) > 1:
             notes[name] = (
                 f"has {count} pages, and only the first is used; colmap-affrect convert makes a "
                 "file of each"

@@ -5,6 +5,7 @@ normals from a depth map, their clusters on the sphere, connected segments of ea
 paper's DepthAffNet warps each as ``affnet-shapes`` does, by a cover of the shapes inside it.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -13,15 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
+from colmap_affrect.geometry import planes
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import resized_from_original
-from colmap_affrect.geometry.planes import (
-    cluster_normals,
-    fronto_parallel_homography,
-    normals_from_depth,
-    shrink_depth,
-    viewing_cosines,
-)
 from colmap_affrect.options import Options, within
 from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, WithInputs
 from colmap_affrect.rectifiers.regions import Region, affine_rectification, homography_rectification
@@ -79,7 +74,7 @@ class DepthPlanes(WithInputs):
         items = tuple(
             homography_rectification(
                 segment.region,
-                fronto_parallel_homography(segment.normal, photograph.camera_matrix),
+                planes.fronto_parallel_homography(segment.normal, photograph.camera_matrix),
                 number,
             )
             for number, segment in enumerate(segments)
@@ -101,36 +96,34 @@ def planar_segments(
     unknown.
     """
     size_of_depth = (depth.shape[1], depth.shape[0])
-    depth, shrunk_from_depth = shrink_depth(depth, MAX_DEPTH_SIZE_PX)
+    depth, shrunk_from_depth = planes.shrink_depth(depth, MAX_DEPTH_SIZE_PX)
     depth_from_image = shrunk_from_depth @ resized_from_original(photograph.size, size_of_depth)
-    planes = cluster_normals(
-        normals_from_depth(depth, depth_from_image @ photograph.camera_matrix),
+    clusters = planes.cluster_normals(
+        planes.normals_from_depth(depth, depth_from_image @ photograph.camera_matrix),
         num_candidates=options.num_candidates,
         bin_angle_rad=np.deg2rad(options.bin_angle_deg),
         min_separation_rad=np.deg2rad(options.min_separation_deg),
         max_num_planes=options.max_num_planes,
         min_votes_frac=options.min_votes_frac,
     )
-    labels = _resampled(planes.labels, depth_from_image, photograph.size)
+    labels = _resampled(clusters.labels, depth_from_image, photograph.size)
     min_cos = np.cos(np.deg2rad(options.max_angle_deg))
     min_area_px = options.min_region_frac * labels.size
     segments = []
-    for label, normal in enumerate(planes.normals):
-        cosines = viewing_cosines(normal, photograph.camera_matrix, photograph.size)
+    for label, normal in enumerate(clusters.normals):
+        cosines = planes.viewing_cosines(normal, photograph.camera_matrix, photograph.size)
         found = _connected_regions((labels == label) & (cosines >= min_cos), min_area_px)
-        segments += [PlanarSegment(Region(*region), normal) for region in found]
+        segments += [PlanarSegment(region, normal) for region in found]
     return segments
 
 
-def _connected_regions(mask: Mask, min_area_px: float) -> list[tuple[Mask, tuple[int, int]]]:
-    """Crop the 4-connected regions that have enough pixels; return each with its first (x, y)."""
+def _connected_regions(mask: Mask, min_area_px: float) -> Iterator[Region]:
+    """Yield the 4-connected regions that have enough pixels."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
-    regions = []
     for label, (left, top, width, height, area) in enumerate(stats.tolist()):
         if label > 0 and area >= min_area_px:
             crop = labels[top : top + height, left : left + width] == label
-            regions.append((crop, (left, top)))
-    return regions
+            yield Region(crop, (left, top))
 
 
 def _resampled(

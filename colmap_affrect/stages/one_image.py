@@ -17,16 +17,9 @@ from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import camera_matrix, resized_from_original
+from colmap_affrect.images import reading
 from colmap_affrect.images.depth import DepthMaps
 from colmap_affrect.images.photographs import Photographs
-from colmap_affrect.images.reading import (
-    decode,
-    in_eight_bits,
-    read_color,
-    shrink_mask,
-    shrink_to,
-    tones,
-)
 from colmap_affrect.parallel.executor import available_cores, available_memory_bytes
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions, Level
@@ -140,21 +133,21 @@ class ImageExtractor:
         level: int = 0,
     ) -> tuple[Photograph, tuple[int, int]]:
         """Read an image at the size of processing; also return its stored (width, height)."""
-        stored = decode(path)
-        black_and_white = tones(stored) if self.options.stretch_contrast else None
-        image = in_eight_bits(stored, black_and_white)
+        stored = reading.decode(path)
+        black_and_white = reading.tones(stored) if self.options.stretch_contrast else None
+        image = reading.in_eight_bits(stored, black_and_white)
         original_size = (image.shape[1], image.shape[0])
         chosen = self.options.levels[level]
         limit = chosen.max_image_size_px
-        gray = shrink_to(image, limit)
+        gray = reading.shrink_to(image, limit)
         color = None
         if chosen.features.in_color:
-            color = read_color(path, limit, stretch=self.options.stretch_contrast)
+            color = reading.read_color(path, limit, stretch=self.options.stretch_contrast)
         size = (gray.shape[1], gray.shape[0])
         original_camera = camera_matrix(original_size) if intrinsics is None else intrinsics
         camera = resized_from_original(original_size, size) @ original_camera
         if mask is not None:
-            mask = shrink_mask(mask, size)
+            mask = reading.shrink_mask(mask, size)
         stretched = black_and_white is not None
         found = Photograph(gray, name or path.name, path, camera, mask, color, stretched)
         return found, original_size

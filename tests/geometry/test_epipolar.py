@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from colmap_affrect.geometry.epipolar import (
+    EpipolarModel,
     common_sign,
-    direction_cosines,
     epipolar_lines,
     sampson_errors,
 )
@@ -69,13 +69,19 @@ def test_true_frames_carry_the_epipolar_direction_of_image_1_to_that_of_image_2(
 ) -> None:
     F, points1, points2, maps = (plane[key] for key in ("F", "points1", "points2", "maps"))
     shapes1 = rotation((0, 0, 37.0))[:2, :2] @ np.diag([5.0, 2.0]) + np.zeros((len(points1), 1, 1))
-    cosines = direction_cosines(F, points1, points2, shapes1, maps @ shapes1)
+    rows = np.arange(len(points1))
+
+    def cosines_of(F: NDArray, points: tuple, shapes: tuple) -> NDArray:
+        return EpipolarModel(F, points).cosines(rows, rows, shapes)
+
+    points, shapes = (points1, points2), (shapes1, maps @ shapes1)
+    cosines = cosines_of(F, points, shapes)
     sign = common_sign(cosines)
     np.testing.assert_allclose(cosines * sign, 1.0, atol=1e-6)
-    assert common_sign(direction_cosines(-F, points1, points2, shapes1, maps @ shapes1)) == sign
+    assert common_sign(cosines_of(-F, points, shapes)) == sign
     assert common_sign(-cosines) == -sign
     turned = maps @ rotation((0, 0, 30.0))[:2, :2] @ shapes1
-    wrong = direction_cosines(F, points1, points2, shapes1, turned)
+    wrong = cosines_of(F, points, (shapes1, turned))
     assert np.degrees(np.arccos(np.clip(wrong * sign, -1, 1))).min() > 10.0
-    swapped = direction_cosines(F.T, points2, points1, maps @ shapes1, shapes1)
+    swapped = cosines_of(F.T, points[::-1], shapes[::-1])
     np.testing.assert_allclose(np.abs(swapped), 1.0, atol=1e-6)
