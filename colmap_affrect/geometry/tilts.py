@@ -99,18 +99,10 @@ def metrics_from_log(logs: Floats) -> Array:
 
 def metrics_from_tilts(tilts: ArrayLike, angles_rad: ArrayLike) -> Array:
     """Return (..., 3) unit metrics of the classes (tilt, angle) of diag(t, 1) R(phi)."""
-    tilts, angles = np.broadcast_arrays(
-        np.asarray(tilts, dtype=np.float64), np.asarray(angles_rad, dtype=np.float64)
-    )
+    tilts, angles = (np.asarray(values, np.float64) for values in (tilts, angles_rad))
     cos, sin = np.cos(angles), np.sin(angles)
-    return np.stack(
-        [
-            tilts * cos**2 + sin**2 / tilts,
-            tilts * sin**2 + cos**2 / tilts,
-            (1.0 / tilts - tilts) * cos * sin,
-        ],
-        -1,
-    )
+    s11, s22 = tilts * cos**2 + sin**2 / tilts, tilts * sin**2 + cos**2 / tilts
+    return np.stack([s11, s22, (1.0 / tilts - tilts) * cos * sin], -1)
 
 
 def tilts_from_metrics(metrics: Floats) -> tuple[Array, Array]:
@@ -149,9 +141,7 @@ def asift_covering() -> Array:
     tilts = [2.0 ** (level / 2.0) for level in range(1, 7)]
     counts = [(round(5.0 * tilt) + 1) // 2 for tilt in tilts]
     rings = zip(tilts, counts, strict=True)
-    return np.array(
-        [(tilt, index * np.pi / count) for tilt, count in rings for index in range(count)]
-    )
+    return np.array([(tilt, k * np.pi / count) for tilt, count in rings for k in range(count)])
 
 
 def near_optimal_covering() -> Array:
@@ -215,10 +205,8 @@ def cover_shapes(
 
 def nearest_centers(metrics: Floats, centers: Floats, radius: float) -> NDArray[np.int32]:
     """Label (N, 3) metrics with the nearest of the identity and (K, 2) centres, within r."""
-    references = np.concatenate([[[1.0, 0.0]], centers])
-    distances = cosh_distances(
-        metrics_from_tilts(references[:, 0], references[:, 1]), np.asarray(metrics)
-    )
+    tilts, angles = np.concatenate([[[1.0, 0.0]], centers]).T
+    distances = cosh_distances(metrics_from_tilts(tilts, angles), np.asarray(metrics))
     nearest = np.argmin(distances, axis=0)
     labels = np.where(nearest == 0, IDENTITY_LABEL, nearest - 1)
     inside = distances.min(axis=0) < ball_threshold(radius)

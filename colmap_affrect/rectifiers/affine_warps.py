@@ -20,7 +20,7 @@ from colmap_affrect.rectifiers.base import (
     RectifierOptions,
     WithInputs,
 )
-from colmap_affrect.rectifiers.regions import Region, affine_rectification
+from colmap_affrect.rectifiers.regions import Region
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
 GAP_BLOCKS = 5  # groups of blocks closer than this are warped together
@@ -129,12 +129,7 @@ def plan_dense_shapes(
         for part in parts:
             if np.count_nonzero(part) < options.min_part_frac * labels.size:
                 continue
-            region = _region(part, grid, image_size)
-            items.append(
-                affine_rectification(
-                    region, tilt, angle, label, area_preserving=options.area_preserving
-                )
-            )
+            items.append(options.warp(_region(part, grid, image_size), tilt, angle, label))
     return RectificationPlan(image_size, tuple(items), replaces_original=True)
 
 

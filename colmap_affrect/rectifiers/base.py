@@ -9,13 +9,15 @@ from typing import Annotated, Any, ClassVar, Protocol
 import numpy as np
 from pydantic import BeforeValidator, SerializeAsAny
 
-from colmap_affrect.data import Photograph, RectificationPlan
+from colmap_affrect.data import Photograph, Rectification, RectificationPlan
 from colmap_affrect.features.base import SHAPES, ShapeOptions, ShapeSource
 from colmap_affrect.features.second_moment import SecondMomentOptions
+from colmap_affrect.geometry.affine import fit_canvas, rectifying_affine
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.tilts import Cover, cover_shapes
 from colmap_affrect.images.depth import DepthMaps
 from colmap_affrect.options import PartOptions, Registry, within
+from colmap_affrect.rectifiers.regions import MARGIN_PX, Region
 
 
 class Rectifier(Protocol):
@@ -46,6 +48,12 @@ class AffineWarpOptions(RectifierOptions):
     area_preserving: bool = True
     """Warp by diag(sqrt t, 1 / sqrt t), which keeps the area; False: by diag(1, 1 / t), which
     never magnifies (the paper)."""
+
+    def warp(self, region: Region, tilt: float, angle_rad: float, segment_id: int) -> Rectification:
+        """Show a region by the affine map of the class (tilt, angle)."""
+        linear = rectifying_affine(tilt, angle_rad, area_preserving=self.area_preserving)
+        canvas = fit_canvas(linear, region.outline(), MARGIN_PX)
+        return Rectification(*canvas, region.mask, tilt, angle_rad, region.origin, segment_id)
 
 
 class CoverOptions(AffineWarpOptions):

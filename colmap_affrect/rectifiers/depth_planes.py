@@ -19,7 +19,7 @@ from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.options import Options, within
 from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, WithInputs
-from colmap_affrect.rectifiers.regions import Region, affine_rectification, homography_rectification
+from colmap_affrect.rectifiers.regions import Region, homography_rectification
 
 MAX_DEPTH_SIZE_PX = 640
 """Larger depth maps are shrunk to this: windows of 5 x 5 px of them see too little of a plane,
@@ -71,17 +71,13 @@ class DepthPlanes(WithInputs):
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan one warp for each segment; DepthError when there is no usable depth map."""
         segments = planar_segments(photograph, self.depth.depth(photograph), self.options.planes)
-        items = tuple(
-            homography_rectification(
-                segment.region,
-                planes.fronto_parallel_homography(segment.normal, photograph.camera_matrix),
-                number,
-            )
-            for number, segment in enumerate(segments)
-        )
+        items: list[Rectification] = []
+        for number, segment in enumerate(segments):
+            turned = planes.fronto_parallel_homography(segment.normal, photograph.camera_matrix)
+            items.append(homography_rectification(segment.region, turned, number))
         everywhere = self.options.keep_original == "everywhere"
         outside = None if everywhere else ~_union(segments, photograph.size)
-        return RectificationPlan(photograph.size, items, outside)
+        return RectificationPlan(photograph.size, tuple(items), outside)
 
 
 def planar_segments(
@@ -169,11 +165,6 @@ class DepthAffNet(WithInputs):
         items: list[Rectification] = []
         for number, segment in enumerate(segments):
             inside = segment.region.contains(samples.points)
-            centers = options.cover(samples.metrics[inside]).centers
-            items += [
-                affine_rectification(
-                    segment.region, tilt, angle, number, area_preserving=options.area_preserving
-                )
-                for tilt, angle in centers.tolist()
-            ]
+            for tilt, angle in options.cover(samples.metrics[inside]).centers.tolist():
+                items.append(options.warp(segment.region, tilt, angle, number))
         return RectificationPlan(photograph.size, tuple(items))

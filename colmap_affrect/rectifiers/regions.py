@@ -6,7 +6,7 @@ from math import sqrt
 import numpy as np
 
 from colmap_affrect.data import Mask, Rectification, in_mask
-from colmap_affrect.geometry.affine import fit_canvas, project, rectifying_affine, transform_frames
+from colmap_affrect.geometry.affine import fit_canvas, project, transform_frames
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 
@@ -46,17 +46,6 @@ class Region:
         return in_mask(self.mask, points, self.origin)
 
 
-def affine_rectification(
-    region: Region, tilt: float, angle_rad: float, segment_id: int, *, area_preserving: bool
-) -> Rectification:
-    """Show a region by the affine map of the class (tilt, angle)."""
-    linear = rectifying_affine(tilt, angle_rad, area_preserving=area_preserving)
-    matrix, canvas_size = fit_canvas(linear, region.outline(), MARGIN_PX)
-    return Rectification(
-        matrix, canvas_size, region.mask, tilt, angle_rad, region.origin, segment_id
-    )
-
-
 def homography_rectification(region: Region, homography: Array, segment_id: int) -> Rectification:
     """Show a region by a homography, scaled so that the canvas has twice the region's area.
 
@@ -70,6 +59,5 @@ def homography_rectification(region: Region, homography: Array, segment_id: int)
     middle = np.concatenate([np.eye(2), region.middle()[:, None]], axis=1)
     jacobian = transform_frames(matrix, middle[None])[0, :, :2]
     tilt, angle_rad = tilts_from_metrics(unit_metrics(jacobian))
-    return Rectification(
-        matrix, canvas_size, region.mask, float(tilt), float(angle_rad), region.origin, segment_id
-    )
+    tilt_class = float(tilt), float(angle_rad)
+    return Rectification(matrix, canvas_size, region.mask, *tilt_class, region.origin, segment_id)

@@ -12,11 +12,11 @@ from colmap_affrect.data import Rectification
 from colmap_affrect.geometry.affine import project, rectifying_affine, transform_frames
 from colmap_affrect.geometry.planes import fronto_parallel_homography
 from colmap_affrect.geometry.tilts import metrics_from_tilts, unit_metrics
+from colmap_affrect.rectifiers.base import AffineWarpOptions
 from colmap_affrect.rectifiers.regions import (
     CANVAS_RATIO,
     MARGIN_PX,
     Region,
-    affine_rectification,
     homography_rectification,
 )
 
@@ -52,10 +52,11 @@ def check_fit(item: Rectification, region: Region) -> None:
 
 
 @given(regions(), classes(), st.booleans())
-def test_affine_rectification_fits_the_region(
+def test_affine_warp_fits_the_region(
     region: Region, tilt_class: tuple[float, float], area_preserving: bool
 ) -> None:
-    item = affine_rectification(region, *tilt_class, 3, area_preserving=area_preserving)
+    options = AffineWarpOptions(name="asift", area_preserving=area_preserving)
+    item = options.warp(region, *tilt_class, 3)
     assert item.is_affine
     linear = rectifying_affine(*tilt_class, area_preserving=area_preserving)
     assert_allclose(item.rectified_from_image[:2, :2], linear)
