@@ -75,19 +75,11 @@ def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> N
         shutil.copy2(path, folder / name)
         report.copied.append(name)
         return
-    made = {_page_name(name, k, len(numbers)): n for k, n in enumerate(numbers, start=1)}
+    ends = [f"-page{k}" for k in range(1, len(numbers) + 1)] if len(numbers) > 1 else [""]
+    made = [f"{name}{end}.png" for end in ends]  # the suffix stays: a.jp2 may lie beside a.png
     for page, content in zip(made, _as_png(path, numbers), strict=True):
         (folder / page).write_bytes(content)
-    report.written[name] = list(made)
-
-
-def _page_name(name: str, page: int, num_pages: int) -> str:
-    """Return what a page is called; the suffix stays, since a.jp2 may lie beside a.png.
-
-    >>> _page_name("box/a.jp2", 1, 1), _page_name("b.tif", 2, 3)
-    ('box/a.jp2.png', 'b.tif-page2.png')
-    """
-    return f"{name}-page{page}.png" if num_pages > 1 else f"{name}.png"
+    report.written[name] = made
 
 
 def _as_png(path: Path, numbers: Sequence[int]) -> Iterator[bytes]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, OptionError
-from colmap_affrect.geometry.arrays import Array, Floats, Singles
+from colmap_affrect.geometry.arrays import Floats, Singles
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.reading import decode, header_size
 from colmap_affrect.options import Options
@@ -128,14 +128,11 @@ def _z_depth(values: Floats, kind: str, photograph: Photograph) -> Singles:
         if kind == "inverse":
             values = 1.0 / values
         elif kind == "ray":
-            values = values / _ray_lengths((values.shape[1], values.shape[0]), photograph)
+            rows, columns = np.indices(values.shape)
+            size = values.shape[1], values.shape[0]
+            camera = resized_from_original(photograph.size, size) @ photograph.camera_matrix
+            pixels = np.stack([columns, rows, np.ones(values.shape)])
+            rays = np.tensordot(np.linalg.inv(camera), pixels, axes=1)  # to points of depth 1
+            values = values / np.linalg.norm(rays, axis=0)
         depth = values.astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(np.nan))
-
-
-def _ray_lengths(size: tuple[int, int], photograph: Photograph) -> Array:
-    """Distance from the camera of the points of depth 1 that the (h, w) pixels of a map show."""
-    camera = resized_from_original(photograph.size, size) @ photograph.camera_matrix
-    pixels = np.stack([*np.meshgrid(np.arange(size[0]), np.arange(size[1])), np.ones(size[::-1])])
-    rays = np.tensordot(np.linalg.inv(camera), pixels, axes=1)
-    return np.asarray(np.linalg.norm(rays, axis=0))

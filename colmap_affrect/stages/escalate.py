@@ -206,16 +206,13 @@ class Escalation:
                 {name for name in sizes if number not in ranges[name]},
                 model.registered_names,
             )
-            others = self._at_least(number)
+            kinds = self.is_measured  # of frames, by level
+            alike = [k for k in range(number, len(kinds)) if kinds[k] == kinds[number]]
+            others = sum(1 << k for k in alike)
             rate, pairs, seconds = gain.best_pairs(number, level, others, self.options)
             self.left_s += seconds / available_cores()
             best = max(best, (rate, number, pairs), key=lambda found: found[0])
         return best[1:] if best[0] else None
-
-    def _at_least(self, level: int) -> int:
-        """Return the bits of the levels from one on that have frames of its kind."""
-        kinds = self.is_measured
-        return sum(1 << k for k in range(level, len(kinds)) if kinds[k] == kinds[level])
 
     def match_at(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers.

@@ -101,17 +101,11 @@ def _why_lost(workspace: Workspace) -> str:
 def _make_again(context: Context, why: str, *, follows: bool) -> None:
     workspace, begun = context.workspace, context.workspace.begun
     original = Path(workspace.require("copy")["database"]) if workspace.is_foreign else None
-    kept = _put_aside(workspace.database)
-    logger.warning(
-        "%s: %s; it is made again from %s%s",
-        workspace.database,
-        why,
-        original or f"{workspace.features.name} and {workspace.matches.name}",
-        f"; 'colmap-affrect map --from-database {shlex.quote(str(kept))} --output-path OTHER' maps "
-        "what was there"
-        if kept
-        else "",
-    )
+    source, hint = original or f"{workspace.features.name} and {workspace.matches.name}", ""
+    if kept := _put_aside(workspace.database):
+        again = f"map --from-database {shlex.quote(str(kept))} --output-path OTHER"
+        hint = f"; 'colmap-affrect {again}' maps what was there"
+    logger.warning("%s: %s; it is made again from %s%s", workspace.database, why, source, hint)
     workspace.rewind()
     if not (follows and "verify" in begun):
         return

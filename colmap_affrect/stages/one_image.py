@@ -198,11 +198,10 @@ def prepare(
 ) -> ImageExtractor:
     """Find everything a recipe needs, before any image is touched, and build its parts.
 
-    Levels of escalation whose weights are not here are left out.
-    ``image_names`` are those to come, to see whether there are depth maps for them. AffrectError
-    when a file of weights is neither found nor downloaded, or the device is not there,
-    OptionError when depth maps are needed and no source is given, DepthError when the
-    folder of depth maps has none of the images.
+    Levels of escalation whose weights are not here are left out. ``image_names`` are those to come,
+    to see whether there are depth maps for them. AffrectError when a file of weights is neither
+    found nor downloaded, or the device is not there, OptionError when depth maps are needed and no
+    source is given, DepthError when the folder of depth maps has none of the images.
     """
     resources = resources or Resources()
     options.check_depth()
