@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
+from dataclasses import dataclass
 from typing import Self, TextIO
 
 from tqdm import tqdm
@@ -55,41 +56,33 @@ class Forecast:
         return f"whole run: about {about} left"
 
 
+@dataclass(eq=False)
 class Progress:
     """Where progress goes; the library is silent unless it is given one of these."""
 
-    def __init__(
-        self, stream: TextIO | None = None, num_plain_lines: int = NUM_PLAIN_LINES
-    ) -> None:
-        """Write to a stream, at most so many lines a stage without a terminal; None is silence."""
-        self._stream, self._num_plain_lines = stream, num_plain_lines
-        self._forecast: Forecast | None = None
-        self._title = ""
+    stream: TextIO | None = None  # None is silence
+    num_plain_lines: int = NUM_PLAIN_LINES  # of a stage at most, where the stream is no terminal
+    title: str = ""  # with which the names of stages begin
+    forecast: Forecast | None = None  # to say how long all stages take
 
     @property
     def file_number(self) -> int:
         """Descriptor of the stream for another process, that of nothing where there is none."""
         try:
-            return self._stream.fileno() if self._stream else subprocess.DEVNULL
+            return self.stream.fileno() if self.stream else subprocess.DEVNULL
         except OSError:  # only in this process
             return subprocess.DEVNULL
-
-    def titled(self, title: str) -> Self:
-        """Return the same whose names of stages begin with a title."""
-        new = copy(self)
-        new._title += title
-        return new
 
     def with_forecast(self, forecast: Forecast) -> Self:
         """Return the same that also says how long all stages take."""
         new = copy(self)
-        new._forecast = forecast
+        new.forecast = forecast
         return new
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
         """Show one stage of ``total`` units for as long as the context lasts."""
-        forecast, stream, title = self._forecast, self._stream, self._title + name
+        forecast, stream, title = self.forecast, self.stream, self.title + name
         done = num_lines = 0
         if forecast:
             forecast.begin(name, total)
@@ -106,7 +99,7 @@ class Progress:
         def advance_lines(count: int) -> None:
             nonlocal num_lines
             text = left(count)
-            if (wanted := done * self._num_plain_lines // total) > num_lines:
+            if (wanted := done * self.num_plain_lines // total) > num_lines:
                 num_lines = wanted
                 print_line(text)
 

@@ -11,6 +11,7 @@ import math
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -224,7 +225,9 @@ class MethodRun:
             with open_database(database_path) as database:
                 database.clear_two_view_geometries()
             map_seed = self._map_recipe if self.method.recipe else self._map_sift
-            models = map_seed(seed, new, watch, self.progress.titled(f"seed {seed}, "))
+            progress = copy(self.progress)
+            progress.title += f"seed {seed}, "
+            models = map_seed(seed, new, watch, progress)
             verified = verified_pairs(database_path, self.verification.min_num_inliers)
         largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
         return SeedResult(

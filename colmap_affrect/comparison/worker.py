@@ -48,7 +48,7 @@ def main() -> None:
     os.dup2(2, 1)  # what others print
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s")
     run, title = pickle.load(sys.stdin.buffer)  # noqa: S301 (of our parent)
-    run.progress = Progress(shown, 1).titled(title)
+    run.progress = Progress(shown, 1, title)
     try:
         with run.workspace.locked():
             run.run()

@@ -20,6 +20,7 @@ from pydantic import Field
 from colmap_affrect.data import GrayImage, Mask, ShapeGrid, ShapeSamples
 from colmap_affrect.features.base import PATCH_SIZE_PX, FeatureOptions, NetworkContext, ShapeOptions
 from colmap_affrect.features.sift import DogOptions, detect_dog
+from colmap_affrect.geometry import tilts
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.conventions import (
@@ -27,13 +28,7 @@ from colmap_affrect.geometry.conventions import (
     grid_origin,
     resized_from_original,
 )
-from colmap_affrect.geometry.tilts import (
-    STEP_PX,
-    frames_from_affnet,
-    log_metrics,
-    metrics_from_log,
-    rectifying_metrics,
-)
+from colmap_affrect.geometry.tilts import STEP_PX
 from colmap_affrect.images.reading import shrink_to
 from colmap_affrect.options import within
 
@@ -110,14 +105,14 @@ class AffNet:
         else:
             logs, textured = self._mean_logs(image), _textured(image, self.options.min_deviation)
             logs[~textured] = 0.0
-        return ShapeGrid(metrics_from_log(logs), textured, grid_origin(STEP_PX), STEP_PX)
+        return ShapeGrid(tilts.metrics_from_log(logs), textured, grid_origin(STEP_PX), STEP_PX)
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
         lafs = self.detect(image).lafs[: self.options.max_num_keypoints]  # by falling response
         shapes = _frames(self._patch_outputs(image, lafs))
         valid = np.isfinite(shapes).all(axis=(1, 2)) & (determinants(shapes) > 0)
-        return ShapeSamples(lafs[valid, :, 2], rectifying_metrics(shapes[valid]))
+        return ShapeSamples(lafs[valid, :, 2], tilts.rectifying_metrics(shapes[valid]))
 
     def _mean_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics, the mean over all sizes of the image."""
@@ -160,8 +155,8 @@ class AffNet:
             strip = image[:, :, STEP_PX * begin : STEP_PX * (last + CELLS_SEEN_AFTER)]
             with torch.inference_mode():
                 outputs = self.layers(strip.to(self.device))[0, :, first - begin : last - begin]
-            metrics = rectifying_metrics(_frames(outputs.permute(1, 2, 0)))
-            strips.append(log_metrics(metrics))
+            metrics = tilts.rectifying_metrics(_frames(outputs.permute(1, 2, 0)))
+            strips.append(tilts.log_metrics(metrics))
         return np.concatenate(strips)
 
     def _patch_outputs(self, image: GrayImage, lafs: Array) -> torch.Tensor:
@@ -181,7 +176,7 @@ class AffNet:
 
 def _frames(outputs: torch.Tensor) -> Array:
     """Return (..., 2, 2) frames L of (..., 3) outputs."""
-    return frames_from_affnet(outputs.cpu().numpy().astype(np.float64))
+    return tilts.frames_from_affnet(outputs.cpu().numpy().astype(np.float64))
 
 
 def _mean_and_deviation(image: GrayImage) -> tuple[Array, Array]:

@@ -11,12 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.geometry.affine import (
-    adjugates,
-    determinants,
-    homography_errors,
-    transform_frames,
-)
+from colmap_affrect.geometry import affine
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.two_views import homogeneous
 
@@ -61,7 +56,7 @@ class EpipolarModel:
         lines1, lines2 = epipolar_lines(self.fundamental, *points)
         along1 = np.stack([-lines1[:, 1], lines1[:, 0]], axis=1)
         along2 = np.stack([-lines2[:, 1], lines2[:, 0]], axis=1)
-        maps = shapes[1][rows2], adjugates(shapes[0][rows1])
+        maps = shapes[1][rows2], affine.adjugates(shapes[0][rows1])
         carried = np.einsum("nij,njk,nk->ni", *maps, along1)
         lengths = np.linalg.norm(carried, axis=1) * np.linalg.norm(along2, axis=1)
         cosines = (carried * along2).sum(axis=1) / np.maximum(lengths, np.finfo(float).tiny)
@@ -85,12 +80,13 @@ class HomographyModel:
 
     def errors(self, rows1: Rows, rows2: Rows) -> Points:
         """Return (M,) px."""
-        return homography_errors(self.matrix, self.points[0][rows1], self.points[1][rows2])
+        return affine.homography_errors(self.matrix, self.points[0][rows1], self.points[1][rows2])
 
     def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
         """Return (M,) cosines between what frames carry over and what the geometry does."""
         frames = np.concatenate([shapes[0][rows1], self.points[0][rows1, :, None]], axis=2)
-        return turn_cosines(transform_frames(self.matrix, frames)[:, :, :2], shapes[1][rows2])
+        carried = affine.transform_frames(self.matrix, frames)[:, :, :2]
+        return turn_cosines(carried, shapes[1][rows2])
 
     def scaled(self, first: float, second: float) -> Self:
         """Return the same in px of images that are smaller by these factors."""
@@ -105,7 +101,8 @@ PairModel = EpipolarModel | HomographyModel
 
 def turn_cosines(shapes1: Points, shapes2: Points) -> Points:
     """Return (N,) cosines of the angles by which frames are turned against others; -1 mirrored."""
-    turns = shapes2 @ adjugates(shapes1) * np.sign(determinants(shapes1))[:, None, None]
+    signs = np.sign(affine.determinants(shapes1))[:, None, None]
+    turns = shapes2 @ affine.adjugates(shapes1) * signs
     along, across = turns[:, 0, 0] + turns[:, 1, 1], turns[:, 1, 0] - turns[:, 0, 1]
     cosines = along / np.maximum(np.hypot(along, across), np.finfo(float).tiny)
-    return np.where(determinants(turns) > 0.0, cosines, -1.0)
+    return np.where(affine.determinants(turns) > 0.0, cosines, -1.0)

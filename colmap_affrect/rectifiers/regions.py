@@ -36,11 +36,6 @@ class Region:
         points = np.stack([np.concatenate([first, last]), np.concatenate([rows, rows])], axis=1)
         return np.asarray(points + self.origin, dtype=np.float64)
 
-    def middle(self) -> Array:
-        """Return the (2,) mean of its pixel centres in the image."""
-        rows, columns = np.nonzero(self.mask)
-        return np.array([columns.mean(), rows.mean()]) + self.origin
-
     def contains(self, points: Floats) -> Mask:
         """Return which (N, 2) points, rounded to pixels, belong to it."""
         return in_mask(self.mask, points, self.origin)
@@ -56,8 +51,9 @@ def homography_rectification(region: Region, homography: Array, segment_id: int)
     scale = sqrt(CANVAS_RATIO * region.area_px / box_area)
     canvas_from_mapped, canvas_size = fit_canvas(scale * np.eye(2), outline, MARGIN_PX)
     matrix = canvas_from_mapped @ homography
-    middle = np.concatenate([np.eye(2), region.middle()[:, None]], axis=1)
-    jacobian = transform_frames(matrix, middle[None])[0, :, :2]
+    middle = np.argwhere(region.mask).mean(axis=0)[::-1] + region.origin
+    frame = np.concatenate([np.eye(2), middle[:, None]], axis=1)
+    jacobian = transform_frames(matrix, frame[None])[0, :, :2]
     tilt, angle_rad = tilts_from_metrics(unit_metrics(jacobian))
     tilt_class = float(tilt), float(angle_rad)
     return Rectification(matrix, canvas_size, region.mask, *tilt_class, region.origin, segment_id)

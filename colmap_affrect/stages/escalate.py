@@ -31,13 +31,9 @@ from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import STEP, PairMatches
 from colmap_affrect.recipes import EscalateOptions
+from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.expected_gain import (
-    ExpectedGain,
-    PairState,
-    insecure_images,
-    weakly_connected_images,
-)
+from colmap_affrect.stages.expected_gain import ExpectedGain, PairState
 from colmap_affrect.stages.extract import extract_images
 from colmap_affrect.stages.match import matched_at_level, write_batches, write_matches
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
@@ -130,8 +126,8 @@ class Escalation:
         workspace, names = self.context.workspace, self.features.names()
         lost = set(names) - set(model.sure)
         if workspace.made_from("map") != self.context.verified_digest():
-            limit = self.options.strong_num_inliers
-            insecure = lost & insecure_images(self.num_inliers(), limit, self._loose())
+            strong, counts = self.options.strong_num_inliers, self.num_inliers()
+            insecure = lost & expected_gain.insecure_images(counts, strong, self._loose())
             # The next model tells of what has been tied since.
             maps_next = insecure != lost and workspace.sparse.exists() and len(names) < LARGE
             lost = set() if maps_next else insecure
@@ -152,7 +148,7 @@ class Escalation:
         if len(self.features.names()) < 3:
             return set()
         limit = self.context.guiding.min_num_tracks
-        return weakly_connected_images(verified_inliers(self.context), limit)
+        return expected_gain.weakly_connected_images(verified_inliers(self.context), limit)
 
     def states(self) -> dict[Pair, PairState]:
         """Return what is known of the pairs that are in the database."""

@@ -21,14 +21,9 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
+from colmap_affrect.stages import one_image
 from colmap_affrect.stages.context import Context, Inputs
-from colmap_affrect.stages.one_image import (
-    ExtractedImage,
-    ImageExtractor,
-    ImageTask,
-    num_images_at_once,
-    prepare,
-)
+from colmap_affrect.stages.one_image import ExtractedImage, ImageExtractor, ImageTask
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +57,7 @@ def extract(
     if contents != known:  # else they were seen to be good
         inputs.check_names(names)
     whole = inputs.photographs.without_mask(names)
-    extractor = prepare(options, context.resources, names, context.progress)
+    extractor = one_image.prepare(options, context.resources, names, context.progress)
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
     weights = digests(extractor.weights)
@@ -143,7 +138,8 @@ def extract_images(
         return
     if later := {name for name, level in images if level}:
         _refuse_changed(context, inputs, later)
-    num = num_images_at_once([extractor.options.levels[k] for k in {k for _, k in images}])
+    levels = [extractor.options.levels[k] for k in {k for _, k in images}]
+    num = one_image.num_images_at_once(levels)
     executor = context.executor or Threads(min(num, len(images)))
     files = inputs.photographs.files(images[0][0])
     if extractor.options.depth.path:

@@ -51,9 +51,6 @@ class ImageTask:
     intrinsics: Array | None = None
     camera_size: tuple[int, int] | None = None  # (width, height) of its camera, if any
 
-    def __str__(self) -> str:
-        return self.name
-
 
 @dataclass(eq=False)
 class ImageExtractor:

@@ -9,14 +9,8 @@ from pathlib import Path
 
 from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.pairs.lists import (
-    Pair,
-    PairList,
-    PairOptions,
-    read_pairs,
-    sequence_pairs,
-    write_pairs,
-)
+from colmap_affrect.pairs import lists
+from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
@@ -52,7 +46,8 @@ def choose_pairs(
         if len(names) > MANY_IMAGES:
             logger.warning(MANY_PAIRS, len(names), count)
         workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
-        write_pairs(workspace.pairs, combinations(names, 2), names)  # too many to keep in memory
+        every = combinations(names, 2)  # too many to keep in memory
+        lists.write_pairs(workspace.pairs, every, names)
         workspace.record_made_from(pairs="")
         return StageReport("pairs", time.perf_counter() - start, count)
     pairs = _given_pairs(context, options)
@@ -63,7 +58,7 @@ def choose_pairs(
         kept = set()
     pairs |= kept | _similar_pairs(context, options, kept)
     warnings = _forget_lost(context, there - pairs)
-    write_pairs(workspace.pairs, sorted(pairs))
+    lists.write_pairs(workspace.pairs, sorted(pairs))
     workspace.record_made_from(pairs=digest)
     return StageReport("pairs", time.perf_counter() - start, len(pairs), warnings=warnings)
 
@@ -73,7 +68,7 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
     names, pairs = context.features.names(), set[Pair]()
     known = set(names)
     if "sequence" in options.methods:
-        pairs |= set(sequence_pairs(names, options.num_neighbors))
+        pairs |= set(lists.sequence_pairs(names, options.num_neighbors))
     if "gps" in options.methods:
         write_images_and_keypoints(context)
         limits = options.num_neighbors, options.max_distance_m
@@ -82,7 +77,7 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
         all_names = context.inputs.names()
-        listed = read_pairs(Path(options.match_list_path), all_names)
+        listed = lists.read_pairs(Path(options.match_list_path), all_names)
         pairs |= {pair for pair in listed if known.issuperset(pair)}
     return pairs
 
@@ -100,7 +95,7 @@ def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pai
 def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:
     """Add pairs to those that are matched already, as pycolmap's matchers do."""
     context.workspace.record_options("pairs", PairOptions().to_mapping())
-    write_pairs(context.workspace.pairs, sorted(_pairs_there(context).union(pairs)))
+    lists.write_pairs(context.workspace.pairs, sorted(_pairs_there(context).union(pairs)))
 
 
 def _pairs_there(context: Context) -> set[Pair]:
@@ -128,4 +123,4 @@ def listed_pairs(context: Context) -> PairList:
             "'colmap-affrect pairs' and then match again"
         )
     names = context.features.names()
-    return read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())
+    return lists.read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())
