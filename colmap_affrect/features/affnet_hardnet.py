@@ -16,7 +16,7 @@ from colmap_affrect.data import GrayImage, LocalFeatures, View, union
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry.affine import rotation
-from colmap_affrect.geometry.arrays import Array, Floats, Singles
+from colmap_affrect.geometry.arrays import Array, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.tilts import frames_from_affnet
 
@@ -96,11 +96,13 @@ class AffNetHardNet:
     def _describe(
         self, sample: Callable[[Array], Tensor], found: LocalFeatures
     ) -> tuple[Array, Singles]:
-        """Return (N, 2, 2) shapes of determinant 1, and (N, 128) descriptors of any length."""
+        """Return (N, 2, 2) shapes of determinant 1 or NaN, (N, 128) descriptors of any length."""
         half_widths_px = PATCH_SIGMAS / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
         upright = sample(_frames(shapes, half_widths_px, found.keypoints))
-        shapes = _shapes_from_outputs(self._run(self.affnet, upright))
+        shapes = frames_from_affnet(self._run(self.affnet, upright))
+        areas = shapes[:, 0, 0] * shapes[:, 1, 1]
+        shapes /= np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]
         unturned = sample(_frames(shapes, half_widths_px, found.keypoints))
         # kornia's angles are of the opposite sense to those of our rotation().
         shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))
@@ -135,13 +137,6 @@ def _sampler(
         return torch.cat([s.sample(part) for s, part in zip(samplers, parts, strict=True)])
 
     return sample
-
-
-def _shapes_from_outputs(outputs: Floats) -> Array:
-    """Return (N, 2, 2) shapes of determinant 1 of AffNet's outputs; NaN without an area."""
-    shapes = frames_from_affnet(outputs)
-    areas = shapes[:, 0, 0] * shapes[:, 1, 1]
-    return shapes / np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]
 
 
 def _frames(shapes: Array, radii_px: Array, centers: Array) -> Array:

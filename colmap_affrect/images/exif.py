@@ -6,6 +6,7 @@ and with the file.
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -76,20 +77,12 @@ def read_camera_tags(path: Path) -> CameraTags | None:
 
 
 def _tags_of_file(file: BinaryIO) -> CameraTags:
-    image = opened(file)
-    size = stored_size(image)
-    if image.format == "PNG" and "exif" not in image.info:  # else Pillow reads the pixels
-        return CameraTags(size)
-    try:
-        exif = image.getexif()
-        tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-    except Exception:  # noqa: BLE001 - damaged tags raise nearly anything in Pillow
-        return CameraTags(size)
-    return _camera_tags(size, tags)
-
-
-def _camera_tags(size: tuple[int, int], tags: Mapping[int, Any]) -> CameraTags:
-    tag = ExifTags.Base
+    image, tag = opened(file), ExifTags.Base
+    size, tags = stored_size(image), dict[int, Any]()
+    if image.format != "PNG" or "exif" in image.info:  # else Pillow reads the pixels
+        with suppress(Exception):  # damaged tags raise nearly anything in Pillow
+            exif = image.getexif()
+            tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
 
     def number(key: ExifTags.Base) -> float | None:
         return _positive(tags.get(key))
