@@ -34,15 +34,10 @@ FAST, MEDIUM, FINAL = 15, 50, 300
 
 @dataclass(frozen=True)
 class FocalPrior:
-    """What is known of a focal length.
+    """What is known of a focal length."""
 
-    Attributes:
-        focal_px: its median.
-        sigma: standard deviation of its logarithm; 0 where it is given and held.
-    """
-
-    focal_px: float
-    sigma: float
+    focal_px: float  # its median
+    sigma: float  # standard deviation of its logarithm; 0 where it is given and held
 
     @classmethod
     def of(cls, camera: pycolmap.Camera, record: CameraRecord | None) -> "FocalPrior":
@@ -50,8 +45,7 @@ class FocalPrior:
         focal_px = float(camera.mean_focal_length())
         if record and "focal" in record.given:
             return cls(focal_px, 0.0)
-        is_known = record.source in TRUSTED if record else camera.has_prior_focal_length
-        if is_known:
+        if record.source in TRUSTED if record else camera.has_prior_focal_length:
             return cls(focal_px, EXIF_SIGMA)
         return cls(USUAL_FOCAL * max(camera.width, camera.height), USUAL_SIGMA)
 
@@ -71,23 +65,14 @@ def priors_of(
 
 @dataclass(frozen=True)
 class Adjuster:
-    """Adjusts models.
+    """Adjusts models."""
 
-    Attributes:
-        priors: of the focal lengths, by camera id.
-        noise_px: standard deviation of the keypoints, the scale of the robust loss.
-        refining: say which parameters of cameras are refined.
-        constant: ids of the cameras of which nothing is refined.
-        constant_frames: ids of the frames that stay where they are.
-        tie_points: observed by all models that have two of their images.
-    """
-
-    priors: Mapping[int, FocalPrior]
-    noise_px: float
-    refining: pycolmap.BundleAdjustmentOptions
-    constant: frozenset[int] = frozenset()
-    constant_frames: frozenset[int] = frozenset()
-    tie_points: TiePoints = NONE
+    priors: Mapping[int, FocalPrior]  # by camera id
+    noise_px: float  # standard deviation of the keypoints, the scale of the robust loss
+    refining: pycolmap.BundleAdjustmentOptions  # say which parameters of cameras are refined
+    constant: frozenset[int] = frozenset()  # ids of the cameras of which nothing is refined
+    constant_frames: frozenset[int] = frozenset()  # ids of the frames that stay where they are
+    tie_points: TiePoints = NONE  # observed by all models that have two of their images
 
     def begin(self, model: pycolmap.Reconstruction) -> None:
         """Give the cameras of a model that are not held the focal lengths of their priors."""
@@ -116,15 +101,14 @@ class Adjuster:
         options.min_track_length = 3 if has_long_tracks(model) else 2
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = self.noise_px
-        config = pycolmap.BundleAdjustmentConfig()
-        images = sorted(model.reg_image_ids() if image_ids is None else set(image_ids))
+        config, registered = pycolmap.BundleAdjustmentConfig(), set(model.reg_image_ids())
+        images = sorted(registered if image_ids is None else set(image_ids))
         for image_id in images:
             config.add_image(image_id)
         used = {model.images[image_id].camera_id for image_id in images}
-        others = set(model.reg_image_ids()) - set(images)
-        held = {model.images[image_id].camera_id for image_id in others} & used
-        held |= used & self.constant
-        for key in sorted(held):
+        others = registered.difference(images)
+        held = {model.images[image_id].camera_id for image_id in others} | self.constant
+        for key in sorted(used & held):
             config.set_constant_cam_intrinsics(key)
         frames = {model.images[image_id].frame_id for image_id in images} & self.constant_frames
         for frame_id in frames:
@@ -134,10 +118,8 @@ class Adjuster:
         problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
         self._add_tie_points(problem, model)
         for key in sorted(used - held):
-            if self.priors[key].sigma:
+            if problem.has_parameter_block(model.cameras[key].params):
                 self._add_prior(problem, model.cameras[key])
-            else:
-                _refine_distortion_only(problem, model.cameras[key])
         solver = pyceres.SolverOptions()
         solver.max_num_iterations, solver.num_threads = max_iterations, 1
         solver.function_tolerance = 1e-5 if max_iterations <= FAST else 1e-7
@@ -167,10 +149,13 @@ class Adjuster:
                 problem.add_residual_block(cost, pyceres.CauchyLoss(4 * self.noise_px), blocks)
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
-        if not problem.has_parameter_block(camera.params):
-            return
         prior = self.priors[camera.camera_id]
         focal, extra = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())
+        if not prior.sigma:  # distortion alone is refined
+            fixed = [*focal, *camera.principal_point_idxs()]
+            manifold = pyceres.SubsetManifold(len(camera.params), fixed)
+            problem.set_manifold(camera.params, manifold)
+            return
         mean, sigma = camera.params.copy(), np.full(len(camera.params), UNKNOWN_SIGMA)
         mean[focal], sigma[focal] = prior.focal_px, prior.sigma * prior.focal_px
         mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
@@ -178,13 +163,6 @@ class Adjuster:
         covariance = np.diag((sigma / self.noise_px) ** 2)
         normal = pyceres.factors.NormalPrior(mean, covariance)
         problem.add_residual_block(normal, None, [camera.params])
-
-
-def _refine_distortion_only(problem: Any, camera: pycolmap.Camera) -> None:
-    if problem.has_parameter_block(camera.params):
-        fixed = [*camera.focal_length_idxs(), *camera.principal_point_idxs()]
-        manifold = pyceres.SubsetManifold(len(camera.params), fixed)
-        problem.set_manifold(camera.params, manifold)
 
 
 def has_long_tracks(model: pycolmap.Reconstruction) -> bool:

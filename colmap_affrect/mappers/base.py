@@ -71,15 +71,11 @@ class MappingTask:
         """A folder that exists, as pycolmap needs one also where there are no photographs."""
         return self.image_path or self.database_path.parent
 
-    def keeps_intrinsics(self, options: MapperOptions) -> bool:
-        """Tell whether nothing of any camera is to be refined: the user gave all of it."""
-        fixed = (record.is_fixed for record in self.cameras.values())
-        return options.keep_given_intrinsics and bool(self.cameras) and all(fixed)
-
-    def keeps_focal_lengths(self, options: MapperOptions) -> bool:
-        """Tell whether no focal length is to be refined: the user gave all of them."""
-        given = ("focal" in record.given for record in self.cameras.values())
-        return options.keep_given_intrinsics and bool(self.cameras) and all(given)
+    def all_given(self, options: MapperOptions) -> tuple[bool, bool]:
+        """Tell whether no focal length, and no distortion, is to be refined: the user gave all."""
+        known = self.cameras.values() if options.keep_given_intrinsics else ()
+        focals = bool(known) and all("focal" in record.given for record in known)
+        return focals, focals and all(record.is_fixed for record in known)
 
     def constant_cameras(self, options: MapperOptions) -> set[int]:
         """Return the ids of the cameras that are not to be refined.
@@ -87,30 +83,23 @@ class MappingTask:
         One whose focal length alone is given is among them where others are refined: pycolmap has
         no focal length that is fixed for some cameras only.
         """
-        focals = options.keep_given_intrinsics and not self.keeps_focal_lengths(options)
-        fixed = {
+        all_focals, _ = self.all_given(options)
+        return {
             key
             for key, record in self.cameras.items()
-            if record.is_fixed or (focals and "focal" in record.given)
+            if options.keep_given_intrinsics
+            and (record.is_fixed or ("focal" in record.given and not all_focals))
         }
-        return fixed if options.keep_given_intrinsics else set()
 
 
 @dataclass(frozen=True)
 class MappedModel:
-    """A model and how some of its images came in.
-
-    Attributes:
-        reconstruction: the model.
-        bridges: by the names of images that came in by one verified pair, not by tracks through
-            three images.
-        moves: what made the model, in the words of a report.
-        tie_points: of it.
-    """
+    """A model and how some of its images came in."""
 
     reconstruction: pycolmap.Reconstruction
     bridges: Mapping[str, Bridge] = field(default_factory=dict)
-    moves: tuple[str, ...] = ()
+    """By the names of images that came in by one verified pair, not by tracks of three images."""
+    moves: tuple[str, ...] = ()  # what made the model, in the words of a report
 
 
 class Mapper(Protocol):

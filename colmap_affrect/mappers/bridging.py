@@ -8,19 +8,15 @@ What a bridge would do is judged by all other verified pairs of the images that 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose
-from colmap_affrect.geometry.two_views import (
-    ScaleEstimate,
-    scale_between,
-    scale_by_planes,
-)
+from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.two_views import ScaleEstimate, scale_between, scale_by_planes
 from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
     CameraById,
@@ -28,7 +24,6 @@ from colmap_affrect.mappers.pair_graph import (
     RelativePose,
     VerifiedPair,
     cameras_of,
-    inverse,
     poses_of,
 )
 from colmap_affrect.project.report import Bridge
@@ -44,71 +39,36 @@ MIN_AGREEING_SHARE = 0.5
 """A scale needs so many places that agree, and this share of all: right pairs have 80 to 100 %, and
 chance a quarter."""
 
-
 FOCAL_STEP = 0.02
 """Relative poses are estimated again when a focal length has changed by about this part."""
 
 
-@dataclass(frozen=True)
-class Part:
-    """A model as bridges see it.
+class _Part:
+    """A model as bridges see it."""
 
-    Attributes:
-        model: the model.
-    """
+    def __init__(self, model: pycolmap.Reconstruction) -> None:
+        self.model, self.poses, self.cameras = model, poses_of(model), cameras_of(model)
+        self.known_depths = cache(self._known_depths)
 
-    model: pycolmap.Reconstruction
-
-    @cached_property
-    def poses(self) -> dict[int, Pose]:
-        """cam_from_world by image id."""
-        return poses_of(self.model)
-
-    @cached_property
-    def cameras(self) -> dict[int, pycolmap.Camera]:
-        """Camera by id of the image."""
-        return cameras_of(self.model)
-
-    def known_depths(self, image_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _known_depths(self, image_id: int) -> tuple[Array, Array]:
         """Return (K, 2) px and (K,) depths of the points that an image sees."""
-        if image_id not in self._known:
-            rotation, translation = self.poses[image_id]
-            points = self.model.images[image_id].get_observation_points2D()
-            places = np.array([p.xy for p in points]).reshape(-1, 2)
-            world = np.array([self.model.points3D[p.point3D_id].xyz for p in points])
-            depths = world.reshape(-1, 3) @ rotation[2] + translation[2]
-            in_front = depths > 0
-            self._known[image_id] = places[in_front], depths[in_front]
-        return self._known[image_id]
-
-    @cached_property
-    def _known(self) -> dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        return {}
+        rotation, translation = self.poses[image_id]
+        points = self.model.images[image_id].get_observation_points2D()
+        places = np.array([p.xy for p in points]).reshape(-1, 2)
+        world = np.array([self.model.points3D[p.point3D_id].xyz for p in points])
+        depths = world.reshape(-1, 3) @ rotation[2] + translation[2]
+        return places[depths > 0], depths[depths > 0]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A bridge that could be built.
+    """A bridge that could be built."""
 
-    Attributes:
-        bridge: what would be reported.
-        image_id: of the image that comes in.
-        pose: of this image, in the frame of the model.
-        camera: of this image.
-        agreeing: weight of the pairs between the model and this image, as far as they agree.
-    """
-
-    bridge: Bridge
-    image_id: int
-    pose: Pose
-    camera: pycolmap.Camera
-    agreeing: float
-
-    @property
-    def rank(self) -> float:
-        """Higher for what more pairs agree with, and for scales that more places agree on."""
-        agreement = self.bridge.num_agreeing / self.bridge.num_ratios
-        return self.agreeing * agreement
+    bridge: Bridge  # what would be reported
+    image_id: int  # of the image that comes in
+    pose: Pose  # of this image, in the frame of the model
+    camera: pycolmap.Camera  # of this image
+    rank: float  # higher for what more pairs agree with, and for scales that more places agree on
 
 
 class Bridges:
@@ -119,62 +79,62 @@ class Bridges:
         self.graph, self.random_seed = graph, random_seed
         self._relative: dict[tuple[Any, ...], list[RelativePose]] = {}
 
-    def find(self, part: Part) -> list[Hypothesis]:
+    def find(self, model: pycolmap.Reconstruction) -> list[Hypothesis]:
         """Return all bridges from a model to other images, best first."""
-        found = filter(None, self._to_images(part))
-        return sorted(found, key=lambda hypothesis: -hypothesis.rank)
+        return sorted(self._to_images(_Part(model)), key=lambda hypothesis: -hypothesis.rank)
 
-    def _to_images(self, part: Part) -> Iterator[Hypothesis | None]:
+    def _to_images(self, part: _Part) -> Iterator[Hypothesis]:
+        camera_of = {camera.camera_id: camera for camera in part.cameras.values()}
         for pair in self.graph.pairs:
             inside = [image_id in part.poses for image_id in pair.ids]
             if sum(inside) != 1:
                 continue
             side = inside.index(True)
             near, far = pair.ids[side], pair.ids[1 - side]
-            cameras = {near: part.cameras[near], far: self._camera(part, far)}
-            for relative in self._poses(pair, cameras):
+            usual = self.graph.cameras[far]
+            camera = camera_of.get(usual.camera_id, usual)
+            for relative in self._poses(pair, {near: part.cameras[near], far: camera}):
                 scale = self._scale(part, near, side, relative)
                 if scale is None:
                     continue
-                pose = relative.pose if side == 0 else inverse(relative.pose)
+                turn, shift = relative.pose if side == 0 else _inverse(relative.pose)
                 rotation, translation = part.poses[near]
-                moved = pose[0] @ rotation, pose[0] @ translation + scale.scale * pose[1]
-                yield self._judged(part, (near, far), moved, cameras[far], scale)
+                pose = turn @ rotation, turn @ translation + scale.scale * shift
+                agreeing = self._agreeing(part, far, pose, camera)
+                if agreeing is not None:
+                    numbers = scale.num_agreeing, scale.num_ratios, scale.error_frac
+                    bridge = Bridge(self.graph.names[near], *numbers)
+                    yield Hypothesis(bridge, far, pose, camera, agreeing * scale.share)
 
     def _scale(
-        self, part: Part, image_id: int, side: int, relative: RelativePose
+        self, part: _Part, image_id: int, side: int, relative: RelativePose
     ) -> ScaleEstimate | None:
         """Compare the depths of a pair in an image with those that a model knows there."""
-        radius = RADIUS_FRAC * _longer_side(part.cameras[image_id])
-        depths = relative.depths.first if side == 0 else relative.depths.second
-        in_front = relative.depths.in_front
-        places = self.graph.keypoints[image_id][relative.matches[in_front, side]]
-        known = part.known_depths(image_id)
-        positive = depths[in_front]
-        return _trusted(scale_between(known, (places, positive), radius)) or _trusted(
-            scale_by_planes(known, (places, positive), PLANE_RADIUS * radius)
-        )
+        camera, known = part.cameras[image_id], part.known_depths(image_id)
+        radius = RADIUS_FRAC * max(camera.width, camera.height)
+        places = self.graph.keypoints[image_id][relative.matches[:, side]].astype(np.float64)
+        own = places, relative.depths[side]
+        for estimate, distance in (scale_between, radius), (scale_by_planes, PLANE_RADIUS * radius):
+            scale = estimate(known, own, distance)
+            if scale and scale.num_agreeing >= MIN_AGREEING and scale.share >= MIN_AGREEING_SHARE:
+                return scale
+        return None
 
-    def _judged(
-        self,
-        part: Part,
-        ids: tuple[int, int],
-        pose: Pose,
-        camera: pycolmap.Camera,
-        scale: ScaleEstimate,
-    ) -> Hypothesis | None:
-        """Ask all pairs between the model and an image; None where they disagree."""
-        near, far = ids
-        poses, cameras = {**part.poses, far: pose}, {**part.cameras, far: camera}
+    def _agreeing(
+        self, part: _Part, image_id: int, pose: Pose, camera: pycolmap.Camera
+    ) -> float | None:
+        """Return the weight of the pairs between the model and an image, as far as they agree.
+
+        None where they disagree.
+        """
+        poses, cameras = {**part.poses, image_id: pose}, {**part.cameras, image_id: camera}
         weight = agreeing = 0.0
         for pair in self.graph.pairs_inside(poses):
-            if far in pair.ids:
-                weight += pair.weight
-                agreeing += pair.weight * self.graph.agreement(pair, poses, cameras)
-        if agreeing < MIN_SHARE * weight:
-            return None
-        numbers = scale.num_agreeing, scale.num_ratios, scale.error_frac
-        return Hypothesis(Bridge(self.graph.names[near], *numbers), far, pose, camera, agreeing)
+            if image_id in pair.ids:
+                own = float(np.sqrt(len(pair.matches)))
+                weight += own
+                agreeing += own * self.graph.agreement(pair, poses, cameras)
+        return agreeing if agreeing >= MIN_SHARE * weight else None
 
     def _poses(self, pair: VerifiedPair, cameras: CameraById) -> list[RelativePose]:
         focals = [cameras[image_id].mean_focal_length() for image_id in pair.ids]
@@ -183,19 +143,7 @@ class Bridges:
             self._relative[key] = self.graph.relative_poses(pair, cameras, self.random_seed)
         return self._relative[key]
 
-    def _camera(self, part: Part, image_id: int) -> pycolmap.Camera:
-        """Return the camera that an image would have in a model."""
-        usual = self.graph.cameras[image_id]
-        alike = (known for known in part.cameras.values() if known.camera_id == usual.camera_id)
-        return next(alike, usual)
 
-
-def _longer_side(camera: pycolmap.Camera) -> int:
-    return max(camera.width, camera.height)
-
-
-def _trusted(estimate: ScaleEstimate | None) -> ScaleEstimate | None:
-    """Return an estimate on which enough places agree."""
-    if estimate is None or estimate.num_agreeing < MIN_AGREEING:
-        return None
-    return estimate if estimate.share >= MIN_AGREEING_SHARE else None
+def _inverse(pose: Pose) -> Pose:
+    """Return cam1_from_cam2 of cam2_from_cam1."""
+    return pose[0].T, -pose[0].T @ pose[1]

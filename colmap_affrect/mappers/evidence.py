@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import seen_points
+from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.mappers.adjustment import FocalPrior
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair, cameras_of, poses_of
 
@@ -78,7 +78,7 @@ class Evidence:
         return min(cells(self.graph.cameras[image_id], points) for image_id, points in both)
 
 
-def cells(camera: pycolmap.Camera, points: NDArray[np.floating]) -> int:
+def cells(camera: pycolmap.Camera, points: Floats) -> int:
     """Return how many cells of a grid over an image hold points, (N, 2) px."""
     numbers = (points / [camera.width, camera.height] * GRID).astype(int)
     return len(np.unique(np.clip(numbers, 0, GRID - 1) @ [1, GRID]))

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.geometry.arrays import Array
 
 SAME_POSE = 1e-6
 """Largest difference of the elements of two poses that are the same; quaternions round."""
@@ -24,22 +24,13 @@ SAME_POSE = 1e-6
 
 @dataclass(frozen=True)
 class Extension:
-    """What is to be extended, and how.
+    """What is to be extended, and how."""
 
-    Attributes:
-        model_path: folder of a COLMAP model, text or binary.
-        refine_existing: its poses and cameras may move; else they stay as they are.
-    """
-
-    model_path: Path
-    refine_existing: bool = False
+    model_path: Path  # folder of a COLMAP model, text or binary
+    refine_existing: bool = False  # its poses and cameras may move; else they stay as they are
 
     def refuse_discarding(self, output_path: Path) -> None:
-        """Refuse a model in a folder whose results are to be discarded first.
-
-        Raises:
-            OptionError: naming it.
-        """
+        """Raise OptionError for a model in a folder whose results are to be discarded first."""
         if self.model_path.resolve().is_relative_to(output_path.resolve()):
             raise OptionError(
                 f"--extend {self.model_path}: --overwrite would discard it; leave that out, or use "
@@ -56,21 +47,17 @@ class Extension:
 
 @dataclass(frozen=True)
 class ExistingModel:
-    """A finished model with the ids of a database.
-
-    Attributes:
-        reconstruction: all images of the database, those of the model registered; without points,
-            which are to be triangulated anew, as the keypoints may be others.
-        refine: its poses and cameras may move.
-    """
+    """A finished model with the ids of a database."""
 
     reconstruction: pycolmap.Reconstruction
-    refine: bool
+    """All images of the database, those of the model registered; without points, which are to be
+    triangulated anew, as the keypoints may be others."""
+    refine: bool  # its poses and cameras may move
 
     @property
     def images(self) -> list[pycolmap.Image]:
         """The images of the model."""
-        return [self.reconstruction.image(i) for i in self.reconstruction.reg_image_ids()]
+        return _registered(self.reconstruction)
 
     def constrain(self, native: pycolmap.IncrementalPipelineOptions) -> None:
         """Have pycolmap's mapper keep poses, cameras and rigs, unless they may move."""
@@ -106,24 +93,16 @@ class ExistingModel:
 def existing_names(model_path: Path, known: Collection[str]) -> list[str]:
     """Return the sorted names of the images of a model that is to be extended.
 
-    Args:
-        model_path: folder of a COLMAP model.
-        known: names of the photographs; all of the model must be among them.
-
-    Raises:
-        OptionError: when there is no such folder, or no model in it.
-        AffrectError: when it has none, or some that are not known.
+    OptionError when there is no such folder, or no model in it; AffrectError when it has no images,
+    or some that are not among the ``known`` names of photographs.
     """
-    model = read_given_model(model_path, "--extend ")
-    return _known_names(model, model_path, known)
+    return _known_names(read_given_model(model_path, "--extend "), model_path, known)
 
 
 def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     """Read the poses and cameras of a model and give them the ids of a database.
 
-    Raises:
-        OptionError: when there is no such folder, or no model in it.
-        AffrectError: when it does not fit the database.
+    OptionError as :func:`existing_names`; AffrectError when it does not fit the database.
     """
     path = extension.model_path
     old = read_given_model(path, "--extend ")
@@ -198,10 +177,9 @@ def _take_poses(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) ->
             frame.set_cam_from_world(now.camera_id, image.cam_from_world())
             new.register_frame(now.frame_id)
     for image, now in images:
-        difference = image.cam_from_world().matrix() - now.cam_from_world().matrix()
-        if np.abs(difference).max() > SAME_POSE * (
-            1 + np.abs(image.cam_from_world().translation).max()
-        ):
+        pose = image.cam_from_world().matrix()
+        difference = np.abs(pose - now.cam_from_world().matrix()).max()
+        if difference > SAME_POSE * (1 + np.abs(pose[:, 3]).max()):
             raise AffrectError(
                 f"--extend {path}: the pose of {image.name} does not fit the rig it has here"
             )
@@ -215,7 +193,7 @@ def _move_onto(model: pycolmap.Reconstruction, images: list[pycolmap.Image]) -> 
         model.transform(moved)
 
 
-def _points_of(images: list[pycolmap.Image]) -> NDArray[np.float64]:
+def _points_of(images: list[pycolmap.Image]) -> Array:
     """Return (N, 3) points that tell poses: centres, and the ends of axes as long as they spread.
 
     Centres alone tell no rotation where they lie on a line.

@@ -4,15 +4,17 @@ All adjustments know what is known of the cameras (:mod:`colmap_affrect.mappers.
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.adjustment import FAST, FINAL, MEDIUM, Adjuster
-from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.bridging import Bridges
 from colmap_affrect.mappers.evidence import Evidence
-from colmap_affrect.mappers.pair_graph import CameraById, PairGraph, PoseById
+from colmap_affrect.mappers.pair_graph import CameraById, PairGraph, PoseById, cameras_of, poses_of
 from colmap_affrect.project.report import Bridge
 
 MIN_POINTS = 10  # of a first pair
@@ -21,46 +23,50 @@ GROWTH = 1.15  # from then on, everything is adjusted when the model has grown b
 NUM_LAST_ROUNDS = 2  # of finding points anew and adjusting to the end
 MAX_TRIALS = 5  # bridges from one model that are tried before nothing more is expected to join it
 
-Models = list[pycolmap.Reconstruction]
-
 
 class Grower:
     """Grows models from first pairs, as COLMAP's incremental mapper does."""
 
     def __init__(
         self,
-        cache: pycolmap.DatabaseCache,
+        graph: PairGraph,
         adjuster: Adjuster,
         native: pycolmap.IncrementalPipelineOptions,
         show: Callable[[int], None],
     ) -> None:
-        self.cache, self.adjuster, self.native, self.show = cache, adjuster, native, show
+        self.graph, self.adjuster, self.native, self.show = graph, adjuster, native, show
         self.options, self.triangulation = native.get_mapper(), native.get_triangulation()
+
+    @contextmanager
+    def _mapping(self, model: pycolmap.Reconstruction) -> Iterator[pycolmap.IncrementalMapper]:
+        mapper = pycolmap.IncrementalMapper(self.graph.cache)
+        mapper.begin_reconstruction(model)
+        yield mapper
+        mapper.end_reconstruction(False)
 
     def grow(self, pair: tuple[int, int]) -> pycolmap.Reconstruction | None:
         """Return the model that a first pair of image ids ends with, None if it makes none."""
-        model, mapper = pycolmap.Reconstruction(), pycolmap.IncrementalMapper(self.cache)
-        mapper.begin_reconstruction(model)
-        self.adjuster.begin(model)
-        pose = mapper.estimate_initial_two_view_geometry(self.options, *pair)
-        if pose is not None:
+        model = pycolmap.Reconstruction()
+        with self._mapping(model) as mapper:
+            self.adjuster.begin(model)
+            pose = mapper.estimate_initial_two_view_geometry(self.options, *pair)
+            if pose is None:
+                return None
             mapper.register_initial_image_pair(self.options, *pair, pose)
-            for image_id in pair:
-                mapper.triangulate_image(self.triangulation, image_id)
+            self._triangulate(mapper, pair)
             self._adjust(mapper, FAST)
             self.show(len(pair))
-        is_model = pose is not None and model.num_points3D() >= MIN_POINTS
-        if is_model:
-            self.complete(mapper)
-        mapper.end_reconstruction(not is_model)
-        return model if is_model else None
+            if model.num_points3D() < MIN_POINTS:
+                return None
+            self._complete(mapper)
+        return model
 
-    def complete(self, mapper: pycolmap.IncrementalMapper) -> None:
+    def _complete(self, mapper: pycolmap.IncrementalMapper) -> None:
         """Register images as long as there are any, and adjust all."""
         model = mapper.reconstruction
         adjusted = model.num_reg_images()
         while image_id := self._register_next(mapper):
-            mapper.triangulate_image(self.triangulation, image_id)
+            self._triangulate(mapper, [image_id])
             mapper.complete_and_merge_tracks(self.triangulation)
             count = model.num_reg_images()
             self.show(count)
@@ -74,58 +80,49 @@ class Grower:
 
     def finish(self, model: pycolmap.Reconstruction, max_iterations: int = FINAL) -> None:
         """Find points anew and adjust a model, by default to the end."""
-        mapper = pycolmap.IncrementalMapper(self.cache)
-        mapper.begin_reconstruction(model)
-        for _ in range(NUM_LAST_ROUNDS):
-            self._refine(mapper, max_iterations)
-        mapper.end_reconstruction(False)
+        with self._mapping(model) as mapper:
+            for _ in range(NUM_LAST_ROUNDS):
+                self._refine(mapper, max_iterations)
 
-    def fill(self, model: pycolmap.Reconstruction, max_iterations: int) -> None:
-        """Find all points of a model that some of them made, and adjust it."""
-        mapper = pycolmap.IncrementalMapper(self.cache)
-        mapper.begin_reconstruction(model)
-        for image_id in model.reg_image_ids():
-            mapper.triangulate_image(self.triangulation, image_id)
-        self._refine(mapper, max_iterations)
-        mapper.end_reconstruction(False)
+    def fill(self, model: pycolmap.Reconstruction) -> None:
+        """Find all points of a model that some of them made, and adjust it a little."""
+        with self._mapping(model) as mapper:
+            self._triangulate(mapper, model.reg_image_ids())
+            self._refine(mapper, FAST)
 
-    def _refine(self, mapper: pycolmap.IncrementalMapper, max_iterations: int) -> None:
-        mapper.retriangulate(self.triangulation)
-        mapper.complete_and_merge_tracks(self.triangulation)
-        self._adjust(mapper, max_iterations)
-
-    def applied(
-        self, hypothesis: Hypothesis, model: pycolmap.Reconstruction
-    ) -> pycolmap.Reconstruction:
-        """Return a copy of a model with the image of a bridge, grown and adjusted from there."""
-        poses = {hypothesis.image_id: hypothesis.pose}
-        cameras = {hypothesis.image_id: hypothesis.camera}
-        return self.placed(poses, cameras, copy.deepcopy(model))
+    def again(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """Return a new model that begins with the poses and cameras of another one."""
+        return self.placed(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
 
     def placed(
         self, poses: PoseById, cameras: CameraById, model: pycolmap.Reconstruction
     ) -> pycolmap.Reconstruction:
         """Register images where they are said to be; grow and adjust the model from there."""
         known = {model.images[i].camera_id for i in model.reg_image_ids()}
-        model.load(self.cache)
+        model.load(self.graph.cache)
         for image_id, (rotation, translation) in poses.items():
             image = model.images[image_id]
             if image.has_pose or image.frame is None:
                 continue
             if image.camera_id not in known:
-                parameters = cameras[image_id].params.tolist()
-                model.cameras[image.camera_id].params = parameters
+                model.cameras[image.camera_id].params = cameras[image_id].params.tolist()
             pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
             image.frame.set_cam_from_world(image.camera_id, pose)
             model.register_frame(image.frame_id)
-        mapper = pycolmap.IncrementalMapper(self.cache)
-        mapper.begin_reconstruction(model)
-        for image_id in poses:
-            mapper.triangulate_image(self.triangulation, image_id)
-        self.complete(mapper)
-        mapper.end_reconstruction(False)
+        with self._mapping(model) as mapper:
+            self._triangulate(mapper, poses)
+            self._complete(mapper)
         self.show(model.num_reg_images())
         return model
+
+    def _triangulate(self, mapper: pycolmap.IncrementalMapper, image_ids: Collection[int]) -> None:
+        for image_id in image_ids:
+            mapper.triangulate_image(self.triangulation, image_id)
+
+    def _refine(self, mapper: pycolmap.IncrementalMapper, max_iterations: int) -> None:
+        mapper.retriangulate(self.triangulation)
+        mapper.complete_and_merge_tracks(self.triangulation)
+        self._adjust(mapper, max_iterations)
 
     def _adjust(
         self,
@@ -138,33 +135,24 @@ class Grower:
 
     def _register_next(self, mapper: pycolmap.IncrementalMapper) -> int | None:
         """Register one more image by points that it sees; return its id."""
-        for image_id in mapper.find_next_images(self.options, False):
-            if mapper.register_next_image(self.options, image_id):
-                return image_id
-        return None
+        ids = mapper.find_next_images(self.options, False)
+        return next((i for i in ids if mapper.register_next_image(self.options, i)), None)
 
 
-class Joiner:
-    """Joins images to models by bridges until nothing joins."""
-
-    def __init__(self, graph: PairGraph, grower: Grower, evidence: Evidence) -> None:
-        self.graph, self.grower, self.evidence = graph, grower, evidence
-        self.bridges = Bridges(graph, grower.native.random_seed)
-
-    def join(
-        self, model: pycolmap.Reconstruction
-    ) -> tuple[pycolmap.Reconstruction, dict[str, Bridge]]:
-        """Bridge from a model to images until nothing joins; return its bridges, too."""
-        built: dict[str, Bridge] = {}
-        score = self.evidence.of(model)
-        while True:
-            for hypothesis in self.bridges.find(Part(model))[:MAX_TRIALS]:
-                grown = self.grower.applied(hypothesis, model)
-                new_score = self.evidence.of(grown)
-                new = set(grown.reg_image_ids()) - set(model.reg_image_ids())
-                if new and new_score > score:
-                    break
-            else:
-                return model, built
-            model, score = grown, new_score
-            built[self.graph.names[hypothesis.image_id]] = hypothesis.bridge
+def join(
+    model: pycolmap.Reconstruction, bridges: Bridges, grower: Grower, evidence: Evidence
+) -> MappedModel:
+    """Bridge from a model to images until nothing joins."""
+    built: dict[str, Bridge] = {}
+    score = evidence.of(model)
+    while True:
+        for found in bridges.find(model)[:MAX_TRIALS]:
+            place = {found.image_id: found.pose}, {found.image_id: found.camera}
+            grown = grower.placed(*place, copy.deepcopy(model))
+            new_score = evidence.of(grown)
+            if grown.num_reg_images() > model.num_reg_images() and new_score > score:
+                break
+        else:
+            return MappedModel(model, built)
+        model, score = grown, new_score
+        built[grower.graph.names[found.image_id]] = found.bridge

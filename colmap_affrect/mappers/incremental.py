@@ -9,16 +9,12 @@ from typing import Annotated, Any, ClassVar, Literal
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import image_ids
-from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.colmap.model_files import model_poses, registered_names
 from colmap_affrect.colmap.native_options import resolve, set_values
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel
-from colmap_affrect.mappers.snapshots import (
-    SNAPSHOT_FRAMES,
-    drop_old_snapshots,
-    largest_snapshot,
-)
+from colmap_affrect.mappers.snapshots import SNAPSHOT_FRAMES, drop_old_snapshots, largest_snapshot
 from colmap_affrect.options import within
 
 FLAG = "--mapper-options"
@@ -51,11 +47,7 @@ class IncrementalOptions(PipelineOptions):
 
 
 class IncrementalMapper:
-    """COLMAP's incremental mapper, in one thread.
-
-    With several the choice of the first pair, and so the model, may differ from run to run in
-    spite of the seed.
-    """
+    """COLMAP's, in one thread: with several the first pair may differ from run to run."""
 
     Options: ClassVar[type[PipelineOptions]] = IncrementalOptions
 
@@ -75,7 +67,7 @@ class IncrementalMapper:
         native = self.native(task, random_seed)
         if task.image_path is None:
             native.extract_colors = False
-        call = _Call(task, native, output_path, show)
+        call = _Call(task, native, output_path, show, task.database_path)
         try:
             models = run_cancellable(call.models, task.cancellation)
         except InterruptedError as error:
@@ -88,8 +80,7 @@ class IncrementalMapper:
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:
         """Translate the options into pycolmap's, with what of a task's cameras is refined."""
         options = self.options
-        focals = not task.keeps_focal_lengths(options)
-        distortion = not task.keeps_intrinsics(options)
+        focals, distortion = (not given for given in task.all_given(options))
         native = pycolmap.IncrementalPipelineOptions(
             min_model_size=options.min_model_size,
             max_focal_length_ratio=options.max_focal_length_ratio,
@@ -123,10 +114,8 @@ class _Call:
     options: pycolmap.IncrementalPipelineOptions
     output_path: Path
     show: Callable[[int], None]
+    database_path: Path
     count: int = 0
-
-    def __post_init__(self) -> None:
-        self.database_path = self.task.database_path
 
     def models(self, token: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
         """Map from scratch, go on from a snapshot, or extend the model of the task."""
@@ -143,9 +132,7 @@ class _Call:
         self._add(len(registered_names(snapshot)))
         models = self._map(token, snapshot)
         # After a model that is gone on with pycolmap begins no other.
-        found = {
-            image.name for model in models for image in model.images.values() if image.has_pose
-        }
+        found = {name for model in models for name in model_poses(model)}
         self.options.image_names = sorted(image_ids(task.database_path).keys() - found)
         return models + (self._map(token) if len(self.options.image_names) > 1 else [])
 

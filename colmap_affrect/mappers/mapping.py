@@ -11,12 +11,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from colmap_affrect.colmap.database import image_ids
-from colmap_affrect.colmap.model_files import (
-    SUMMARY,
-    file_digests,
-    require_intact,
-    write_model,
-)
+from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
 from colmap_affrect.errors import damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.pair_graph import graph_of
@@ -30,10 +25,7 @@ from colmap_affrect.project.report import DOUBTFUL, ModelSummary
 
 @dataclass(frozen=True)
 class _Kept:
-    """The content of the file."""
-
-    model: dict[str, str]
-    """Digests of the files of the model by name."""
+    model: dict[str, str]  # digests of its files by name
     summary: ModelSummary
 
 

@@ -6,24 +6,19 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Self
 
-import networkx as nx
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import Pose, relative_pose
-from colmap_affrect.colmap.two_views import decomposed_homography, homography_matrix
+from colmap_affrect.colmap.two_views import Cameras, decomposed_homography, homography_matrix
+from colmap_affrect.colmap.verification import connected_parts
+from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
 from colmap_affrect.geometry.epipolar import sampson_errors
-from colmap_affrect.geometry.two_views import (
-    Depths,
-    essential_matrix,
-    triangulated_depths,
-)
+from colmap_affrect.geometry.two_views import Depths, essential_matrix, triangulated_depths
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.thinning import matches_of_best_tracks
 
@@ -55,27 +50,11 @@ MIN_SHARE = 0.5
 
 @dataclass(frozen=True)
 class VerifiedPair:
-    """A verified pair of images.
+    """A verified pair of images."""
 
-    Attributes:
-        ids: of the two images.
-        matches: (M, 2) features that are inliers.
-        geometry: of the pair in the database.
-    """
-
-    ids: tuple[int, int]
-    matches: NDArray[np.int64]
-    geometry: pycolmap.TwoViewGeometry
-
-    @property
-    def homography(self) -> NDArray[np.float64] | None:
-        """(3, 3) from image 1 to image 2, where COLMAP found one."""
-        return homography_matrix(self.geometry)
-
-    @property
-    def weight(self) -> float:
-        """What the pair counts beside others."""
-        return float(np.sqrt(len(self.matches)))
+    ids: Ids
+    matches: Indices  # (M, 2) features that are inliers
+    geometry: pycolmap.TwoViewGeometry  # of the pair in the database
 
     def some_matches(self) -> Self:
         """Return the pair with ``MAX_MATCHES`` of its inliers at most, spread over all."""
@@ -83,49 +62,32 @@ class VerifiedPair:
         return replace(self, matches=self.matches[::step])
 
 
+Pairs = tuple[VerifiedPair, ...]
+
+
 @dataclass(frozen=True)
 class RelativePose:
-    """A relative pose of a pair that its inliers allow.
+    """A relative pose of a pair that its inliers allow."""
 
-    Attributes:
-        pose: cam2_from_cam1, with a translation of length 1.
-        matches: (M, 2) features that agree with it, with enough parallax to know their depth.
-        depths: of these.
-    """
-
-    pose: Pose
-    matches: NDArray[np.int64]
-    depths: Depths
+    pose: Pose  # cam2_from_cam1, with a translation of length 1
+    matches: Indices  # (M, 2) features that agree, with enough parallax to know their depth
+    depths: tuple[Array, Array]  # of these in both cameras, twice (M,), all positive
 
 
 @dataclass(frozen=True, eq=False)
 class PairGraph:
-    """The verified pairs of a database, of each image the strongest.
+    """The verified pairs of a database, of each image the strongest."""
 
-    Attributes:
-        cache: the same for pycolmap's mappers.
-        names: by image id.
-        cameras: by image id, as in the database.
-        keypoints: (N, 2) px by image id, of the images of pairs.
-        pairs: sorted by ids.
-        weak: verified pairs that are not among the strongest, and in the cache only.
-        min_num_matches: pairs with fewer inliers are left out.
-    """
-
-    cache: pycolmap.DatabaseCache
-    names: Mapping[int, str]
-    cameras: CameraById
-    keypoints: Mapping[int, NDArray[np.float32]]
-    pairs: tuple[VerifiedPair, ...]
-    weak: tuple[VerifiedPair, ...]
-    min_num_matches: int
+    cache: pycolmap.DatabaseCache  # the same for pycolmap's mappers
+    names: Mapping[int, str]  # by image id
+    cameras: CameraById  # as in the database
+    keypoints: Mapping[int, Singles]  # (N, 2) px by image id, of the images of pairs
+    pairs: Pairs  # sorted by ids
+    weak: Pairs  # that are not among the strongest, and in the cache only
+    min_num_matches: int  # pairs with fewer inliers are left out
 
     @classmethod
-    def read(
-        cls,
-        path: Path,
-        min_num_matches: int = MIN_NUM_MATCHES,
-    ) -> Self:
+    def read(cls, path: Path, min_num_matches: int = MIN_NUM_MATCHES) -> Self:
         """Read the pairs with at least as many inliers, and all images."""
         with open_database(path) as database:
             images = {image.image_id: image for image in database.read_all_images()}
@@ -149,32 +111,29 @@ class PairGraph:
             }
         names = {image_id: image.name for image_id, image in images.items()}
         of_images = {image_id: cameras[image.camera_id] for image_id, image in images.items()}
-        strong, weak = _strongest(verified)
-        return cls(cache, names, of_images, keypoints, strong, weak, min_num_matches)
+        return cls(cache, names, of_images, keypoints, *_strongest(verified), min_num_matches)
 
     def without(self, ids: Collection[Ids]) -> Self:
-        """Leave out some pairs."""
-        return self._with((pair for pair in self._verified if pair.ids not in ids), self.cache)
+        """Leave out some pairs; itself where there are none."""
+        kept = [pair for pair in self._verified if pair.ids not in ids]
+        return self._with(kept, self.cache) if ids else self
 
     @property
-    def _verified(self) -> tuple[VerifiedPair, ...]:
+    def _verified(self) -> Pairs:
         return self.pairs + self.weak
 
     @cached_property
     def most_connected(self) -> frozenset[int]:
         """The images that pairs connect with the most others."""
-        graph = nx.Graph()
-        graph.add_edges_from(pair.ids for pair in self.pairs)
-        parts = nx.connected_components(graph)
-        return frozenset(max(parts, key=len, default=()))
+        parts = connected_parts(pair.ids for pair in self.pairs)
+        return frozenset(parts[0] if parts else ())
 
     def with_cameras(self, records: Mapping[int, CameraRecord]) -> Self:
         """Give images the cameras that records say they have, of those of the graph."""
         camera_of = {name: key for key, record in records.items() for name in record.names}
         cache = _empty_copy(self.cache, camera_of)
         cameras = {i: cache.cameras[image.camera_id] for i, image in cache.images.items()}
-        moved = self._with(self._verified, cache)
-        return replace(moved, cameras={**self.cameras, **cameras})
+        return replace(self._with(self._verified, cache), cameras={**self.cameras, **cameras})
 
     def thinned(self) -> Self:
         """Leave out tracks where the others tell the poses as well; itself where they are few.
@@ -192,7 +151,7 @@ class PairGraph:
     def _with(self, verified: Iterable[VerifiedPair], cache: pycolmap.DatabaseCache) -> Self:
         """Return a graph of other pairs, with the cameras and images of a cache."""
         kept = [pair for pair in verified if len(pair.matches) >= self.min_num_matches]
-        new = _empty_copy(cache)
+        new = _empty_copy(cache, {})
         for pair in kept:
             geometry = copy.copy(pair.geometry)
             geometry.inlier_matches = pair.matches.astype(np.uint32)
@@ -203,12 +162,10 @@ class PairGraph:
         strong, weak = _strongest(kept)
         return replace(self, cache=new, keypoints=keypoints, pairs=strong, weak=weak)
 
-    def points(self, pair: VerifiedPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def points(self, pair: VerifiedPair) -> tuple[Array, Array]:
         """Return the (M, 2) px of the inliers in both images."""
-        first, second = (
-            self.keypoints[image_id][pair.matches[:, side]].astype(np.float64)
-            for side, image_id in enumerate(pair.ids)
-        )
+        both = (self.keypoints[i][rows] for i, rows in zip(pair.ids, pair.matches.T, strict=True))
+        first, second = (points.astype(np.float64) for points in both)
         return first, second
 
     def pairs_inside(self, image_ids: Collection[int]) -> list[VerifiedPair]:
@@ -218,10 +175,9 @@ class PairGraph:
 
     def agreement(self, pair: VerifiedPair, poses: PoseById, cameras: CameraById) -> float:
         """Return the share of the inliers of a pair that agree with the poses of its images."""
-        camera1, camera2 = (cameras[image_id] for image_id in pair.ids)
-        pose = relative_pose(*(poses[image_id] for image_id in pair.ids))
-        some = pair.some_matches()
-        return float(_agrees(pose, (camera1, camera2), self.points(some))[0].mean())
+        first, second = pair.ids
+        pose, both = relative_pose(poses[first], poses[second]), (cameras[first], cameras[second])
+        return float(_agrees(pose, both, self.points(pair.some_matches()))[0].mean())
 
     def is_explained_by(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model has all images of all pairs, and no pair contradicts it."""
@@ -246,33 +202,33 @@ class PairGraph:
         of a plane seen twice both solutions may have all points before both cameras, so that only
         other pairs can tell which one is right.
         """
-        camera1, camera2 = (cameras[image_id] for image_id in pair.ids)
-        points = self.points(pair)
+        both = cameras[pair.ids[0]], cameras[pair.ids[1]]
         options = pycolmap.RANSACOptions(
             max_error=MAX_ERROR_PX, max_num_trials=MAX_TRIALS, random_seed=max(random_seed, 0)
         )
         # Not by a two-view geometry, which where a fundamental matrix has more inliers is that.
         found: Any = pycolmap.estimate_essential_matrix(
-            *self.points(pair.some_matches()), camera1, camera2, options
+            *self.points(pair.some_matches()), *both, options
         )
         candidates = []
         if found and found.get("cam2_from_cam1") is not None:
             matrix = found["cam2_from_cam1"].matrix()
             candidates.append((matrix[:, :3], matrix[:, 3]))
-        if pair.homography is not None:
-            candidates += decomposed_homography(pair.homography, (camera1, camera2))
+        homography = homography_matrix(pair.geometry)
+        if homography is not None:
+            candidates += decomposed_homography(homography, both)
         allowed = []
         for pose in candidates:
-            agrees, depths = _agrees(pose, (camera1, camera2), points)
+            agrees, depths = _agrees(pose, both, self.points(pair))
             known = agrees & (depths.angles_deg > MIN_ANGLE_DEG)
             if agrees.mean() >= MIN_SHARE and known.any():
-                kept = Depths(depths.first[known], depths.second[known], depths.angles_deg[known])
+                kept = depths.first[known], depths.second[known]
                 allowed.append(RelativePose(pose, pair.matches[known], kept))
         return allowed
 
 
 @lru_cache(maxsize=1)
-def graph_of(task: MappingTask, min_num_matches: int = MIN_NUM_MATCHES) -> PairGraph:
+def graph_of(task: MappingTask, min_num_matches: int) -> PairGraph:
     """Return the graph of what is to be mapped; of one task it is read once."""
     return PairGraph.read(task.database_path, min_num_matches)
 
@@ -288,16 +244,7 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
     return {i: model.cameras[model.images[i].camera_id] for i in model.reg_image_ids()}
 
 
-def inverse(pose: Pose) -> Pose:
-    """Return cam1_from_cam2 of cam2_from_cam1."""
-    return pose[0].T, -pose[0].T @ pose[1]
-
-
-def _agrees(
-    pose: Pose,
-    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    points: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> tuple[NDArray[np.bool_], Depths]:
+def _agrees(pose: Pose, cameras: Cameras, points: tuple[Array, Array]) -> tuple[Bools, Depths]:
     """Return which matches agree with a relative pose, and their depths."""
     rays1, rays2 = (
         np.asarray(camera.cam_from_img(part), np.float64)
@@ -315,9 +262,7 @@ def _agrees(
     return (errors <= tolerance) & sides, depths
 
 
-def _strongest(
-    pairs: Iterable[VerifiedPair],
-) -> tuple[tuple[VerifiedPair, ...], tuple[VerifiedPair, ...]]:
+def _strongest(pairs: Iterable[VerifiedPair]) -> tuple[Pairs, Pairs]:
     """Return the pairs among the ``MAX_PAIRS_OF_IMAGE`` strongest of one image, and the others."""
     counts: Counter[int] = Counter()
     strong: list[VerifiedPair] = []
@@ -330,7 +275,7 @@ def _strongest(
 
 
 def _empty_copy(
-    cache: pycolmap.DatabaseCache, camera_of: Mapping[str, int] = MappingProxyType({})
+    cache: pycolmap.DatabaseCache, camera_of: Mapping[str, int]
 ) -> pycolmap.DatabaseCache:
     """Return cameras and images without pairs; some images, by name, have another camera.
 

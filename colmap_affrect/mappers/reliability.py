@@ -29,6 +29,7 @@ from colmap_affrect.mappers.adjustment import (
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import Evidence, cells, pair_evidence
 from colmap_affrect.mappers.pair_graph import (
+    MIN_NUM_MATCHES,
     Ids,
     PairGraph,
     VerifiedPair,
@@ -64,56 +65,36 @@ COEFFICIENTS = Path(__file__).with_suffix(".json")
 
 @dataclass(frozen=True)
 class Measures:
-    """What holds a photograph in a model.
-
-    Attributes:
-        evidence: of its pairs, of its features that two other images match, and of its focal
-            length, in nats.
-        agreement: share of the inliers of its pairs that agrees with the model.
-        num_three: points that it and two others see.
-        focal_growth: part by which the cost of adjustment grows with another focal length;
-            1 where somebody knows it.
-        focal_px: of its camera.
-        fitting_px: the focal length that fits, where the one that the user gave does not; else 0.
-        turned: share of the matches of its strongest pairs that a camera explains which only turns.
-        bridge: what it came in by, if that was no track.
-        original: name of the photograph that it may be a mirrored copy of, or empty.
-        zoom: longest by shortest focal length of the photographs of its size, where nobody knows
-            them: parts of photographs have longer ones, and their middle is elsewhere.
-        tied: what its tie points by hand say for its place, in nats.
-    """
+    """What holds a photograph in a model."""
 
     evidence: float
-    agreement: float
-    num_three: int
+    """Of its pairs, its features that two other images match, and its focal length, in nats."""
+    agreement: float  # share of the inliers of its pairs that agrees with the model
+    num_three: int  # points that it and two others see
     focal_growth: float
-    focal_px: float
-    fitting_px: float
-    turned: float
-    bridge: Bridge | None
-    original: str
+    """Part by which the cost of adjustment grows with another focal length; 1 of a known one."""
+    focal_px: float  # of its camera
+    fitting_px: float  # what fits, where the focal length that the user gave does not; else 0
+    turned: float  # share of the matches of its strongest pairs that a mere rotation explains
+    bridge: Bridge | None  # what it came in by, if that was no track
+    original: str  # name of the photograph that it may be a mirrored copy of, or empty
     zoom: float
-    tied: float
+    """Longest by shortest focal length of the photographs of its size, where nobody knows them:
+    parts of photographs have longer ones, and their middle is elsewhere."""
+    tied: float  # what its tie points by hand say for its place, in nats
 
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the regression.
+    """A term of the regression."""
 
-    Attributes:
-        value: the larger the surer.
-        reason: what to say where it is small.
-    """
-
-    value: Callable[[Measures], float]
-    reason: Callable[[Measures], str]
+    value: Callable[[Measures], float]  # the larger the surer
+    reason: Callable[[Measures], str]  # what to say where it is small
 
 
 def _bridge_reason(m: Measures) -> str:
-    if not m.bridge:
-        return ""
-    error = f"{m.bridge.scale_error_frac:.0%}"
-    return f"bridged by {m.bridge.by} alone, at a distance known to +-{error}"
+    text = "bridged by {} alone, at a distance known to +-{:.0%}"
+    return text.format(m.bridge.by, m.bridge.scale_error_frac) if m.bridge else ""
 
 
 TERMS: Mapping[str, Term] = {
@@ -164,17 +145,11 @@ OF_MATCHES = {"evidence", "agreement", "points of three", "bridge"}  # terms tha
 
 @dataclass(frozen=True)
 class Judgement:
-    """How sure a model is of a photograph.
+    """How sure a model is of a photograph."""
 
-    Attributes:
-        probability: that it stands right.
-        reason: what speaks most against that, empty if nothing does.
-        gain: what more matches may add to the probability.
-    """
-
-    probability: float
-    reason: str
-    gain: float = 0.0
+    probability: float  # that it stands right
+    reason: str  # what speaks most against that, empty if nothing does
+    gain: float = 0.0  # what more matches may add to the probability
 
 
 @cache
@@ -208,7 +183,7 @@ def judged(measures: Measures) -> Judgement:
 
 def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
     """Measure what holds each photograph of a model, by name."""
-    model, graph = mapped.reconstruction, graph_of(task)
+    model, graph = mapped.reconstruction, graph_of(task, MIN_NUM_MATCHES)
     poses, cameras = poses_of(model), cameras_of(model)
     used = {camera.camera_id: camera for camera in cameras.values()}
     priors = priors_of(used.values(), task.cameras)
@@ -221,29 +196,23 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             pairs_of[image_id].append(pair)
     three, long = evidence.three_view_ratios(model), num_long_tracks(model)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
-    growth, fitting_px = _focal_growths(model, task), fitting_focals(model, task)
+    growth, fitting_px = _focal_growths(model, task), _fitting_focals(model, task)
     tied = tied_evidence(tie_points_of(task, graph).residuals(model))
     zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
     found = {}
     for image_id, own in pairs_of.items():
-        shares = [agreements[pair.ids] for pair in own]
-        nats = [
-            pair_evidence(share * num, num)
-            for pair, share in zip(own, shares, strict=True)
-            if (num := evidence.num_cells(pair))
-        ]
+        shares, weights = [agreements[p.ids] for p in own], [len(p.matches) for p in own]
+        cells_of = [evidence.num_cells(pair) for pair in own]
+        nats = sum(pair_evidence(share * n, n) for share, n in zip(shares, cells_of, strict=True))
         rotations = [turned[p.ids] for p in own if p.ids in turned] or list(turned.values())
         name, camera = graph.names[image_id], cameras[image_id]
+        focal_px = float(camera.mean_focal_length())
         found[name] = Measures(
-            evidence=sum(nats)
-            + three.get(image_id, 0.0)
-            - priors[camera.camera_id].cost(camera.mean_focal_length()),
-            agreement=float(np.average(shares, weights=[len(p.matches) for p in own]))
-            if shares
-            else 1.0,
+            nats + three.get(image_id, 0.0) - priors[camera.camera_id].cost(focal_px),
+            agreement=float(np.average(shares, weights=weights)) if shares else 1.0,
             num_three=long[image_id],
             focal_growth=growth.get(camera.camera_id, 1.0),
-            focal_px=float(camera.mean_focal_length()),
+            focal_px=focal_px,
             fitting_px=fitting_px.get(camera.camera_id, 0.0),
             turned=float(np.mean(rotations)) if rotations else 0.0,
             bridge=mapped.bridges.get(name),
@@ -313,18 +282,15 @@ def _zooms(cameras: Iterable[pycolmap.Camera]) -> dict[Size, float]:
 def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
     """Return by what part the cost grows with another focal length, by id of the camera.
 
-    None of those that somebody knows.
-
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each camera that nobody knows, while all else may move.
     """
-    images = [model.images[image_id] for image_id in model.reg_image_ids()]
-    used = {image.camera_id for image in images}
-    priors = priors_of((model.cameras[key] for key in sorted(used)), task.cameras)
+    used = {camera.camera_id: camera for camera in cameras_of(model).values()}
+    priors = priors_of((used[key] for key in sorted(used)), task.cameras)
     unknown = [key for key, p in priors.items() if p.sigma > EXIF_SIGMA and key in task.cameras]
-    if not unknown or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
+    if not (unknown and _is_tried(model)):
         return {}
-    fixed = frozenset(key for key in used & task.cameras.keys() if task.cameras[key].is_fixed)
+    fixed = frozenset(k for k in used.keys() & task.cameras.keys() if task.cameras[k].is_fixed)
     is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     sparse = _with_fewer_points(model)
@@ -340,15 +306,15 @@ def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[in
     return {key: value for keys, value in growths for key in keys}
 
 
-def fitting_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+def _fitting_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
     """Return the focal length that fits, by id of the cameras of which the user gave another one.
 
     None where freeing them lowers the cost by less than free parameters are worth: half the
     logarithm of the number of observations each, of which those in one cell of an image count once.
     """
-    used = {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
+    used = {camera.camera_id for camera in cameras_of(model).values()}
     given = {key for key in used & task.cameras.keys() if "focal" in task.cameras[key].given}
-    if not given or model.num_reg_images() > MAX_NUM_IMAGES or model.num_points3D() == 0:
+    if not (given and _is_tried(model)):
         return {}
     priors = priors_of(model.cameras.values(), task.cameras)
     free = priors | {key: FocalPrior(priors[key].focal_px, FREE_SIGMA) for key in given}
@@ -364,13 +330,16 @@ def fitting_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[in
     return {k: px for k, px in found.items() if abs(math.log(px / priors[k].focal_px)) > MIN_MOVE}
 
 
+def _is_tried(model: pycolmap.Reconstruction) -> bool:
+    return model.num_reg_images() <= MAX_NUM_IMAGES and model.num_points3D() > 0
+
+
 def _num_cells(model: pycolmap.Reconstruction) -> int:
     """Return how many cells of all images of a model hold observations."""
     total = 0
-    for image_id in model.reg_image_ids():
-        image = model.images[image_id]
-        points = np.array([p.xy for p in image.get_observation_points2D()]).reshape(-1, 2)
-        total += cells(model.cameras[image.camera_id], points)
+    for image_id, camera in cameras_of(model).items():
+        seen = [p.xy for p in model.images[image_id].get_observation_points2D()]
+        total += cells(camera, np.array(seen).reshape(-1, 2))
     return total
 
 
@@ -390,8 +359,7 @@ def _scaled(
 ) -> pycolmap.Reconstruction:
     """Return a copy with other focal lengths of some cameras."""
     copy = pycolmap.Reconstruction(model)
-    for key in cameras:
-        camera = copy.cameras[key]
+    for camera in map(copy.camera, cameras):
         for index in camera.focal_length_idxs():
             camera.params[index] *= factor
     return copy

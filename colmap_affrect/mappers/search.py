@@ -7,17 +7,19 @@ bridges add images to them. One number chooses: how much the verified pairs spea
 
 import math
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.adjustment import EXIF_SIGMA, MEDIUM, Adjuster, FocalPrior
 from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.bridging import Bridges
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
-from colmap_affrect.mappers.growing import Grower, Joiner, Models
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, cameras_of, poses_of
+from colmap_affrect.mappers.growing import Grower, join
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, cameras_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 ZOOMS = 1.0, 1.4, 0.7, 2.0
@@ -27,6 +29,8 @@ SHARED_SIGMA = 0.1
 these images do not tell it."""
 SAME_FOCAL = 0.03  # of the logarithm: bridges built with one are right with the other
 NUM_STARTS = 3
+
+Models = list[pycolmap.Reconstruction]
 
 
 @dataclass(frozen=True)
@@ -41,9 +45,9 @@ class Search:
     num_starts: int = NUM_STARTS
     """Models from which bridges are built in turn; with 0 there are none, and one try."""
 
-    def grower(self, graph: PairGraph, adjuster: Adjuster | None = None) -> Grower:
+    def grower(self, graph: PairGraph) -> Grower:
         """Return what grows models of a graph."""
-        return Grower(graph.cache, adjuster or self.adjuster, self.native, self.show)
+        return Grower(graph, self.adjuster, self.native, self.show)
 
     def evidence_of(self, models: Sequence[MappedModel]) -> float:
         """Return the evidence of the best of some models."""
@@ -59,46 +63,36 @@ class Search:
         """
         if start:
             return self._beyond(graph, start)
-        best: list[MappedModel] = []
-        most = -math.inf
+        best, most, grower = list[MappedModel](), -math.inf, self.grower(graph)
         zooms = ZOOMS if self.num_starts else ZOOMS[:1]
-        usual = [self._near(zoom) for zoom in zooms] if self._shared else [self.adjuster]
+        usual = [self._near(zoom) for zoom in zooms] if self._shared else [self]
         left = usual.copy()
         while left:
-            adjuster = left.pop(0)
-            grower = self.grower(graph, adjuster)
-            found = self.joined(graph, adjuster, self._grown(graph, grower), self.num_starts)
+            near = left.pop(0)
+            found = near.joined(graph, near._grown(graph))
             if not found:
                 continue
             model = found[0].reconstruction
             if self.unknown:
-                self.grower(graph).finish(model, MEDIUM)
-            evidence = self.evidence.of(model)
-            agrees = self._agrees(adjuster, model)
-            evidence += MIN_GAIN * agrees  # with others, bridges are of the wrong length
+                grower.finish(model, MEDIUM)
+            agrees = near._agrees(model)  # with other focal lengths, bridges are of wrong length
+            evidence = self.evidence.of(model) + MIN_GAIN * agrees
             if evidence > most:
                 most, best = evidence, found
-                if adjuster in usual and not agrees:
+                if near in usual and not agrees:
                     left.insert(0, self._as_found(model))
             if self.is_certain(model, graph, agrees=agrees):
                 break
         for mapped in best:
-            self.grower(graph).finish(mapped.reconstruction)
+            grower.finish(mapped.reconstruction)
         return best
 
-    def with_own_cameras(
-        self, graph: PairGraph, model: pycolmap.Reconstruction
-    ) -> pycolmap.Reconstruction:
-        """Return a model with the cameras of the graph that begins with those of another one."""
-        grower = self.grower(graph)
-        return grower.placed(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
-
     def _beyond(self, graph: PairGraph, start: pycolmap.Reconstruction) -> list[MappedModel]:
-        near = replace(self, adjuster=self._as_found(start))
-        grower, again = near.grower(graph), pycolmap.Reconstruction(start)
+        near, again = self._as_found(start), pycolmap.Reconstruction(start)
+        grower = near.grower(graph)
         grower.finish(again)
-        models = sorted([again, *near._grown(graph, grower)], key=self.evidence.of, reverse=True)
-        found = near.joined(graph, near.adjuster, models, self.num_starts)
+        models = sorted([again, *near._grown(graph)], key=self.evidence.of, reverse=True)
+        found = near.joined(graph, models)
         for model in found:
             grower.finish(model.reconstruction)
         return found
@@ -127,63 +121,59 @@ class Search:
         counts = Counter(camera.camera_id for camera in self.evidence.graph.cameras.values())
         return {key for key in self.unknown if counts[key] > 1}
 
-    def _near(self, zoom: float) -> Adjuster:
+    def _near(self, zoom: float) -> Self:
         """Return what keeps unknown focal lengths near the usual one times a factor."""
+        sigmas = {k: min(SHARED_SIGMA, self.unknown[k].sigma) for k in self._shared}
         near = {
-            key: FocalPrior(
-                zoom * prior.focal_px,
-                min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma,
-            )
+            key: FocalPrior(zoom * prior.focal_px, sigmas.get(key, prior.sigma))
             for key, prior in self.unknown.items()
         }
-        return replace(self.adjuster, priors={**self.adjuster.priors, **near})
+        return self._with_priors(near)
 
-    def _as_found(self, model: pycolmap.Reconstruction) -> Adjuster:
+    def _as_found(self, model: pycolmap.Reconstruction) -> Self:
         """Return what keeps unknown focal lengths near those of a model."""
-        near = {
-            key: FocalPrior(model.cameras[key].mean_focal_length(), SHARED_SIGMA)
-            for key in self._unknown_in(model)
-        }
-        return replace(self.adjuster, priors={**self.adjuster.priors, **near})
+        focals = self._unknown_focals(model).items()
+        return self._with_priors({key: FocalPrior(px, SHARED_SIGMA) for key, px in focals})
 
-    def _agrees(self, adjuster: Adjuster, model: pycolmap.Reconstruction) -> bool:
+    def _with_priors(self, priors: Mapping[int, FocalPrior]) -> Self:
+        together = {**self.adjuster.priors, **priors}
+        return replace(self, adjuster=replace(self.adjuster, priors=together))
+
+    def _agrees(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether unknown focal lengths ended near those with which a model was made."""
         return all(
-            abs(math.log(model.cameras[key].mean_focal_length() / adjuster.priors[key].focal_px))
-            <= SAME_FOCAL
-            for key in self._unknown_in(model)
+            abs(math.log(focal_px / self.adjuster.priors[key].focal_px)) <= SAME_FOCAL
+            for key, focal_px in self._unknown_focals(model).items()
         )
 
-    def _unknown_in(self, model: pycolmap.Reconstruction) -> set[int]:
-        """Return the cameras of the registered images that nobody knows."""
-        used = {camera.camera_id for camera in cameras_of(model).values()}
-        return used & self.unknown.keys()
+    def _unknown_focals(self, model: pycolmap.Reconstruction) -> dict[int, float]:
+        """Return the focal lengths of the used cameras that nobody knows, by id of the camera."""
+        used = {camera.camera_id: camera for camera in cameras_of(model).values()}
+        return {k: used[k].mean_focal_length() for k in used.keys() & self.unknown.keys()}
 
-    def joined(
-        self, graph: PairGraph, adjuster: Adjuster, models: Models, num_starts: int
-    ) -> list[MappedModel]:
+    def joined(self, graph: PairGraph, models: Models) -> list[MappedModel]:
         """Return the best model that bridges make of one of some, and those left out of it."""
         if not models:
             return []
-        if not num_starts or graph.is_explained_by(models[0]):
+        if not self.num_starts or graph.is_explained_by(models[0]):
             return [MappedModel(models[0])]
-        grower = self.grower(graph, adjuster)
-        joiner = Joiner(graph, grower, self.evidence)
-        joined = [joiner.join(model) for model in models[:num_starts]]
-        best, bridges = max(joined, key=lambda pair: self.evidence.of(pair[0]))
-        found, inside = [MappedModel(best, bridges)], set(best.reg_image_ids())
+        grower, bridges = self.grower(graph), Bridges(graph, self.native.random_seed)
+        starts = models[: self.num_starts]
+        joined = [join(model, bridges, grower, self.evidence) for model in starts]
+        best = max(joined, key=lambda mapped: self.evidence.of(mapped.reconstruction))
+        found, inside = [best], set(best.reconstruction.reg_image_ids())
         for model in models:
             if len(set(model.reg_image_ids()) - inside) > 1:
                 found.append(MappedModel(model))
                 inside.update(model.reg_image_ids())
         return found
 
-    def _grown(self, graph: PairGraph, grower: Grower) -> Models:
+    def _grown(self, graph: PairGraph) -> Models:
         """Return models of different images, that with most evidence first."""
         models: dict[frozenset[int], tuple[float, pycolmap.Reconstruction]] = {}
         best, in_vain = 0.0, 0
         pairs = sorted(graph.pairs, key=lambda pair: -len(pair.matches))
-        with closing(_in_order(grower, [pair.ids for pair in pairs])) as grown:
+        with closing(_in_order(self.grower(graph), [pair.ids for pair in pairs])) as grown:
             for model in grown:
                 images, evidence = frozenset(model.reg_image_ids()), self.evidence.of(model)
                 in_vain = 0 if evidence > best + MIN_GAIN else in_vain + 1

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,11 +58,9 @@ def largest_snapshot(folder: Path) -> Path | None:
     """Return the complete snapshot with most images, of several the newest."""
     found: list[tuple[int, str, Path]] = []
     for path in folder.iterdir():
-        try:
+        with suppress(StoreError):
             require_intact(path)
             found.append((len(registered_names(path)), path.name, path))
-        except StoreError:
-            continue
     if not found:
         return None
     num_images, _, path = max(found)
@@ -72,14 +70,7 @@ def largest_snapshot(folder: Path) -> Path | None:
 
 def drop_old_snapshots(folder: Path) -> None:
     """Remove all but the newest snapshots of the largest models."""
-    folders = [path for path in folder.iterdir() if path.is_dir()]
-    if len(folders) <= NUM_KEPT:
-        return
-    newest = max(folders, key=lambda path: path.name)  # may still be written
-    complete = sorted(
-        ((path / "frames.bin").stat().st_size, path.name, path)
-        for path in folders
-        if path != newest and (path / "frames.bin").exists()
-    )
-    for _, _, path in complete[: -(NUM_KEPT - 1)]:
-        remove_own([path])
+    older = sorted(path for path in folder.iterdir() if path.is_dir())[:-1]
+    complete = [path for path in older if (path / "frames.bin").exists()]  # the newest may be not
+    complete.sort(key=lambda path: ((path / "frames.bin").stat().st_size, path.name))
+    remove_own(complete[: -(NUM_KEPT - 1)])

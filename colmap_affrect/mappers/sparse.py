@@ -2,22 +2,24 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA, FAST, NOISE_PX, Adjuster, priors_of
+from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, priors_of
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
-from colmap_affrect.mappers.moves import MOVES
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, graph_of, poses_of
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
+MEASURED_PAIRS = "with the pairs of measured frames"  # others also verify sides that look the same
+ALL_PAIRS = "with all pairs"
 SOME_TRACKS = "from some of the tracks"  # the move that makes easy models
 AGAIN = "after pairs were matched again"
 OWN_CAMERAS = "with a camera for each photograph"
@@ -66,10 +68,9 @@ class SparseMapper(IncrementalMapper):
             is_whole = found and graph.is_explained_by(found[0].reconstruction)
             if is_whole and not task.tie_points:
                 return found
-            search = self._search(task, graph, native, shown)
+            search = replace(self._search(task, graph, native, shown), num_starts=1)
             models = sorted((m.reconstruction for m in found), key=search.evidence.of, reverse=True)
-            best = search.joined(graph, search.adjuster, models, num_starts=1)
-            best = _joined_by_hand(search, graph, best)
+            best = _joined_by_hand(search, graph, search.joined(graph, models))
             if task.extend:
                 for model in best:
                     task.extend.restore(model.reconstruction)
@@ -91,25 +92,18 @@ class SparseMapper(IncrementalMapper):
         show: Callable[[int], None],
     ) -> Search:
         priors = priors_of(graph.cameras.values(), task.cameras)
+        constant, frames = frozenset[int](), frozenset[int]()
         if self.options.keep_given_intrinsics:
-            constant = {key for key, record in task.cameras.items() if record.is_fixed}
+            constant = frozenset(key for key, record in task.cameras.items() if record.is_fixed)
         else:
-            constant = set()
             priors = {k: replace(p, sigma=p.sigma or EXIF_SIGMA) for k, p in priors.items()}
-        frames: set[int] = set()
         if task.extend:
             task.extend.constrain(native)
             constant |= native.constant_cameras
             if not task.extend.refine:
-                frames = {image.frame_id for image in task.extend.images}
-        adjuster = Adjuster(
-            priors,
-            self.options.noise_px,
-            native.get_global_bundle_adjustment(),
-            frozenset(constant),
-            frozenset(frames),
-            tie_points_of(task, graph),
-        )
+                frames = frozenset(image.frame_id for image in task.extend.images)
+        refining, tie_points = native.get_global_bundle_adjustment(), tie_points_of(task, graph)
+        adjuster = Adjuster(priors, self.options.noise_px, refining, constant, frames, tie_points)
         return Search(adjuster, Evidence(graph, priors), native, self.options.num_seeds, show)
 
     def _best(
@@ -135,12 +129,13 @@ class SparseMapper(IncrementalMapper):
         unmeasured = {(min(pair), max(pair)) for pair in pairs}
         best = _again(search, graph, task.before) if task.before else []
         most = search.evidence_of(best)
-        for name, move in MOVES.items():
+        measured = {MEASURED_PAIRS: unmeasured} if unmeasured else {}
+        for name, left_out in {**measured, ALL_PAIRS: set[Ids]()}.items():
             start = best[0].reconstruction if best else None
             if start and search.is_certain(start, graph):
                 break
-            reduced = move(graph, unmeasured)
-            if reduced is None or (start and reduced.is_explained_by(start)):
+            reduced = graph.without(left_out)
+            if start and reduced.is_explained_by(start):
                 continue
             models = [] if start else _of_some_tracks(search, reduced, graph)
             models = models or search.best(reduced, start)
@@ -150,16 +145,13 @@ class SparseMapper(IncrementalMapper):
             moves = (*(best[0].moves if best else ()), name, *models[0].moves)
             best, most = [replace(model, moves=moves) for model in models], evidence
             if is_sharing:
-                same = move(own[0], unmeasured) or own[0]
-                model = _with_own_cameras(own[1], same, search, best[0])
+                model = _with_own_cameras(own[1], own[0].without(left_out), search, best[0])
                 if model and own[1].evidence.of(model) > most + MIN_GAIN:
                     is_sharing, (graph, search) = False, own
                     first = replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))
                     inside = set(model.reg_image_ids())
-                    others = (
-                        m for m in best[1:] if inside.isdisjoint(m.reconstruction.reg_image_ids())
-                    )
-                    best = [first, *others]
+                    apart = (inside.isdisjoint(m.reconstruction.reg_image_ids()) for m in best[1:])
+                    best = [first, *compress(best[1:], apart)]
                     most = search.evidence_of(best)
         if not best and is_sharing:
             return self._best(replace(task, may_share=False), own[0], native, show)
@@ -174,10 +166,8 @@ def _joined_by_hand(
 
 def _again(search: Search, graph: PairGraph, before: MappedModel) -> list[MappedModel]:
     """Return a model with the poses of one before, and all that now joins it."""
-    found = before.reconstruction
-    grower, empty = search.grower(graph), pycolmap.Reconstruction()
-    model = grower.placed(poses_of(found), cameras_of(found), empty)
-    joined = search.joined(graph, search.adjuster, [model], num_starts=1)
+    grower = search.grower(graph)
+    joined = search.joined(graph, [grower.again(before.reconstruction)])
     for mapped in joined:
         grower.finish(mapped.reconstruction)
     return [replace(m, moves=tuple(dict.fromkeys((*before.moves, AGAIN)))) for m in joined]
@@ -189,12 +179,13 @@ def _with_own_cameras(
     """Return a model with a camera for each image; None where some tracks already tell against."""
     thin, model = graph.thinned(), found.reconstruction
     if thin is not graph:
-        trial = own.with_own_cameras(thin, model)
+        trial = own.grower(thin).again(model)
         before, after = (replace(s.evidence, graph=thin) for s in (shared, own))
         if after.of(trial) <= before.of(model) + MIN_GAIN:
             return None
-    model = own.with_own_cameras(graph, model)
-    own.grower(graph).finish(model)
+    grower = own.grower(graph)
+    model = grower.again(model)
+    grower.finish(model)
     return model
 
 
@@ -211,5 +202,5 @@ def _of_some_tracks(search: Search, reduced: PairGraph, graph: PairGraph) -> lis
     has_all = models and models[0].reconstruction.num_reg_images() == len(graph.keypoints)
     if not has_all or not quick.is_certain(models[0].reconstruction, graph):
         return []
-    search.grower(reduced).fill(models[0].reconstruction, FAST)  # poses are right
+    search.grower(reduced).fill(models[0].reconstruction)  # poses are right
     return [replace(models[0], moves=(SOME_TRACKS,))]

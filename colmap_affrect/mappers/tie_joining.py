@@ -59,7 +59,7 @@ class TieJoiner:
             if moved is not None:
                 yield poses_of(moved), cameras_of(moved)
         elsewhere = {i for m in (model, *others) for i in m.reg_image_ids()}
-        for image in self.grower.cache.images.values():
+        for image in self.grower.graph.cache.images.values():
             if image.image_id not in elsewhere:
                 found = self._registered(image, model, places)
                 if found:
@@ -92,7 +92,7 @@ class TieJoiner:
         points, known = (np.array([at[name] for name in names]) for at in (marks, places))
         key = image.camera_id
         is_used = key in {camera.camera_id for camera in cameras_of(model).values()}
-        camera = copy.copy((model if is_used else self.grower.cache).cameras[key])
+        camera = copy.copy((model if is_used else self.grower.graph.cache).cameras[key])
         prior = self.grower.adjuster.priors[key]
         is_open = not is_used and prior.sigma > EXIF_SIGMA
         estimation = pycolmap.AbsolutePoseEstimationOptions(ransac=self._ransac(AGREEING_PX))

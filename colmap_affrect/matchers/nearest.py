@@ -74,45 +74,32 @@ class NearestNeighbors:
 
     def prepare(self, image: ImageFeatures) -> MatchableImage:
         """Make the features of an image ready for matching."""
-        descriptors, keypoints = image.features.descriptors, image.features.keypoints
-        return matchable(descriptors, keypoints, self.options, is_coarse=self._is_coarse)
+        descriptors = np.ascontiguousarray(image.features.descriptors, dtype=np.float32)
+        keypoints = image.features.keypoints
+        rivals = neighbors_within(keypoints, self.options.min_contrast_distance_px)
+        coarse = CoarseDescriptors.of(descriptors) if self._is_coarse else None
+        return MatchableImage(descriptors, keypoints, rivals, coarse)
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
-        """Match two images."""
-        return match_features(first, second, self.options)
-
-
-def matchable(
-    descriptors: Floats, keypoints: Floats, options: NearestOptions, *, is_coarse: bool = False
-) -> MatchableImage:
-    """Prepare (N, D) unit descriptors at (N, 2) px; all images are coarse, or none."""
-    descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
-    rivals = neighbors_within(keypoints, options.min_contrast_distance_px)
-    coarse = CoarseDescriptors.of(descriptors) if is_coarse else None
-    return MatchableImage(descriptors, keypoints, rivals, coarse)
-
-
-def match_features(
-    image1: MatchableImage, image2: MatchableImage, options: NearestOptions
-) -> Matches:
-    """Match two images, with or without features; scores are 1 - the larger ratio of distances."""
-    if not len(image1.descriptors) or not len(image2.descriptors):
-        return Matches.none()
-    everything = np.arange(len(image1.descriptors))
-    forward, ratios = _nearest(image1, everything, image2, options.max_ratio)
-    rows = np.flatnonzero(ratios < options.max_ratio)
-    targets, back = np.unique(forward[rows], return_inverse=True)
-    back_limit = options.max_ratio if options.ratio_both_ways else NO_LIMIT
-    backward, back_ratios = _nearest(image2, targets, image1, back_limit)
-    worst = ratios[rows]
-    if options.ratio_both_ways:
-        worst = np.maximum(worst, back_ratios[back])
-    keep = (backward[back] == rows) & (worst < options.max_ratio)
-    rows, columns, worst = rows[keep], targets[back][keep], worst[keep]
-    order = np.argsort(worst, kind="stable")
-    places = image1.keypoints[rows[order]], image2.keypoints[columns[order]]
-    kept = np.sort(order[without_duplicates(*places, options.duplicate_radius_px)])
-    return Matches(np.stack([rows, columns], axis=1)[kept], 1.0 - worst[kept])
+        """Match two images; scores are 1 - the larger ratio of distances."""
+        options = self.options
+        if not len(first.descriptors) or not len(second.descriptors):
+            return Matches.none()
+        everything = np.arange(len(first.descriptors))
+        forward, ratios = _nearest(first, everything, second, options.max_ratio)
+        rows = np.flatnonzero(ratios < options.max_ratio)
+        targets, back = np.unique(forward[rows], return_inverse=True)
+        back_limit = options.max_ratio if options.ratio_both_ways else NO_LIMIT
+        backward, back_ratios = _nearest(second, targets, first, back_limit)
+        worst = ratios[rows]
+        if options.ratio_both_ways:
+            worst = np.maximum(worst, back_ratios[back])
+        keep = (backward[back] == rows) & (worst < options.max_ratio)
+        rows, columns, worst = rows[keep], targets[back][keep], worst[keep]
+        order = np.argsort(worst, kind="stable")
+        places = first.keypoints[rows[order]], second.keypoints[columns[order]]
+        kept = np.sort(order[without_duplicates(*places, options.duplicate_radius_px)])
+        return Matches(np.stack([rows, columns], axis=1)[kept], 1.0 - worst[kept])
 
 
 def _nearest(

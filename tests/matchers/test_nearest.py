@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from colmap_affrect.matchers.base import Matches
-from colmap_affrect.matchers.nearest import NearestOptions, match_features, matchable
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
+from colmap_affrect.matchers.nearest import NearestNeighbors, NearestOptions
 
 RATIO_ERROR = 2e-3
 """Ratios are roots of differences of float32 cosines near 1: sqrt(1e-7) where a distance is 0."""
@@ -85,7 +87,15 @@ def slow_matches(
 
 def run(first: Features, second: Features, options: NearestOptions) -> Matches:
     """Match two sets of (descriptors, keypoints)."""
-    return match_features(matchable(*first, options), matchable(*second, options), options)
+    matcher = NearestNeighbors(options, MatcherContext())
+    return matcher.match(*(matcher.prepare(image_of(*view)) for view in (first, second)))
+
+
+def image_of(descriptors: NDArray[np.float32], keypoints: NDArray[np.float64]) -> ImageFeatures:
+    """Circles at (N, 2) px."""
+    ones = np.ones(len(keypoints))
+    lafs = lafs_from_keypoints(keypoints, ones, ones)
+    return ImageFeatures(LocalFeatures(lafs, ones.astype(np.float32), descriptors), (99, 99), "")
 
 
 @given(

@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.matchers import nearest_8bit as coarse
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
-from colmap_affrect.matchers.nearest import (
-    NearestNeighbors,
-    NearestOptions,
-    match_features,
-    matchable,
-)
+from colmap_affrect.matchers.nearest import NearestNeighbors, NearestOptions
 from colmap_affrect.matchers.nearest_8bit import coarse_pays, has_fast_8_bit_products
 
 
@@ -54,9 +49,14 @@ def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArra
 
 def require_exact(views: list[tuple[NDArray, NDArray]], options: NearestOptions) -> int:
     """Compare with the matches of exact similarities; return how many there are."""
-    exact = match_features(*(matchable(*view, options) for view in views), options)
-    images = (matchable(*view, options, is_coarse=True) for view in views)
-    found = match_features(*images, options)
+    images = []
+    for descriptors, places in views:
+        lafs = np.dstack([np.broadcast_to(np.eye(2), (len(places), 2, 2)), places])
+        features = LocalFeatures(lafs, np.ones(len(places), np.float32), descriptors)
+        images.append(ImageFeatures(features, (99, 99), ""))
+    matchers = [NearestNeighbors(options, MatcherContext()) for _ in range(2)]
+    matchers[0]._is_coarse = True
+    found, exact = (matcher.match(*map(matcher.prepare, images)) for matcher in matchers)
     np.testing.assert_array_equal(found.indices, exact.indices)
     np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
     return len(exact.indices)
