@@ -79,8 +79,7 @@ class Adjuster:
         for key, camera in model.cameras.items():
             prior = self.priors.get(key)
             if prior and prior.sigma and key not in self.constant:
-                for index in camera.focal_length_idxs():
-                    camera.params[index] = prior.focal_px
+                camera.params[list(camera.focal_length_idxs())] = prior.focal_px
 
     def adjust(
         self,

@@ -161,16 +161,14 @@ class _Call:
     def _map(
         self, token: pycolmap.CancellationToken, input_path: Path | None = None
     ) -> list[pycolmap.Reconstruction]:
-        def begun() -> None:  # also called for a model that is gone on with
-            self._add(0 if input_path else 2)
-
+        first = 0 if input_path else 2  # of a model that is gone on with it is told, too
         models = pycolmap.incremental_mapping(
             self.database_path,
             self.task.colors_path,
             self.output_path,
             options=self.options,
             input_path=input_path or "",
-            initial_image_pair_callback=begun,
+            initial_image_pair_callback=lambda: self._add(first),
             next_image_callback=lambda: self._add(1),
             cancellation_token=token,
         )

@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.model_files import Pose, relative_pose
 from colmap_affrect.colmap.two_views import Cameras, decomposed_homography, homography_matrix
 from colmap_affrect.colmap.verification import connected_parts
@@ -56,11 +56,6 @@ class VerifiedPair:
     matches: Indices  # (M, 2) features that are inliers
     geometry: pycolmap.TwoViewGeometry  # of the pair in the database
 
-    def some_matches(self) -> Self:
-        """Return the pair with ``MAX_MATCHES`` of its inliers at most, spread over all."""
-        step = -(-len(self.matches) // MAX_MATCHES)
-        return replace(self, matches=self.matches[::step])
-
 
 Pairs = tuple[VerifiedPair, ...]
 
@@ -90,8 +85,8 @@ class PairGraph:
     def read(cls, path: Path, min_num_matches: int = MIN_NUM_MATCHES) -> Self:
         """Read the pairs with at least as many inliers, and all images."""
         with open_database(path) as database:
-            images = {image.image_id: image for image in database.read_all_images()}
-            cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+            names = {image.image_id: image.name for image in database.read_all_images()}
+            cameras = cameras_of_images(database)
             verified = [
                 VerifiedPair(
                     pycolmap.pair_id_to_image_pair(pair_id),
@@ -109,9 +104,7 @@ class PairGraph:
                 image_id: np.array(database.read_keypoints(image_id)[:, :2], np.float32)
                 for image_id in {image_id for pair in verified for image_id in pair.ids}
             }
-        names = {image_id: image.name for image_id, image in images.items()}
-        of_images = {image_id: cameras[image.camera_id] for image_id, image in images.items()}
-        return cls(cache, names, of_images, keypoints, *_strongest(verified), min_num_matches)
+        return cls(cache, names, cameras, keypoints, *_strongest(verified), min_num_matches)
 
     def without(self, ids: Collection[Ids]) -> Self:
         """Leave out some pairs; itself where there are none."""
@@ -162,11 +155,14 @@ class PairGraph:
         strong, weak = _strongest(kept)
         return replace(self, cache=new, keypoints=keypoints, pairs=strong, weak=weak)
 
-    def points(self, pair: VerifiedPair) -> tuple[Array, Array]:
-        """Return the (M, 2) px of the inliers in both images."""
-        both = (self.keypoints[i][rows] for i, rows in zip(pair.ids, pair.matches.T, strict=True))
-        first, second = (points.astype(np.float64) for points in both)
+    def points(self, pair: VerifiedPair, step: int = 1) -> tuple[Array, Array]:
+        """Return the (M, 2) px in both images of the inliers, or of every so many."""
+        columns = zip(pair.ids, pair.matches[::step].T, strict=True)
+        first, second = (self.keypoints[i][rows].astype(np.float64) for i, rows in columns)
         return first, second
+
+    def _some_points(self, pair: VerifiedPair) -> tuple[Array, Array]:
+        return self.points(pair, -(-len(pair.matches) // MAX_MATCHES))
 
     def pairs_inside(self, image_ids: Collection[int]) -> list[VerifiedPair]:
         """Return the pairs both of whose images are among some."""
@@ -177,7 +173,7 @@ class PairGraph:
         """Return the share of the inliers of a pair that agree with the poses of its images."""
         first, second = pair.ids
         pose, both = relative_pose(poses[first], poses[second]), (cameras[first], cameras[second])
-        return float(_agrees(pose, both, self.points(pair.some_matches()))[0].mean())
+        return float(_agrees(pose, both, self._some_points(pair))[0].mean())
 
     def is_explained_by(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model has all images of all pairs, and no pair contradicts it."""
@@ -207,9 +203,7 @@ class PairGraph:
             max_error=MAX_ERROR_PX, max_num_trials=MAX_TRIALS, random_seed=max(random_seed, 0)
         )
         # Not by a two-view geometry, which where a fundamental matrix has more inliers is that.
-        found: Any = pycolmap.estimate_essential_matrix(
-            *self.points(pair.some_matches()), *both, options
-        )
+        found: Any = pycolmap.estimate_essential_matrix(*self._some_points(pair), *both, options)
         candidates = []
         if found and found.get("cam2_from_cam1") is not None:
             matrix = found["cam2_from_cam1"].matrix()

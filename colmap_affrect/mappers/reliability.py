@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -153,11 +154,10 @@ class Judgement:
 
 
 @cache
-def _coefficients() -> tuple[float, dict[str, tuple[float, float]]]:
+def _coefficients() -> dict[str, Any]:
     """Return the constant, and of each term the weight and what right photographs usually have."""
-    content = json.loads(COEFFICIENTS.read_text(encoding="utf-8"))
-    terms = content["terms"].items()
-    return content["constant"], {name: (term["weight"], term["usual"]) for name, term in terms}
+    content: dict[str, Any] = json.loads(COEFFICIENTS.read_text(encoding="utf-8"))
+    return content
 
 
 def judge(mapped: MappedModel, task: MappingTask) -> dict[str, Judgement]:
@@ -167,13 +167,12 @@ def judge(mapped: MappedModel, task: MappingTask) -> dict[str, Judgement]:
 
 def judged(measures: Measures) -> Judgement:
     """Return the probability that a photograph stands right, and what takes most from it."""
-    constant, weights = _coefficients()
-    log_odds, left = constant + measures.tied, 0.0
+    log_odds, left = _coefficients()["constant"] + measures.tied, 0.0
     losses = [(-measures.tied, "its tie points disagree")]
-    for name, (weight, usual) in weights.items():
+    for name, fitted in _coefficients()["terms"].items():
         value = TERMS[name].value(measures)
-        log_odds += weight * value
-        losses.append((weight * (usual - value), TERMS[name].reason(measures)))
+        log_odds += fitted["weight"] * value
+        losses.append((fitted["weight"] * (fitted["usual"] - value), TERMS[name].reason(measures)))
         left += max(0.0, losses[-1][0]) * (name in OF_MATCHES)
     worst = sorted((loss for loss in losses if loss[0] >= MIN_LOSS), reverse=True)
     reasons = [text for _, text in (worst or [max(losses)])[:NUM_REASONS]]
@@ -196,7 +195,8 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             pairs_of[image_id].append(pair)
     three, long = evidence.three_view_ratios(model), num_long_tracks(model)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
-    growth, fitting_px = _focal_growths(model, task), _fitting_focals(model, task)
+    growth = _focal_growths(model, task, priors)
+    fitting_px = _fitting_focals(model, task, priors)
     tied = tied_evidence(tie_points_of(task, graph).residuals(model))
     zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
     found = {}
@@ -279,18 +279,19 @@ def _zooms(cameras: Iterable[pycolmap.Camera]) -> dict[Size, float]:
     return {size: max(focals) / min(focals) for size, focals in of_size.items()}
 
 
-def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+def _focal_growths(
+    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, FocalPrior]
+) -> dict[int, float]:
     """Return by what part the cost grows with another focal length, by id of the camera.
 
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each camera that nobody knows, while all else may move.
     """
-    used = {camera.camera_id: camera for camera in cameras_of(model).values()}
-    priors = priors_of((used[key] for key in sorted(used)), task.cameras)
-    unknown = [key for key, p in priors.items() if p.sigma > EXIF_SIGMA and key in task.cameras]
+    known = sorted(priors.keys() & task.cameras.keys())
+    unknown = [key for key in known if priors[key].sigma > EXIF_SIGMA]
     if not (unknown and _is_tried(model)):
         return {}
-    fixed = frozenset(k for k in used.keys() & task.cameras.keys() if task.cameras[k].is_fixed)
+    fixed = frozenset(key for key in known if task.cameras[key].is_fixed)
     is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     sparse = _with_fewer_points(model)
@@ -306,18 +307,19 @@ def _focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[in
     return {key: value for keys, value in growths for key in keys}
 
 
-def _fitting_focals(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+def _fitting_focals(
+    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, FocalPrior]
+) -> dict[int, float]:
     """Return the focal length that fits, by id of the cameras of which the user gave another one.
 
     None where freeing them lowers the cost by less than free parameters are worth: half the
     logarithm of the number of observations each, of which those in one cell of an image count once.
     """
-    used = {camera.camera_id for camera in cameras_of(model).values()}
-    given = {key for key in used & task.cameras.keys() if "focal" in task.cameras[key].given}
+    known = priors.keys() & task.cameras.keys()
+    given = {key for key in known if "focal" in task.cameras[key].given}
     if not (given and _is_tried(model)):
         return {}
-    priors = priors_of(model.cameras.values(), task.cameras)
-    free = priors | {key: FocalPrior(priors[key].focal_px, FREE_SIGMA) for key in given}
+    free = {**priors} | {key: FocalPrior(priors[key].focal_px, FREE_SIGMA) for key in given}
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=False)
     held, freed = _with_fewer_points(model), _with_fewer_points(model)
     before = Adjuster(priors, NOISE_PX, refining, frozenset(given)).adjust(held, FINAL)
@@ -360,6 +362,5 @@ def _scaled(
     """Return a copy with other focal lengths of some cameras."""
     copy = pycolmap.Reconstruction(model)
     for camera in map(copy.camera, cameras):
-        for index in camera.focal_length_idxs():
-            camera.params[index] *= factor
+        camera.params[list(camera.focal_length_idxs())] *= factor
     return copy

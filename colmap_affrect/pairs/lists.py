@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.geometry.arrays import Bools, Indices, Singles
+from colmap_affrect.geometry.arrays import Bools
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
 
@@ -111,10 +111,13 @@ def most_similar_pairs(
     similar pairs of all. ``similarities`` has for each of N images its (N,) similarities with all.
     """
     half, count = -(-num_neighbors // 2), len(names)
-    candidates = [
-        _candidates(index, row.astype(np.float32), CANDIDATES_PER_NEIGHBOR * num_neighbors)
-        for index, row in enumerate(similarities)
-    ]
+    candidates = []
+    for index, row in enumerate(similarities):
+        values = row.astype(np.float32)
+        order = np.argsort(-values, kind="stable")
+        others = order[order != index][: CANDIDATES_PER_NEIGHBOR * num_neighbors]
+        both = np.minimum(others, index), np.maximum(others, index)
+        candidates.append((*both, values[others], np.arange(len(others))))
     if not candidates:
         return []
     indices1, indices2, similarity, rank = (
@@ -128,20 +131,6 @@ def most_similar_pairs(
     return sorted(
         (min(names[i], names[j]), max(names[i], names[j]))
         for i, j in zip(indices1[chosen], indices2[chosen], strict=True)
-    )
-
-
-def _candidates(
-    index: int, row: Singles, max_num: int
-) -> tuple[Indices, Indices, Singles, Indices]:
-    """Return the smaller and larger indices, similarities and ranks of an image's best pairs."""
-    order = np.argsort(-row, kind="stable")
-    others = order[order != index][:max_num]
-    return (
-        np.minimum(others, index),
-        np.maximum(others, index),
-        row[others],
-        np.arange(len(others)),
     )
 
 

@@ -87,25 +87,15 @@ def terms(state: PairState, wins: int, losses: int) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class ExpectedGain:
-    """The pairs of a set as they are now, and what a level may bring to them.
+    """The pairs of a set as they are now, and what a level may bring to them."""
 
-    Attributes:
-        states: of all pairs.
-        loose: images with few features in tracks through three images.
-        needs: what more matches may be worth to images, 1 to those that are lost.
-        megapixels: of each image, as its features are extracted.
-        unmeasured: levels whose frames are not measured.
-        lacking: images without features of the level yet.
-        registered: images of the model before.
-    """
-
-    states: Mapping[Pair, PairState]
-    loose: Set[str]
-    needs: Mapping[str, float]
-    megapixels: Mapping[str, float]
-    unmeasured: Collection[int]
-    lacking: Collection[str]
-    registered: Collection[str]
+    states: Mapping[Pair, PairState]  # of all pairs
+    loose: Set[str]  # images with few features in tracks through three images
+    needs: Mapping[str, float]  # what more matches may be worth to images, 1 to those that are lost
+    megapixels: Mapping[str, float]  # of each image, as its features are extracted
+    unmeasured: Collection[int]  # levels whose frames are not measured
+    lacking: Collection[str]  # images without features of the level yet
+    registered: Collection[str]  # images of the model before
 
     @cached_property
     def _parts(self) -> list[set[str]]:

@@ -119,8 +119,7 @@ class GuidedMatcher:
         """Return the (K, 2) inliers of a pair and its guided matches."""
         (first, shapes1), (second, shapes2) = map(self._images, task.names)
         shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
-        both = first, second
-        return guided_matches(both, shapes, task.model, task.inliers, self._options)
+        return guided_matches((first, second), shapes, task.model, task.inliers, self._options)
 
     def _read(self, name: str) -> tuple[Singles, Array]:
         """Return descriptors and, where frames were measured one by one, their linear parts."""
@@ -169,9 +168,8 @@ class Guiding:
         for begin in range(0, len(ordered), PAIRS_PER_WRITE):
             batch, found = ordered[begin : begin + PAIRS_PER_WRITE], []
             tasks = self._tasks(batch)
-            for task, both in zip(
-                tasks, executor.map(matcher, tasks, [features.path]), strict=True
-            ):
+            matched = executor.map(matcher, tasks, [features.path])
+            for task, both in zip(tasks, matched, strict=True):
                 found.append((task, both[stationary.left(task.names, both)]))
                 advance(1)
             untold = set(batch) - {task.names for task in tasks}

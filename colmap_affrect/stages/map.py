@@ -54,9 +54,11 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     known_models = read_summaries(workspace.sparse)  # refuses edited ones
+    before = None
     is_same = known.partition("+")[2] == inputs.partition("+")[2]  # as it was said by hand
-    goes_on = goes_on and bool(known_models) and is_same
-    before = _read_before(workspace, known_models[0]) if goes_on else None
+    if goes_on and known_models and is_same:
+        model = pycolmap.Reconstruction(str(workspace.sparse / "0"))
+        before = MappedModel(model, moves=known_models[0].moves)
     task = _task(context, extend, before)
     workspace.record_made_from(map="")  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
@@ -67,9 +69,7 @@ def map_images(
     return StageReport("map", wall_s, len(models)), models
 
 
-def _task(
-    context: Context, extend: Extension | None, before: MappedModel | None = None
-) -> MappingTask:
+def _task(context: Context, extend: Extension | None, before: MappedModel | None) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace, by_hand = context.workspace, context.by_hand
     copied, path = workspace.is_foreign, workspace.database
@@ -88,11 +88,6 @@ def _task(
         may_share=not copied and context.inputs.may_share,
         tie_points=tie_points,
     )
-
-
-def _read_before(workspace: Workspace, summary: ModelSummary) -> MappedModel:
-    model = pycolmap.Reconstruction(str(workspace.sparse / "0"))
-    return MappedModel(model, moves=summary.moves)
 
 
 def _inputs(context: Context, extend: Extension | None) -> str:
