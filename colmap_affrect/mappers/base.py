@@ -103,28 +103,17 @@ class MappedModel:
 
 
 class Mapper(Protocol):
-    """Makes models; called with its ``Options``.
+    """Makes models; called with its ``Options``."""
 
-    Attributes:
-        options: checked, with pycolmap's full keys in ``mapper_options``.
-    """
-
-    options: Any
+    options: Any  # checked, with pycolmap's full keys in ``mapper_options``
 
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
-        """Map once.
+        """Map once; ``output_path`` is an empty folder that models may be written to.
 
-        Args:
-            task: what to map.
-            output_path: an empty folder that models may be written to.
-            random_seed: of this attempt.
-            show: is told how many images have been registered so far.
-
-        Raises:
-            AffrectError: when COLMAP ends with an error.
-            KeyboardInterrupt: after mapping has been stopped.
+        ``show`` is told how many images have been registered so far. AffrectError when COLMAP ends
+        with an error, KeyboardInterrupt after mapping has been stopped.
         """
 
 

@@ -16,7 +16,7 @@ from colmap_affrect.errors import damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.reliability import Judgement, judge
-from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
+from colmap_affrect.mappers.snapshots import with_snapshots
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
@@ -76,18 +76,14 @@ def map_database(
     of a model that is extended. ``sparse_path`` appears only once all models are written, and
     what was in it, perhaps the model that is extended, stays there until then.
 
-    Args:
-        mapper: with its options.
-        task: what to map.
-        sparse_path: folder to make; an old one is replaced.
-        next_image: called with the number of images registered since the last call; never
-            more than there are, also when a mapper tries several models.
-
-    Raises:
-        AffrectError: when COLMAP ends with an error.
-        KeyboardInterrupt: after mapping has been stopped and what it wrote, but snapshots, removed.
+    ``next_image`` is called with the number of images registered since the last call, never more
+    than there are, also when a mapper tries several models. AffrectError when COLMAP ends with an
+    error; KeyboardInterrupt after mapping has been stopped, and what it wrote, but snapshots, is
+    gone.
     """
-    partial = sparse_path.with_name(sparse_path.name + ".partial")
+    partial, snapshots = (
+        sparse_path.with_name(sparse_path.name + end) for end in (".partial", ".snapshots")
+    )
     remove_own([partial] if task.extend or task.before else [partial, sparse_path])
     num_images = len(image_ids(task.database_path))
     most_shown, lock = 0, threading.Lock()
@@ -101,7 +97,7 @@ def map_database(
                 next_image(news)
 
     try:
-        with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as whole:
+        with with_snapshots(task, mapper.options, snapshots, num_images) as whole:
             raw = partial / "raw"
             raw.mkdir(parents=True)
             found = mapper.map(whole, raw, mapper.options.random_seed, show)

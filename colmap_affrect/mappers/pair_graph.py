@@ -281,15 +281,14 @@ def _empty_copy(
     for image in map(copy.copy, cache.images.values()):
         key = camera_of.get(image.name, image.camera_id)
         if key != image.camera_id:
-            sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, key)
-            frame = pycolmap.Frame(frame_id=image.frame_id, rig_id=rigs[sensor].rig_id)
-            frame.add_data_id(pycolmap.data_t(sensor, image.image_id))
-            frames[image.frame_id], image.camera_id = frame, key
+            image.camera_id, rig = key, rigs[cache.cameras[key].sensor_id]
+            frames[image.frame_id] = pycolmap.Frame(frame_id=image.frame_id, rig_id=rig.rig_id)
+            frames[image.frame_id].add_data_id(image.data_id)
         images.append(image)
     used = {frame.rig_id for frame in frames.values()}
     sensors = {sensor for rig_id in used for sensor in cache.rigs[rig_id].sensor_ids()}
     for camera in cache.cameras.values():
-        if pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera.camera_id) in sensors:
+        if camera.sensor_id in sensors:
             new.add_camera(camera)
     for rig_id in sorted(used):
         new.add_rig(cache.rigs[rig_id])

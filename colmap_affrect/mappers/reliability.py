@@ -208,7 +208,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
         name, camera = graph.names[image_id], cameras[image_id]
         focal_px = float(camera.mean_focal_length())
         found[name] = Measures(
-            nats + three.get(image_id, 0.0) - priors[camera.camera_id].cost(focal_px),
+            evidence=nats + three.get(image_id, 0.0) - priors[camera.camera_id].cost(focal_px),
             agreement=float(np.average(shares, weights=weights)) if shares else 1.0,
             num_three=long[image_id],
             focal_growth=growth.get(camera.camera_id, 1.0),

@@ -53,16 +53,8 @@ class Search:
         """Return the evidence of the best of some models."""
         return max((self.evidence.of(model.reconstruction) for model in models), default=0.0)
 
-    def best(
-        self, graph: PairGraph, start: pycolmap.Reconstruction | None = None
-    ) -> list[MappedModel]:
-        """Return the best model, and then the best ones of images that none before has.
-
-        If a model is given to start from, bridges begin at it, too, and unknown focal lengths stay
-        near its own.
-        """
-        if start:
-            return self._beyond(graph, start)
+    def best(self, graph: PairGraph) -> list[MappedModel]:
+        """Return the best model, and then the best ones of images that none before has."""
         best, most, grower = list[MappedModel](), -math.inf, self.grower(graph)
         zooms = ZOOMS if self.num_starts else ZOOMS[:1]
         usual = [self._near(zoom) for zoom in zooms] if self._shared else [self]
@@ -87,7 +79,8 @@ class Search:
             grower.finish(mapped.reconstruction)
         return best
 
-    def _beyond(self, graph: PairGraph, start: pycolmap.Reconstruction) -> list[MappedModel]:
+    def beyond(self, graph: PairGraph, start: pycolmap.Reconstruction) -> list[MappedModel]:
+        """Do so when bridges begin at a model, too, near whose focal lengths unknown ones stay."""
         near, again = self._as_found(start), pycolmap.Reconstruction(start)
         grower = near.grower(graph)
         grower.finish(again)

@@ -23,11 +23,6 @@ NUM_KEPT = 2
 """A snapshot may be half written when a run is killed; the one before it is complete."""
 
 
-def snapshots_of(sparse_path: Path) -> Path:
-    """Return the folder of the snapshots of models that go to a folder."""
-    return sparse_path.with_name(sparse_path.name + ".snapshots")
-
-
 @contextmanager
 def with_snapshots(
     task: MappingTask, options: MapperOptions, folder: Path, num_images: int

@@ -137,8 +137,10 @@ class SparseMapper(IncrementalMapper):
             reduced = graph.without(left_out)
             if start and reduced.is_explained_by(start):
                 continue
-            models = [] if start else _of_some_tracks(search, reduced, graph)
-            models = models or search.best(reduced, start)
+            if start:
+                models = search.beyond(reduced, start)
+            else:
+                models = _of_some_tracks(search, reduced, graph) or search.best(reduced)
             evidence = search.evidence_of(models)
             if not models or (best and evidence <= most):
                 continue
