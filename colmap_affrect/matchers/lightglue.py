@@ -24,12 +24,7 @@ from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.arrays import Array, Indices, Singles
 from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.geometry.tilts import of_unit_area
-from colmap_affrect.matchers.base import (
-    ImageFeatures,
-    MatcherContext,
-    MatcherOptions,
-    Matches,
-)
+from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, MatcherOptions, Matches
 from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import one_openmp_thread
 
