@@ -16,7 +16,6 @@ from colmap_affrect.mappers.mapping import map_database, read_summaries
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import unmeasured_pairs
 
