@@ -140,7 +140,8 @@ class Adjuster:
         for _, image_id, mark in self.tie_points.observed(model):
             image, place = model.images[image_id], model.points3D[mark.point3D_id].xyz
             camera, frame = model.cameras[image.camera_id], model.frames[image.frame_id]
-            if frame.rig_from_world is None:
+            is_reference = frame.rig is None or frame.rig.is_ref_sensor(camera.sensor_id)
+            if frame.rig_from_world is None or not is_reference:
                 continue
             blocks = [place, frame.rig_from_world.params, camera.params]
             if all(map(problem.has_parameter_block, blocks)):

@@ -14,7 +14,7 @@ from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
 from colmap_affrect.errors import damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
-from colmap_affrect.mappers.pair_graph import graph_of
+from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, graph_of
 from colmap_affrect.mappers.reliability import Judgement, judge
 from colmap_affrect.mappers.snapshots import with_snapshots
 from colmap_affrect.mappers.tie_points import tie_points_of
@@ -157,5 +157,5 @@ def _summary(
         taken_out={name: one.reason for name, one in taken.items()},
         focals_px=focals,
         moves=mapped.moves,
-        tie_points=tie_points_of(task, graph_of(task)).report(model) if task.tie_points else (),
+        tie_points=tie_points_of(task, graph_of(task, MIN_NUM_MATCHES)).report(model),
     )

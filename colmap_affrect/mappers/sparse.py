@@ -163,7 +163,8 @@ class SparseMapper(IncrementalMapper):
 def _joined_by_hand(
     search: Search, graph: PairGraph, models: Sequence[MappedModel]
 ) -> list[MappedModel]:
-    return TieJoiner(search.adjuster.tie_points, search.grower(graph)).join(models)
+    joiner = TieJoiner(search.adjuster.tie_points, search.grower(graph), search.evidence)
+    return joiner.join(models)
 
 
 def _again(search: Search, graph: PairGraph, before: MappedModel) -> list[MappedModel]:

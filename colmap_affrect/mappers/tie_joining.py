@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,9 @@ from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.adjustment import EXIF_SIGMA
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.growing import Grower
+from colmap_affrect.mappers.bridging import Bridges
+from colmap_affrect.mappers.evidence import Evidence
+from colmap_affrect.mappers.growing import Grower, join
 from colmap_affrect.mappers.pair_graph import CameraById, PoseById, cameras_of, poses_of
 from colmap_affrect.mappers.search import ZOOMS
 from colmap_affrect.mappers.tie_points import AGREEING_PX, TiePoints
@@ -26,28 +27,37 @@ MAX_SIM3_ERROR = 0.1  # of tie points of two models, of their spread
 class TieJoiner:
     """Joins photographs and models that tie points hold, whatever the matches say."""
 
-    def __init__(self, points: TiePoints, grower: Grower) -> None:
-        self.points, self.grower = points, grower
+    def __init__(self, points: TiePoints, grower: Grower, evidence: Evidence) -> None:
+        self.points, self.grower, self.evidence = points, grower, evidence
 
     def join(self, models: Sequence[MappedModel]) -> list[MappedModel]:
-        """Return models with all that joins them, and all tie points observed; large ones first."""
+        """Return models with all that joins them, and all tie points observed; large ones first.
+
+        Bridges go on from what tie points have joined.
+        """
         if not self.points.keypoints:
             return list(models)
         left = sorted(models, key=lambda mapped: -mapped.reconstruction.num_reg_images())
         joined = list[MappedModel]()
         while left:
             mapped, *left = left
-            model, moves = mapped.reconstruction, mapped.moves
-            while new := next(self._new_poses(model, left), None):
-                model = self.grower.placed(*new, copy.deepcopy(model))
-                moves = tuple(dict.fromkeys((*moves, BY_HAND)))
-                inside = set(model.reg_image_ids())
+            while new := next(self._new_poses(mapped.reconstruction, left), None):
+                mapped = self._with(mapped, *new)
+                inside = set(mapped.reconstruction.reg_image_ids())
                 left = [m for m in left if not inside >= set(m.reconstruction.reg_image_ids())]
-            if model is not mapped.reconstruction:
-                self.grower.finish(model)
-            self.points.observe(model)
-            joined.append(replace(mapped, reconstruction=model, moves=moves))
+            if BY_HAND in mapped.moves:
+                self.grower.finish(mapped.reconstruction)
+            self.points.observe(mapped.reconstruction)
+            joined.append(mapped)
         return joined
+
+    def _with(self, mapped: MappedModel, poses: PoseById, cameras: CameraById) -> MappedModel:
+        """Place images, and what bridges join to them."""
+        model = self.grower.placed(poses, cameras, copy.deepcopy(mapped.reconstruction))
+        bridges = Bridges(self.grower.graph, self.grower.native.random_seed)
+        grown = join(model, bridges, self.grower, self.evidence)
+        moves = tuple(dict.fromkeys((*mapped.moves, BY_HAND)))
+        return MappedModel(grown.reconstruction, {**mapped.bridges, **grown.bridges}, moves)
 
     def _new_poses(
         self, model: pycolmap.Reconstruction, left: Sequence[MappedModel]

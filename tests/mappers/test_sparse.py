@@ -12,11 +12,15 @@ from mapping_tasks import task_with_given_cameras
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.model_files import Poses, model_poses, pose_errors, relative_pose
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
+from colmap_affrect.mappers.reliability import judge
 from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
+from colmap_affrect.mappers.tie_joining import BY_HAND
+from colmap_affrect.mappers.tie_points import tie_points_of, tied_evidence
 
 WIDTH, HEIGHT = 1000, 700
 MATRIX = np.array([[900.0, 0.0, 480.0], [0.0, 910.0, 360.0], [0.0, 0.0, 1.0]])
@@ -173,3 +177,89 @@ def test_what_incremental_mapping_registers_is_left_as_it_is(tmp_path: Path, cou
     (model,) = mapped(path, tmp_path / "models")
     assert model.bridges == {}
     assert model.reconstruction.num_reg_images() == 2
+
+
+def tied(
+    path: Path, truth: Poses, marked: dict[str, int], moved: tuple[str, str] | None = None
+) -> tuple[list[MappedModel], MappingTask]:
+    """Map with tie points of the wall: of each image so many, with a noise of 2 px.
+
+    The mark of one point in one image, ``moved``, is 100 px off.
+    """
+    random = np.random.default_rng(3)
+    points = wall(random, 4000)
+    seen = {name: project(points, truth[name]) for name in marked}
+    common = points[np.logical_and.reduce([is_inside(xy) for xy in seen.values()])]
+    corners = [int(np.argmax(common @ way)) for way in random.normal(size=(40, 3))]
+    points = common[list(dict.fromkeys(corners))]
+    table = path.with_suffix(".csv")
+    lines = ["photograph,point,y,x"]
+    for name, count in marked.items():
+        noisy = project(points, truth[name]) + random.normal(0, 2.0, (len(points), 2))
+        for number, (x, y) in enumerate(noisy[:count]):
+            shift = 100.0 * (moved == (f"p{number}", name))
+            lines.append(f"{name},p{number},{y + 0.8 * shift:.2f},{x + 0.6 * shift:.2f}")
+    table.write_text("\n".join(lines) + "\n")
+    mapped_path, output_path = path.with_name("mapped.db"), path.with_name("models")
+    tie_points = ByHand(table).copy_database(path, mapped_path)
+    output_path.mkdir()
+    task = task_with_given_cameras(mapped_path, tie_points=tie_points)
+    return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None), task
+
+
+def rotation_error_deg(model: MappedModel, truth: Poses, first: str, second: str) -> float:
+    found = model_poses(model.reconstruction)
+    pairs = [relative_pose(poses[first], poses[second]) for poses in (found, truth)]
+    return pose_errors(*pairs)[0]
+
+
+def test_lost_photograph_comes_back_by_six_points_in_two_others(tmp_path: Path) -> None:
+    truth = views(4)
+    path = tmp_path / "database.db"
+    write_scene(path, truth, [(0, 1), (1, 2), (0, 2)])
+    (model,), task = tied(path, truth, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6})
+    assert model.moves[-1] == BY_HAND
+    assert model.reconstruction.num_reg_images() == 4
+    assert rotation_error_deg(model, truth, "0.jpg", "3.jpg") < 2.0
+    residuals = tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)
+    assert len(residuals) == 18
+    assert residuals[0].error_px < 10.0
+    assert judge(model, task)["3.jpg"].probability > 0.9
+
+
+def test_a_mark_that_is_far_off_is_named_as_the_worst(tmp_path: Path) -> None:
+    truth = views(4)
+    path = tmp_path / "database.db"
+    write_scene(path, truth, [(0, 1), (1, 2), (0, 2)])
+    marked = {"1.jpg": 8, "2.jpg": 8, "3.jpg": 8}
+    (model,), task = tied(path, truth, marked, moved=("p5", "3.jpg"))
+    worst = tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)[0]
+    assert (worst.point, worst.image) == ("p5", "3.jpg")
+    assert worst.error_px > 50.0
+    assert rotation_error_deg(model, truth, "0.jpg", "3.jpg") < 3.0
+
+
+def test_two_models_are_joined_by_seven_points(tmp_path: Path) -> None:
+    truth = views(6)
+    path = tmp_path / "database.db"
+    write_scene(path, truth, [(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5)])
+    models, _ = tied(path, truth, {f"{i}.jpg": 7 for i in (1, 2, 3, 4)})
+    assert [model.reconstruction.num_reg_images() for model in models] == [6]
+    for name in ("3.jpg", "5.jpg"):
+        assert rotation_error_deg(models[0], truth, "0.jpg", name) < 3.0
+
+
+def test_tie_points_of_too_few_photographs_join_nothing(tmp_path: Path) -> None:
+    truth = views(4)
+    path = tmp_path / "database.db"
+    write_scene(path, truth, [(0, 1), (1, 2), (0, 2)])
+    (model,), task = tied(path, truth, {"1.jpg": 3, "2.jpg": 3, "3.jpg": 3})
+    assert model.reconstruction.num_reg_images() == 3
+    assert len(tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)) == 6
+
+
+def test_evidence_of_tie_points_grows_with_those_that_agree() -> None:
+    agreeing = [("p", 1, 2.0)] * 6
+    assert tied_evidence(agreeing[:3]) == {1: 0.0}
+    assert tied_evidence(agreeing)[1] > 8.0
+    assert tied_evidence([*agreeing[:3], ("q", 1, 50.0), ("q", 2, 1.0)])[1] < -2.0
