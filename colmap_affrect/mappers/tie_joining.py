@@ -17,10 +17,9 @@ from colmap_affrect.mappers.evidence import Evidence
 from colmap_affrect.mappers.growing import Grower, join
 from colmap_affrect.mappers.pair_graph import CameraById, PoseById, cameras_of, poses_of
 from colmap_affrect.mappers.search import ZOOMS
-from colmap_affrect.mappers.tie_points import AGREEING_PX, TiePoints
+from colmap_affrect.mappers.tie_points import AGREEING_PX, MIN_NUM_POINTS, TiePoints
 
 BY_HAND = "with tie points"  # the move, in a report
-MIN_NUM_POINTS = 4  # that must agree: three make a pose, of which the others are the test
 MAX_SIM3_ERROR = 0.1  # of tie points of two models, of their spread
 
 
@@ -33,7 +32,8 @@ class TieJoiner:
     def join(self, models: Sequence[MappedModel]) -> list[MappedModel]:
         """Return models with all that joins them, and all tie points observed; large ones first.
 
-        Bridges go on from what tie points have joined.
+        Bridges go on from what tie points have joined. Images that their tie points contradict are
+        placed anew.
         """
         if not self.points.keypoints:
             return list(models)
@@ -41,6 +41,9 @@ class TieJoiner:
         joined = list[MappedModel]()
         while left:
             mapped, *left = left
+            for image_id in self.points.misplaced(mapped.reconstruction):
+                frame_id = mapped.reconstruction.images[image_id].frame_id
+                mapped.reconstruction.deregister_frame(frame_id)
             while new := next(self._new_poses(mapped.reconstruction, left), None):
                 mapped = self._with(mapped, *new)
                 inside = set(mapped.reconstruction.reg_image_ids())

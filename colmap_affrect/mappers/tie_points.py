@@ -5,7 +5,7 @@ for good.
 """
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -21,6 +21,7 @@ from colmap_affrect.project.report import Residual
 AGREEING_PX = 4.0 * SIGMA_PX  # residuals up to which a tie point agrees with a pose
 AGREES_IF_RIGHT, AGREES_BY_CHANCE = 0.9, 0.05
 """Shares of tie points that agree with right places, as some marks are wrong, and with others."""
+MIN_NUM_POINTS = 4  # that must agree to place an image: three do so, of which others are the test
 NUM_FREE = 3  # tie points that any place of an image can agree with
 NEAR, NUM_NEAR = 0.1, 5
 """Depths of so many points near a mark, up to this part of the longer side, stand for its own."""
@@ -72,10 +73,10 @@ class TiePoints:
 
     def residuals(self, model: pycolmap.Reconstruction) -> list[Mark]:
         """Return the residuals of all that a model observes."""
-        return [
-            (name, i, _error_px(model, i, mark.xy, model.points3D[mark.point3D_id].xyz))
-            for name, i, mark in self.observed(model)
-        ]
+        places = (
+            (n, i, m.xy, model.points3D[m.point3D_id].xyz) for n, i, m in self.observed(model)
+        )
+        return [(n, i, _errors_px(model, {i: xy}, place)[0]) for n, i, xy, place in places]
 
     def report(self, model: pycolmap.Reconstruction) -> tuple[Residual, ...]:
         """Return the residuals as a report has them, the worst first."""
@@ -93,6 +94,20 @@ class TiePoints:
             if place is not None:
                 found[name] = place
         return found
+
+    def misplaced(self, model: pycolmap.Reconstruction) -> list[int]:
+        """Return images of most of whose tie points two others agree that they are elsewhere."""
+        far, num = Counter[int](), Counter[int]()
+        for seen in self._seen(model).values():
+            xy = {i: model.images[i].points2D[k].xy for i, k in seen.items()}
+            for image_id in xy if len(xy) > 2 else ():
+                others = {i: mark for i, mark in xy.items() if i != image_id}
+                place = triangulated(model, others)
+                if place is None or max(_errors_px(model, others, place)) > AGREEING_PX:
+                    continue
+                num[image_id] += 1
+                far[image_id] += _errors_px(model, {image_id: xy[image_id]}, place)[0] > AGREEING_PX
+        return [i for i, count in far.items() if count >= max(MIN_NUM_POINTS, num[i] / 2)]
 
     def marks(self, image: pycolmap.Image) -> dict[str, Array]:
         """Return where the points are in an image, px."""
@@ -131,12 +146,17 @@ def tie_points_of(task: MappingTask, graph: PairGraph) -> TiePoints:
     return TiePoints({p: {ids[name]: key for name, key in seen.items()} for p, seen in found})
 
 
-def _error_px(model: pycolmap.Reconstruction, image_id: int, xy: Array, place: Array) -> float:
-    """Return the reprojection error, that of a point behind the camera as large as the image."""
-    image = model.images[image_id]
-    camera, projected = model.cameras[image.camera_id], image.project_point(place)
-    largest = math.hypot(camera.width, camera.height)
-    return largest if projected is None else min(largest, math.dist(projected, xy))
+def _errors_px(
+    model: pycolmap.Reconstruction, marks: Mapping[int, Array], place: Array
+) -> list[float]:
+    """Return reprojection errors, those of a point behind the camera as large as the image."""
+    found = []
+    for image_id, xy in marks.items():
+        image = model.images[image_id]
+        camera, projected = model.cameras[image.camera_id], image.project_point(place)
+        largest = math.hypot(camera.width, camera.height)
+        found.append(largest if projected is None else min(largest, math.dist(projected, xy)))
+    return found
 
 
 def _place_by_neighbors(model: pycolmap.Reconstruction, image_id: int, xy: Array) -> Array | None:

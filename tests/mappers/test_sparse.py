@@ -239,6 +239,18 @@ def test_a_mark_that_is_far_off_is_named_as_the_worst(tmp_path: Path) -> None:
     assert rotation_error_deg(model, truth, "0.jpg", "3.jpg") < 3.0
 
 
+def test_photograph_in_a_wrong_place_is_placed_by_its_tie_points(tmp_path: Path) -> None:
+    truth = views(4)
+    wrong = {**truth, "3.jpg": (turned(0, 25, 40) @ truth["3.jpg"][0], truth["3.jpg"][1])}
+    path = tmp_path / "database.db"
+    write_scene(path, wrong, [(0, 1), (1, 2), (0, 2), (2, 3)])
+    (before,) = mapped(path, tmp_path / "before")
+    assert rotation_error_deg(before, truth, "0.jpg", "3.jpg") > 20.0
+    (model,), _ = tied(path, truth, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6})
+    assert model.reconstruction.num_reg_images() == 4
+    assert rotation_error_deg(model, truth, "0.jpg", "3.jpg") < 3.0
+
+
 def test_two_models_are_joined_by_seven_points(tmp_path: Path) -> None:
     truth = views(6)
     path = tmp_path / "database.db"
