@@ -15,7 +15,7 @@ from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_int
 from colmap_affrect.errors import damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, graph_of
-from colmap_affrect.mappers.reliability import Judgement, judge
+from colmap_affrect.mappers.reliability import Judgement, focal_growths, judge
 from colmap_affrect.mappers.snapshots import with_snapshots
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
@@ -125,11 +125,16 @@ def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgeme
     all images leave that were taken at once. Those of a model that is extended stay.
     """
     model, taken = mapped.reconstruction, dict[str, Judgement]()
+    growths, are_new = focal_growths(model, task), True
     while model.num_reg_images() > 1:
-        found = judge(mapped, task)
+        found = judge(mapped, task, growths)
         name = min(found, key=lambda name: found[name].probability)
         if task.extend or found[name].probability >= WRONG:
-            return found, taken
+            if are_new:
+                return found, taken
+            growths, are_new = focal_growths(model, task), True
+            continue
+        are_new = False
         frame_id = model.find_image_with_name(name).frame_id
         for image in model.images.values():
             if image.frame_id == frame_id and image.has_pose:

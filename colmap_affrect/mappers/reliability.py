@@ -44,7 +44,9 @@ from colmap_affrect.project.report import Bridge
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 FREE_SIGMA = 1.0  # of the logarithm of a focal length that is given, where it is freed
+MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing
 MIN_MOVE = 0.1  # of the logarithm of a given focal length that is told from another
+NUM_ITERATIONS = 100  # of a trial: three times as many change growths by 4 % at most
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
 MAX_NUM_IMAGES = 100  # of models whose focal lengths are tried; larger ones have points of many
 MAX_NUM_POINTS = 2_000  # of a model, for what need not be exact
@@ -116,7 +118,7 @@ TERMS: Mapping[str, Term] = {
         lambda m: f"only {m.num_three} of its points are seen by two other photographs",
     ),
     "focal length": Term(
-        lambda m: math.log(min(max(m.focal_growth, 0.003), 1.0)),
+        lambda m: math.log(min(max(m.focal_growth, MIN_GROWTH), 1.0)),
         lambda _: f"{FOCAL_UNKNOWN}, and the place of the camera depends on that",
     ),
     "given focal length": Term(
@@ -160,9 +162,14 @@ def _coefficients() -> dict[str, Any]:
     return content
 
 
-def judge(mapped: MappedModel, task: MappingTask) -> dict[str, Judgement]:
-    """Say of each photograph of a model how sure it is that it stands right, by name."""
-    return {name: judged(measures) for name, measures in measure(mapped, task).items()}
+def judge(
+    mapped: MappedModel, task: MappingTask, growths: Mapping[int, float] | None = None
+) -> dict[str, Judgement]:
+    """Say of each photograph of a model how sure it is that it stands right, by name.
+
+    The :func:`focal_growths` of a model with a few photographs more may be given: they are slow.
+    """
+    return {name: judged(measures) for name, measures in measure(mapped, task, growths).items()}
 
 
 def judged(measures: Measures) -> Judgement:
@@ -180,7 +187,9 @@ def judged(measures: Measures) -> Judgement:
     return Judgement(now, "; ".join(reasons), then - now)
 
 
-def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
+def measure(
+    mapped: MappedModel, task: MappingTask, growths: Mapping[int, float] | None = None
+) -> dict[str, Measures]:
     """Measure what holds each photograph of a model, by name."""
     model, graph = mapped.reconstruction, graph_of(task, MIN_NUM_MATCHES)
     poses, cameras = poses_of(model), cameras_of(model)
@@ -195,7 +204,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             pairs_of[image_id].append(pair)
     three, long = evidence.three_view_ratios(model), num_long_tracks(model)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
-    growth = _focal_growths(model, task, priors)
+    growths = focal_growths(model, task) if growths is None else growths
     fitting_px = _fitting_focals(model, task, priors)
     tied = tied_evidence(tie_points_of(task, graph).residuals(model))
     zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
@@ -211,7 +220,7 @@ def measure(mapped: MappedModel, task: MappingTask) -> dict[str, Measures]:
             evidence=nats + three.get(image_id, 0.0) - priors[camera.camera_id].cost(focal_px),
             agreement=float(np.average(shares, weights=weights)) if shares else 1.0,
             num_three=long[image_id],
-            focal_growth=growth.get(camera.camera_id, 1.0),
+            focal_growth=growths.get(camera.camera_id, 1.0),
             focal_px=focal_px,
             fitting_px=fitting_px.get(camera.camera_id, 0.0),
             turned=float(np.mean(rotations)) if rotations else 0.0,
@@ -279,14 +288,13 @@ def _zooms(cameras: Iterable[pycolmap.Camera]) -> dict[Size, float]:
     return {size: max(focals) / min(focals) for size, focals in of_size.items()}
 
 
-def _focal_growths(
-    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, FocalPrior]
-) -> dict[int, float]:
+def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
     """Return by what part the cost grows with another focal length, by id of the camera.
 
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each camera that nobody knows, while all else may move.
     """
+    priors = priors_of(cameras_of(model).values(), task.cameras)
     known = sorted(priors.keys() & task.cameras.keys())
     unknown = [key for key in known if priors[key].sigma > EXIF_SIGMA]
     if not (unknown and _is_tried(model)):
@@ -295,13 +303,18 @@ def _focal_growths(
     is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     sparse = _with_fewer_points(model)
-    cost = Adjuster(priors, NOISE_PX, refining, fixed).adjust(sparse, FINAL)
+    cost = Adjuster(priors, NOISE_PX, refining, fixed).adjust(sparse, NUM_ITERATIONS)
     groups = [keys.tolist() for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS))]
 
     def growth(keys: Sequence[int]) -> float:
         held = Adjuster(priors, NOISE_PX, refining, fixed.union(keys))
-        least = min(held.adjust(_scaled(sparse, keys, factor), FINAL) for factor in FACTORS)
-        return least / max(cost, 1e-9) - 1.0
+        least = math.inf
+        for factor in FACTORS:
+            trial = held.adjust(_scaled(sparse, keys, factor), NUM_ITERATIONS)
+            least = min(least, trial / max(cost, 1e-9))
+            if least - 1.0 <= MIN_GROWTH:
+                break
+        return least - 1.0
 
     growths = zip(groups, map_ordered(growth, groups, available_cores()), strict=True)
     return {key: value for keys, value in growths for key in keys}
