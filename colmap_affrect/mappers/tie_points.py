@@ -22,6 +22,7 @@ AGREEING_PX = 4.0 * SIGMA_PX  # residuals up to which a tie point agrees with a 
 AGREES_IF_RIGHT, AGREES_BY_CHANCE = 0.9, 0.05
 """Shares of tie points that agree with right places, as some marks are wrong, and with others."""
 MIN_NUM_POINTS = 4  # that must agree to place an image: three do so, of which others are the test
+MOST = 2.5  # nats: of images that six tie points alone hold twelve of thirteen stand right
 NUM_FREE = 3  # tie points that any place of an image can agree with
 NEAR, NUM_NEAR = 0.1, 5
 """Depths of so many points near a mark, up to this part of the longer side, stand for its own."""
@@ -135,7 +136,8 @@ def tied_evidence(residuals: Iterable[Mark]) -> dict[int, float]:
     found = {}
     for image_id, of_image in errors.items():
         num = sum(error_px <= AGREEING_PX for error_px in of_image)
-        found[image_id] = max(0, num - NUM_FREE) * agreeing + (len(of_image) - num) * differing
+        nats = max(0, num - NUM_FREE) * agreeing + (len(of_image) - num) * differing
+        found[image_id] = min(nats, MOST)
     return found
 
 
