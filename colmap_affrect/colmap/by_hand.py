@@ -131,6 +131,7 @@ def read_marks(path: Path, names: Collection[str]) -> Marks:
     for name in names:
         for key in {name, Path(name).name, Path(name).stem}:
             stems[key].append(name)
+    stems |= {name: [name] for name in names}  # a whole name is that of no other
     marks = defaultdict[str, dict[str, Array]](dict)
     known = [column for alike in COLUMNS.values() for column in alike]
     for place, row in read_table(path, where, [*known, "z"], header=tuple(COLUMNS)):

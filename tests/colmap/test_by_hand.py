@@ -61,6 +61,12 @@ def test_names_that_several_photographs_have_are_refused(tmp_path: Path) -> None
         read_marks(tmp_path / "marks.csv", ["1/a.jpg", "2/a.jpg", "b.jpg"])
 
 
+def test_a_whole_name_is_not_the_short_one_of_another(tmp_path: Path) -> None:
+    (tmp_path / "marks.csv").write_text("p,a.jpg,1,2\np,old/a.jpg,3,4\n")
+    (found,) = read_marks(tmp_path / "marks.csv", ["a.jpg", "old/a.jpg"]).values()
+    assert found["a.jpg"].tolist() == [1.0, 2.0]
+
+
 @pytest.mark.parametrize(
     "by_hand", [ByHand(left_out=("x.jpg",)), ByHand(rejected=(("b.jpg", "x"),))]
 )
