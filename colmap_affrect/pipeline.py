@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from colmap_affrect.colmap.by_hand import NOTHING, ByHand
+from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import read_names, schema_version
@@ -140,12 +140,13 @@ def run(
         return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
 
 
-def _check_by_hand(by_hand: ByHand, names: Collection[str], mapper: Mapper) -> None:
-    by_hand.marks(names)  # refuses what names other photographs
+def _check_by_hand(by_hand: ByHand, names: Collection[str], mapper: Mapper) -> Marks:
+    marks = by_hand.marks(names)  # refuses what names other photographs
     if by_hand.tie_points_path and mapper.options.name != MAPPERS.default:
         raise OptionError(
             f"--tie-points: the {mapper.options.name} mapper takes none; use --mapper sparse"
         )
+    return marks
 
 
 def _num_pairs(names: Sequence[str], options: PairOptions) -> int:
@@ -205,7 +206,7 @@ def map_and_report(
         raise ImageError(f"{path}: {min(gone)} has features, and is gone; run extract again")
     if extend and overwrite:
         extend.refuse_discarding(workspace.path)
-    _check_by_hand(context.by_hand, names, mapper)
+    marks = _check_by_hand(context.by_hand, names, mapper)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
     copied = workspace.is_foreign
@@ -238,5 +239,5 @@ def map_and_report(
     replace_text(workspace.report, result.to_json())
     if page:
         image_path = workspace.photographs()
-        write_run_page(workspace, result, names, pair_inliers, image_path, context.progress)
+        write_run_page(workspace, result, names, pair_inliers, image_path, context.progress, marks)
     return result

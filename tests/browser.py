@@ -48,12 +48,32 @@ class Browser:
 
     def click(self, selector: str) -> None:
         """Click as a person would: fails if the element is not visible."""
-        found = _call(f"{self._address}/element", using="css selector", value=selector)
-        _call(f"{self._address}/element/{found[ELEMENT]}/click")
+        _call(f"{self._found(selector)}/click")
 
     def command(self, name: str, **parameters: Any) -> Any:
         """Send a command of the DevTools protocol."""
         return _call(f"{self._address}/goog/cdp/execute", cmd=name, params=parameters)
+
+    def press(self, x: float, y: float) -> None:
+        """Click at a place of the window, px."""
+        for kind in ("mousePressed", "mouseReleased"):
+            self.command(
+                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
+            )
+
+    def key(self, name: str, *, is_ctrl: bool = False) -> None:
+        """Press a key, called as in JavaScript."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.command("Input.dispatchKeyEvent", type=kind, key=name, modifiers=2 * is_ctrl)
+
+    def give_files(self, selector: str, *paths: Path) -> None:
+        """Give files to an input, as if they had been chosen."""
+        files = "\n".join(str(path.resolve()) for path in paths)
+        _call(f"{self._found(selector)}/value", text=files)
+
+    def _found(self, selector: str) -> str:
+        found = _call(f"{self._address}/element", using="css selector", value=selector)
+        return f"{self._address}/element/{found[ELEMENT]}"
 
     def resize(self, width: int, height: int = 800) -> None:
         sizes = {"width": width, "height": height, "deviceScaleFactor": 1}

@@ -56,12 +56,11 @@ def write_page(
         finalize=finalized,
     )
     environment.tests["contains"] = lambda values, value: value in values
-    script = (TEMPLATES / "page.js").read_text(encoding="utf-8")
-    digest = hashlib.sha256(script.encode("utf-8")).digest()
+    files = ["page.js", *(["tie_points.js"] if content.get("can_mark") else [])]
+    scripts = [(TEMPLATES / name).read_text(encoding="utf-8") for name in files]
     environment.globals |= {
         "inlier_colors": INLIER_COLORS,
-        "script": script,
-        "script_digest": base64_text(digest),
+        "scripts": {s: base64_text(hashlib.sha256(s.encode()).digest()) for s in scripts},
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
     }
     index = {name: number for number, name in enumerate(names)}
@@ -70,6 +69,7 @@ def write_page(
         "starts": list(INLIER_COLORS),
         "colors": list(INLIER_COLORS.values()),
         "matrix": content.get("matrix", ""),
+        "tie_points": content.get("tie_points"),
         "views": [view.script_data(index, kinds) for view, kinds in views],
     }
     pictures = thumbnails(image_path, names, progress) if image_path else {}

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from colmap_affrect.colmap.by_hand import Marks
+from colmap_affrect.colmap.database import read_cameras
 from colmap_affrect.errors import such_as
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
@@ -52,11 +54,12 @@ def write_run_page(
     pair_inliers: Mapping[Pair, int],
     image_path: Path | None,
     progress: Progress = SILENT,
+    marks: Marks | None = None,
 ) -> Path:
     """Write ``report.html`` of a run, one file that loads nothing; WorkspaceError if it cannot.
 
     ``names`` are those of all photographs, ``image_path`` their folder, if known; ``pair_inliers``
-    are of the verified pairs.
+    are of the verified pairs, ``marks`` those of the tie points by hand.
     """
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
     cards = [_card(name, report, model) for name in names]
@@ -77,6 +80,7 @@ def write_run_page(
         "num_pairs": len(pair_inliers),
         "matrix": _matrix(names, pair_inliers),
         **_cameras(report, names),
+        **_tie_points(workspace, model, names, marks or {}),
     }
     views = [(view, {card.name: card.kind for card in cards})]
     template = TEMPLATES / "run.html"
@@ -119,6 +123,27 @@ def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, An
     ]
     counts = Counter(camera["source"] for camera in report.cameras).most_common()
     return {"cameras": cameras, "source_counts": counts, "source_texts": SOURCES}
+
+
+def _tie_points(
+    workspace: Workspace, model: ModelSummary, names: Sequence[str], marks: Marks
+) -> dict[str, Any]:
+    """Return what the tool for tie points begins with, sizes as stored and marks in px."""
+    cameras = read_cameras(workspace.database) if workspace.database.exists() else {}
+    sizes = {name: [name, camera.width, camera.height] for name, camera in cameras.items()}
+    index = {name: number for number, name in enumerate(names)}
+    errors = {(one.point, one.image): one.error_px for one in model.tie_points}
+    shown = [
+        [point, index[name], *place.tolist(), errors.get((point, name))]
+        for point, places in marks.items()
+        for name, place in places.items()
+    ]
+    return {
+        "tie_points": {"photographs": [sizes.get(name) for name in names], "marks": shown},
+        "can_mark": len(sizes.keys() & index.keys()) > 1,
+        "wants_marks": bool(marks) or len(model.registered_names) < len(names),
+        "residuals": [f"{r.point} in {r.image}: {r.error_px:.1f} px" for r in model.tie_points],
+    }
 
 
 def _matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> str:

@@ -66,17 +66,10 @@ def browser(
     assert running.run(OUTSIDE) == []
 
 
-def press(browser: Browser, x: float, y: float) -> None:
-    for kind in ("mousePressed", "mouseReleased"):
-        browser.command(
-            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
-        )
-
-
 def test_a_click_on_a_camera_shows_its_photograph(browser: Browser) -> None:
     browser.run("document.querySelector('canvas').scrollIntoView({block: 'center'})")
     assert not browser.run(DIALOG)
-    press(browser, *browser.run(PLACE_OF_CAMERA, "3 c.png: bridged by"))
+    browser.press(*browser.run(PLACE_OF_CAMERA, "3 c.png: bridged by"))
     assert browser.run(DIALOG)
     same = """return document.querySelector("#photo img").src ===
         document.querySelectorAll("#sheet img")[2].src"""

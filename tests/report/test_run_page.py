@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import html as markup
 import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from small_comparison import IMAGE_SIZE
 from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
@@ -44,6 +48,24 @@ def test_page_loads_nothing_and_names_are_never_markup(html: str) -> None:
     assert "<img src=x" not in html
     assert "\u202e" not in html
     assert r"b\u202egnp.c" in html
+
+
+def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', html)
+    digests = [
+        base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        for script in re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    ]
+    assert len(digests) == 2
+    allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
+    assert markup.unescape(policy) == (
+        f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
+    )
+
+
+def test_the_tool_for_tie_points_knows_names_and_sizes(html: str) -> None:
+    data = json.loads(html.split('id="data">')[1].split("</script>")[0])
+    assert data["tie_points"] == {"photographs": [[n, *IMAGE_SIZE] for n in NAMES], "marks": []}
 
 
 def test_no_folder_of_this_machine_is_in_the_page(html: str, folder: Path) -> None:
@@ -89,3 +111,4 @@ def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
     ):
         assert text in html
     assert html.count("no picture</span>") == 6
+    assert "Tie points by hand" not in html
