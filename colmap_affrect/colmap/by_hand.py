@@ -52,8 +52,7 @@ class ByHand:
         """Read the tie points; OptionError also where photographs are named that are not there."""
         asked = [("--reject-pair", name) for pair in self.rejected for name in pair]
         for flag, name in [*asked, *(("--leave-out", name) for name in self.left_out)]:
-            if name not in names:
-                raise OptionError(f"{flag} {name}: no such photograph{suggestion(name, names)}")
+            require_known(name, names, f"{flag} ")
         return read_marks(self.tie_points_path, names) if self.tie_points_path else {}
 
     def allows(self, first: str, second: str) -> bool:
@@ -105,6 +104,12 @@ class ByHand:
 
 
 NOTHING = ByHand()
+
+
+def require_known(name: str, names: Collection[str], option: str = "") -> None:
+    """Refuse the name of a photograph that is not there; OptionError says which may be meant."""
+    if name not in names:
+        raise OptionError(f"{option}{name}: no such photograph{suggestion(name, names)}")
 
 
 def _append_keypoints(database: pycolmap.Database, image_id: int, places: Array) -> None:

@@ -71,10 +71,10 @@ def draw_sheet(level: InspectedLevel, summary: str, path: Path) -> None:
     colors, items = warp_colors(level.plan), level.plan.items
     largest = sorted(range(len(items)), key=lambda index: -items[index].canvas_area_px)
     warps = [_warp(level, index, colors[index]) for index in sorted(largest[:MAX_NUM_WARPS])]
-    rows = [_row([(np.zeros((0, WIDTH_PX, 3), np.uint8), summary)], 1)]
-    rows.append(_row([_regions(level), _features(level, colors)], PANELS_PER_ROW))
+    rows = [row_of([(np.zeros((0, WIDTH_PX, 3), np.uint8), summary)], 1)]
+    rows.append(row_of([_regions(level), _features(level, colors)], PANELS_PER_ROW))
     for first in range(0, len(warps), WARPS_PER_ROW):
-        rows.append(_row(warps[first : first + WARPS_PER_ROW], WARPS_PER_ROW))
+        rows.append(row_of(warps[first : first + WARPS_PER_ROW], WARPS_PER_ROW))
     _, data = cv2.imencode(".png", np.concatenate(rows)[:, :, ::-1])
     replace_bytes(path, data.tobytes())
 
@@ -92,7 +92,7 @@ def _regions(level: InspectedLevel) -> tuple[ColorImage, str]:
     marks = {place: ", ".join(alike[:3]) for place, alike in numbers.items()}
     dark = "; dark: masked" if level.photograph.mask is not None else ""
     title = f"regions by number of warp{dark}" if marks else f"no regions{dark}"
-    return _panel(image, PANELS_PER_ROW, marks=marks), title
+    return panel_of(image, PANELS_PER_ROW, marks=marks), title
 
 
 def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImage, str]:
@@ -100,7 +100,7 @@ def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImag
     palette = [DARK, *colors]
     drawn = [palette[number] for number in features.rectification_ids.tolist()]
     pale = 255 - (255 - level.photograph.gray) // 2
-    image = _panel(pale, PANELS_PER_ROW, features, drawn, MAX_NUM_FEATURES)
+    image = panel_of(pale, PANELS_PER_ROW, features, drawn, MAX_NUM_FEATURES)
     shown = min(len(features), MAX_NUM_FEATURES)
     return image, f"the strongest {shown} of {len(features)} features; gray: without a warp"
 
@@ -113,11 +113,11 @@ def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, 
         outside = 255 - (255 - image) // 4
         image = np.where(mask if image.ndim == 2 else mask[:, :, None], image, outside)
     features = replace(kept, lafs=transform_frames(item.rectified_from_image, kept.lafs))
-    panel = _panel(image, WARPS_PER_ROW, features, [color] * len(kept), MAX_NUM_WARP_FEATURES)
+    panel = panel_of(image, WARPS_PER_ROW, features, [color] * len(kept), MAX_NUM_WARP_FEATURES)
     return panel, f"{index + 1}: tilt {item.tilt:.2f}, {len(kept)} of {len(found)} features"
 
 
-def _panel(
+def panel_of(
     image: GrayImage | ColorImage,
     per_row: int,
     features: LocalFeatures | None = None,
@@ -146,7 +146,8 @@ def _panel(
     return panel
 
 
-def _row(panels: Sequence[tuple[ColorImage, str]], per_row: int) -> ColorImage:
+def row_of(panels: Sequence[tuple[ColorImage, str]], per_row: int) -> ColorImage:
+    """Put panels side by side, each below its title."""
     height = max(len(panel) for panel, _ in panels) + TITLE_PX
     row = np.full((height, WIDTH_PX, 3), 255, np.uint8)
     for place, (panel, title) in enumerate(panels):

@@ -3,8 +3,9 @@
 import base64
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
+from colmap_affrect.data import ColorImage
 from colmap_affrect.errors import ImageError
 from colmap_affrect.images.reading import encode_jpeg, read_color
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -22,6 +23,12 @@ class Picture(NamedTuple):
     width: int
     height: int
 
+    @classmethod
+    def of(cls, image: ColorImage) -> Self:
+        """Encode an (H, W, 3) image."""
+        data = base64_text(encode_jpeg(image, JPEG_QUALITY))
+        return cls(f"data:image/jpeg;base64,{data}", image.shape[1], len(image))
+
 
 def base64_text(data: bytes) -> str:
     """Return bytes as base64."""
@@ -37,11 +44,9 @@ def thumbnails(
 
     def picture(name: str) -> Picture | None:
         try:
-            image = read_color(folder / name, size_px)
+            return Picture.of(read_color(folder / name, size_px))
         except ImageError:
             return None
-        data = encode_jpeg(image, JPEG_QUALITY)
-        return Picture(f"data:image/jpeg;base64,{base64_text(data)}", image.shape[1], len(image))
 
     found = {}
     with progress.stage("pictures", len(shown), "images") as advance:

@@ -3,6 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
@@ -13,6 +14,7 @@ from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, read_summaries
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
@@ -96,6 +98,21 @@ def _inputs(context: Context, extend: Extension | None) -> str:
         return verified
     own = extend.model_path.resolve().is_relative_to(context.workspace.sparse.resolve())
     return f"{verified} {'own' if own else extend.digest()}"
+
+
+def agreements(path: Path, model: pycolmap.Reconstruction) -> dict[Pair, float]:
+    """Return the share of inliers that agrees with a model by verified pair of a database.
+
+    The strongest pairs of each photograph in the model count, the lower id of the database first.
+    """
+    graph = PairGraph.read(path, 1)
+    ids = {name: image_id for image_id, name in graph.names.items()}  # the model may have others
+    same = {i: ids[image.name] for i, image in model.images.items() if image.name in ids}
+    poses = {same[i]: pose for i, pose in poses_of(model).items() if i in same}
+    cameras = {same[i]: camera for i, camera in cameras_of(model).items() if i in same}
+    pairs = graph.pairs_inside(poses)
+    shares = {pair.ids: graph.agreement(pair, poses, cameras) for pair in pairs}
+    return {(graph.names[one], graph.names[two]): n for (one, two), n in shares.items()}
 
 
 def image_names(context: Context) -> list[str]:
