@@ -34,6 +34,7 @@ from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
+from colmap_affrect.report.pairs import draw_pair
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.extract import write_descriptors
 from colmap_affrect.stages.match import match as match_pairs
@@ -266,6 +267,11 @@ def inspect(options: argparse.Namespace) -> None:
     mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])
     show(inspect_image(extractor, options.image, options.output_path, mask))
+
+
+def show_pair(options: argparse.Namespace) -> None:
+    photographs = given.folder("--image-path", options.image_path)
+    show(draw_pair(options.path, tuple(options.pair), photographs, options.picture_path))
 
 
 def convert(options: argparse.Namespace) -> None:

@@ -196,6 +196,10 @@ FLAGS: dict[str, Settings] = {
         default=[]),
     # looking into things
     "image": _path("IMAGE", "the photograph"),
+    "pair": _value("IMAGE", "the names of two photographs, as in pairs.txt", nargs=2),
+    "--image-path@pair": _path("PATH", "folder of the photographs (default: that of the run)"),
+    "--output-path@pair": _path("FILE", "PNG file to make, in no folder of photographs (default: "
+        "pairs/a--b.png in the folder of the run)", dest="picture_path"),
     "path@optional": _path("PATH", "output folder, or any COLMAP database", nargs="?"),
     "name": {"nargs": "?", "help": "print this recipe with all of its options"},
     "action": {"choices": ["list", "fetch"], "nargs": "?", "default": "list",

@@ -24,6 +24,8 @@ EXAMPLES = (
     "      --recipes unrectified-rootsift,rectified,default",
     "convert --image-path scans --output-path photos",
     "inspect photos/a.jpg --output-path out",
+    "show-pair out a.jpg b.jpg",
+    "show-pair any.db a.jpg b.jpg --image-path photos --output-path pair.png",
     "recipes on-demand",
     "weights fetch affnet orinet hardnet --weights folder",
     "doctor out",
@@ -143,6 +145,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "inspect": (
         "draw what a recipe does to one image: regions, warps, features",
         f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),
+    "show-pair": (
+        "draw two photographs side by side, with lines between what was matched",
+        "path pair --image-path@pair --output-path@pair"),
     "import-h5": ("features and matches in hloc's files into a new COLMAP database",
         "--image-path! --features-path! --matches-path! --database-path! "
         f"{CAMERAS} --random-seed"),

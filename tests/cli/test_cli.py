@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from command import Call, on_photographs
+from PIL import Image
 from small_scene import write_photographs
 
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
 from colmap_affrect.colmap.model_files import model_poses
+from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.reliability import Judgement
@@ -44,7 +47,8 @@ def test_help_has_options_and_examples(command: list[str], call: Call) -> None:
 def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
     parser = build_parser()
     assert {example.split()[0] for example in EXAMPLES} == {
-        *COMMANDS, "convert", "import-h5", "export-h5", "export-database", "export", "align",
+        *COMMANDS, "convert", "show-pair", "import-h5", "export-h5", "export-database", "export",
+        "align",
     }  # fmt: skip
     for example in EXAMPLES:
         parser.parse_args(example.replace("\\\n", " ").split())
@@ -181,6 +185,7 @@ INPUTS = {
     "match --output-path OUT": "--weights",
     "map --output-path NEW --from-database OUT/database.db": "--image-path",
     f"import-h5 --image-path PHOTOS {H5}": "--cameras-path",
+    "show-pair OUT a.png side/č.png": "--image-path",
     f"align {MODEL}": "--gps --positions --points",
     # what a command cannot do without
     "extract --output-path NEW --image-path NONE": "",
@@ -194,6 +199,7 @@ INPUTS = {
     "export-database NONE NEW": "",
     "export --output-path NEW --model-path NONE": "",
     "doctor NONE": "",
+    "show-pair NONE a.png side/č.png": "",
     "recipes NONE": "",
 }
 """Commands with options of inputs that they may be given."""
@@ -238,6 +244,65 @@ def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
     sheet = out / "view_5_tilt70-inspection.png"
     assert sheet.stat().st_size > 50_000
     assert str(sheet) in done.stdout
+
+
+def test_show_pair_draws_matches_of_a_run_and_of_any_database(
+    verified: Path, photos: Path, tmp_path: Path, call: Call
+) -> None:
+    digest = rows_digest(verified / "database.db")
+    names = ["a.png", "side/č.png"]
+    for _ in range(2):  # the second picture takes the place of the first
+        done = call("show-pair", verified, *names)
+        assert (done.code, done.stderr) == (0, [])
+    said, path = done.stdout.splitlines()
+    assert re.match(
+        r"a\.png and side/č\.png: \d+ raw matches of level 0 \(identity\), \d+ inliers, \d+% of",
+        said,
+    )
+    assert path == str(verified / "pairs" / "a--side-č.png")
+    with Image.open(path) as picture:
+        assert picture.format == "PNG"
+        assert picture.width == 1596
+        assert 500 < picture.height < 800
+    copied = tmp_path / "any.db"
+    shutil.copy(verified / "database.db", copied)
+    given = ["show-pair", copied, *names, "--image-path", photos, "--output-path"]
+    done = call(*given, tmp_path / "pair.png")
+    assert (done.code, done.stderr) == (0, [])
+    assert (
+        done.stdout.splitlines()[0] == said.partition(" of level")[0] + ", " + said.split(", ")[1]
+    )
+    before = (tmp_path / "pair.png").read_bytes()
+    done = call(*given, tmp_path / "pair.png")
+    assert (done.code, done.stderr[0].endswith("give another name or folder")) == (2, True)
+    assert (tmp_path / "pair.png").read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["any.db", "pair.png"]
+    assert rows_digest(verified / "database.db") == digest
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("OUT a.pgn side/č.png", "a.pgn: no such photograph (did you mean 'a.png'?)"),
+        ("OUT a.png a.png", "a.png, a.png: never matched"),
+        ("OUT/database.db a.png side/č.png", "--image-path: give the folder of the photographs"),
+        ("OUT/database.db a.png side/č.png --image-path PHOTOS", "--output-path: give the name"),
+        ("OUT a.png side/č.png --output-path NEW/pair.jpg", "new file that ends in .png"),
+        ("OUT a.png side/č.png --output-path PHOTOS/pair.png", "in the folder of the photographs"),
+        ("PHOTOS a.png side/č.png", "database.db: no such file; give a COLMAP database"),
+    ],
+)
+def test_show_pair_says_what_it_lacks_and_makes_nothing(
+    verified: Path, photos: Path, tmp_path: Path, arguments: str, message: str, call: Call
+) -> None:
+    for name, path in {"OUT": verified, "PHOTOS": photos, "NEW": tmp_path / "new"}.items():
+        arguments = arguments.replace(name, str(path))
+    before = sorted(photos.rglob("*"))
+    done = call("show-pair", *arguments.split())
+    assert (done.code, done.stdout, len(done.stderr)) == (2, "", 1)
+    assert message in done.stderr[0]
+    assert sorted(photos.rglob("*")) == before
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

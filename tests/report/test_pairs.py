@@ -1,0 +1,192 @@
+"""Pictures of pairs: lines where the matches are, in the colour of their kind, and which pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_comparison import write_scene
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import keypoint_counts, open_database
+from colmap_affrect.errors import OptionError
+from colmap_affrect.report import pairs
+from colmap_affrect.report.inspection import WIDTH_PX
+from colmap_affrect.report.pairs import (
+    BY_HAND,
+    COLORS,
+    GUIDED,
+    LEARNED,
+    OTHERS,
+    OWN,
+    REJECTED,
+    WARPED,
+    KnownPair,
+    PairReader,
+    draw_matches,
+)
+from colmap_affrect.stages.map import agreements
+
+NAMES = ("a.png", "b.png", "c.png", "d.png", "e.png", "f.png")
+SIZES = [(400, 300), (150, 300)]
+PHOTOGRAPHS = [np.zeros((height, width, 3), np.uint8) for width, height in SIZES]
+SIDE = WIDTH_PX // 2 - 4  # longest side of what is drawn of a photograph
+
+
+def known(first: Any, second: Any, kinds: Any) -> KnownPair:
+    places = [np.asarray(points, np.float64) for points in (first, second)]
+    return KnownPair(SIZES, places, np.asarray(kinds), "")
+
+
+def test_lines_join_the_matches_in_the_colours_of_their_kinds() -> None:
+    """One photograph is wide and one high: their scales differ."""
+    pair = known([(100.0, 30.0), (390.0, 290.0)], [(30.0, 150.0), (140.0, 10.0)], [OWN, GUIDED])
+    drawn = draw_matches(pair, PHOTOGRAPHS)
+    assert drawn.shape == (SIDE, WIDTH_PX, 3)
+    scales, far = (SIDE / 400, SIDE / 300), np.full(drawn.shape[:2], np.inf)
+    rows, columns = np.indices(far.shape)
+    for index, kind in enumerate((OWN, GUIDED)):
+        first, second = (pair.places[side][index] * scales[side] - 0.5 for side in (0, 1))
+        second[0] += WIDTH_PX // 2
+        for share in (0.0, 0.3, 1.0):
+            x, y = np.rint(first + share * (second - first)).astype(int)
+            around = drawn[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3).astype(int)
+            assert np.abs(around - COLORS[kind]).sum(axis=1).min() < 30
+        normal = np.array([first[1] - second[1], second[0] - first[0]])
+        normal /= np.linalg.norm(normal)
+        offsets = (columns - first[0]) * normal[0] + (rows - first[1]) * normal[1]
+        far = np.minimum(far, np.abs(offsets))
+    drawn[int(scales[0] * 300) :, : WIDTH_PX // 2] = 0  # white below the wide photograph
+    drawn[:, SIDE : WIDTH_PX // 2] = drawn[:, WIDTH_PX // 2 + int(scales[1] * 150) :] = 0
+    assert far[drawn.any(axis=2)].max() < 6
+
+
+def test_photographs_that_were_shrunk_get_the_same_lines() -> None:
+    pair = known([(100.0, 30.0)], [(30.0, 150.0)], [WARPED])
+    small = [np.ascontiguousarray(image[::2, ::2]) for image in PHOTOGRAPHS]
+    np.testing.assert_array_equal(draw_matches(pair, small), draw_matches(pair, PHOTOGRAPHS))
+
+
+@pytest.mark.parametrize("count", [0, 1, 199, 1001])
+def test_numbers_of_lines_are_bounded_for_inliers_and_the_others(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(pairs.cv2, "line", lambda *given: drawn.append(given[3]))
+    kinds = [OWN] * count + [REJECTED] * 3 * count
+    points = np.full((len(kinds), 2), 40.0)
+    draw_matches(known(points, points, kinds), PHOTOGRAPHS)
+    for kind, num in ((OWN, count), (REJECTED, 3 * count)):
+        assert drawn.count(COLORS[kind]) == min(num, 200)
+
+
+class Stores(SimpleNamespace):
+    """Of a run whose odd features are of warps; from number 60 on they have no shapes."""
+
+    def __init__(self, folder: Path, begun: list[str]) -> None:
+        levels = [
+            SimpleNamespace(name=name, features=SimpleNamespace(has_shapes=name == "first"))
+            for name in ("first", "second")
+        ]
+        super().__init__(
+            workspace=SimpleNamespace(sparse=folder / "sparse", begun=begun, is_changed=False),
+            extraction=SimpleNamespace(levels=levels),
+            counts=keypoint_counts(folder / "database.db"),
+            features=self,
+            matches=self,
+        )
+
+    def read(self, name: str) -> Any:
+        return SimpleNamespace(rectification_ids=np.arange(self.counts[name]) % 2)
+
+    def level_ranges(self, _: str) -> dict[int, range]:
+        return {0: range(60), 1: range(60, 1000)}
+
+    def levels(self, asked: list[tuple[str, str]]) -> dict[tuple[str, str], int]:
+        return dict.fromkeys(asked, 1)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a database and a model, with one tie point in the photographs 2 and 3.
+
+    Of their matches the first is found by guided matching only, and one raw match is wrong.
+    """
+    folder = tmp_path_factory.mktemp("scene")
+    model, _ = write_scene(folder / "database.db", NAMES)
+    ids = [model.find_image_with_name(name).image_id for name in NAMES[2:4]]
+    with open_database(folder / "database.db") as database:
+        raw = np.asarray(database.read_matches(*ids))
+        wrong = np.array([[raw[0, 0], raw[1, 1]]], raw.dtype)
+        database.delete_matches(*ids)
+        database.write_matches(*ids, np.concatenate([raw[1:], wrong]))
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    model.write_text(sparse)
+    lines = (sparse / "images.txt").read_text().splitlines()
+    track = "99999 0 0 0 0 0 0 0"
+    for number, line in enumerate(lines):
+        if line.endswith(NAMES[2:4]):
+            image_id = int(line.split()[0])
+            track += f" {image_id} {len(lines[number + 1].split()) // 3}"
+            lines[number + 1] += f" {10 + image_id} 20 99999"
+    (sparse / "images.txt").write_text("\n".join([*lines, ""]))
+    with (sparse / "points3D.txt").open("a") as file:
+        file.write(f"{track}\n")
+    return folder
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned: bool) -> None:
+    stores: Any = Stores(scene, ["match"])
+    reader = PairReader(scene / "database.db", stores)
+    names = NAMES[3:1:-1] if turned else NAMES[2:4]
+    pair = reader.read(names)
+    with open_database(scene / "database.db") as database:
+        images = {image.name: image.image_id for image in database.read_all_images()}
+        ids = [images[name] for name in names]
+        inliers = np.asarray(database.read_two_view_geometry(*ids).inlier_matches, np.int64)
+        points = [np.asarray(database.read_keypoints(i)[:, :2]) for i in ids]
+        raw = {tuple(row) for row in database.read_matches(*ids).tolist()}
+    expected = np.where((inliers % 2).any(axis=1), WARPED, OWN)
+    expected[(inliers >= 60).any(axis=1)] = LEARNED
+    expected[[tuple(row) not in raw for row in inliers.tolist()]] = GUIDED
+    assert np.count_nonzero(expected == GUIDED) == 1
+    np.testing.assert_array_equal(pair.kinds, [*expected, REJECTED, BY_HAND])
+    np.testing.assert_allclose(pair.places[1][: len(inliers)], points[1][inliers[:, 1]])
+    marks = [(10.0 + image_id, 20.0) for image_id in ids]
+    np.testing.assert_allclose([places[-1] for places in pair.places], marks)
+    count = len(inliers)
+    assert pair.text == (
+        f"{count} raw matches of level 1 (second), {count} inliers, 100% of them agree with the "
+        "model"
+    )
+
+
+def test_of_the_database_of_another_program_inliers_are_of_one_kind(scene: Path) -> None:
+    stores: Any = Stores(scene, [])
+    stores.workspace.sparse = scene / "none"
+    reader = PairReader(scene / "database.db", stores)
+    pair = reader.read(NAMES[2:4])
+    assert set(pair.kinds.tolist()) == {OTHERS, REJECTED}
+    assert "model" not in pair.text
+    stores = Stores(scene, ["match"])
+    stores.counts[NAMES[3]] += 1  # the database has others than the run
+    pair = PairReader(scene / "database.db", stores).read(NAMES[2:4])
+    assert set(pair.kinds.tolist()) == {OTHERS, REJECTED, BY_HAND}
+    with pytest.raises(OptionError, match=r"c\.jpg: no such photograph \(did you mean 'c\.png'"):
+        reader.read(("c.jpg", NAMES[3]))
+    with pytest.raises(OptionError, match="never matched"):
+        reader.read((NAMES[3], NAMES[3]))
+
+
+def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    one, other = (model.find_image_with_name(name) for name in NAMES[:2])
+    one.frame.rig_from_world = pycolmap.Rigid3d(other.cam_from_world().matrix())
+    shares = agreements(scene / "database.db", model)
+    for pair, share in shares.items():
+        assert share < 0.5 if NAMES[0] in pair else share > 0.95
