@@ -30,6 +30,7 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.report.pairs import pairs_of_page
 from colmap_affrect.report.run_page import write_run_page
 from colmap_affrect.stages.climb import climb
 from colmap_affrect.stages.context import Context, Inputs, Resources
@@ -239,5 +240,8 @@ def map_and_report(
     replace_text(workspace.report, result.to_json())
     if page:
         image_path = workspace.photographs()
-        write_run_page(workspace, result, names, pair_inliers, image_path, context.progress, marks)
+        looks, progress = pairs_of_page(context, result, pair_inliers), context.progress
+        write_run_page(
+            workspace, result, names, pair_inliers, image_path, progress, marks=marks, looks=looks
+        )
     return result

@@ -1,10 +1,14 @@
 """Pairs of photographs side by side, with lines between what was matched."""
 
-from collections.abc import Sequence
+import shlex
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
+from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,16 +20,18 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.data import ColorImage
-from colmap_affrect.errors import OptionError, StoreError
+from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Indices, rows_in
 from colmap_affrect.geometry.conventions import pixel_from_colmap, resized_from_original
-from colmap_affrect.images.reading import read_color
+from colmap_affrect.images.reading import read_color, shrink_to
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.report import ModelSummary, ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import inspection as sheets
+from colmap_affrect.report.pictures import Picture
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.map import agreements
 
@@ -36,6 +42,7 @@ measured shapes, of guided matching alone, of tie points, of another program; of
 OWN, WARPED, LEARNED, GUIDED, BY_HAND, OTHERS, REJECTED = range(len(KINDS))
 COLORS = [tuple(bytes.fromhex(color[1:])) for color in KINDS.values()]
 MAX_NUM_LINES = 200  # of inliers, and of other matches
+MAX_NUM_SHOWN, MAX_NUM_ALIKE = 12, 3  # pairs in a page, and those that nothing speaks against
 SIDE_PX = 450  # of photographs in a page
 
 
@@ -167,8 +174,61 @@ def draw_pair(
     drawn = draw_matches(pair, [read_color(image_path / name, SIDE_PX * 2) for name in names])
     counts = zip(KINDS, COLORS, np.bincount(pair.kinds, minlength=len(KINDS)), strict=True)
     bars = [(np.full((4, 150, 3), c, np.uint8), f"{kind}: {n}") for kind, c, n in counts if n]
-    rows = [sheets.row_of(bars, len(KINDS)), sheets.row_of([(drawn, text)], 1)]
+    legend = sheets.row_of(bars or [(drawn[:0], "no matches")], len(KINDS))
+    rows = [legend, sheets.row_of([(drawn, text)], 1)]
     _, data = cv2.imencode(".png", np.concatenate(rows)[:, :, ::-1])
     with new_results(target, names=names, replaces=not picture_path) as (new,):
         replace_bytes(new, data.tobytes())
     return f"{text}\n{target}"
+
+
+def pairs_of_page(
+    context: Context, report: ReconstructionReport, verified: Mapping[Pair, int]
+) -> list[dict[str, Any]]:
+    """Draw the pairs of a run that a person should see; none where photographs are not known.
+
+    ``verified`` has the inliers of pairs that may be used. Each has ``names``, ``why`` it is shown,
+    the ``text`` that is known of it, the ``option`` that leaves it out, and a ``picture``.
+    """
+    if not (folder := context.workspace.photographs()):
+        return []
+    reader, found = PairReader(context.workspace.database, context), []
+    photograph = cache(lambda name: read_color(folder / name, SIDE_PX))
+    for names, why in _chosen(reader, report, verified).items():
+        with suppress(AffrectError):  # unreadable, or rejected by hand and never matched
+            pair, option = reader.read(names), shlex.join(["--reject-pair", ",".join(names)])
+            drawn = draw_matches(pair, [photograph(name) for name in names])
+            one = {"names": names, "why": why, "text": pair.text, "option": option}
+            found.append({**one, "picture": Picture.of(shrink_to(drawn, 2 * SIDE_PX))})
+    return found
+
+
+def _chosen(
+    reader: PairReader, report: ReconstructionReport, verified: Mapping[Pair, int]
+) -> dict[Pair, str]:
+    """Return at most ``MAX_NUM_SHOWN`` pairs, some of each sort, and why they are worth a look."""
+    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    context, shares, best = reader.context, reader.shares, dict[str, Pair]()
+    inside = set(model.registered_names)
+    for pair in sorted(verified, key=lambda pair: -verified[pair]):
+        for name, other in (pair, pair[::-1]):
+            if other in inside or not inside:
+                best.setdefault(name, pair)
+    held = sorted(inside & best.keys(), key=lambda name: verified[best[name]])
+    guided = sorted(context.guided.read(), key=lambda pair: len(pair.exact) - pair.num_inliers)
+    sorts: list[list[tuple[Any, str]]] = [
+        [(pair, "most inliers disagree with the model") for pair in shares if shares[pair] < 0.5],
+        [(pair, "rejected by hand") for pair in context.by_hand.rejected],
+        [((name, x.by), f"{name} came in by this pair") for name, x in model.bridges.items()],
+        [(best.get(name), f"{name} is doubtful") for name in model.doubtful],
+        [(best.get(name), f"{name} is missing") for name in report.unregistered],
+        [(best[name], f"the strongest pair of {name}") for name in held[:MAX_NUM_ALIKE]],
+        [(one.names, "guided") for one in guided[:MAX_NUM_ALIKE] if one.num_inliers],
+    ]
+    why = defaultdict[Pair, list[str]](list)
+    for row in zip_longest(*sorts, fillvalue=(None, "")):
+        for (first, second), text in (found for found in row if found[0]):
+            pair = min(first, second), max(first, second)
+            if pair in why or len(why) < MAX_NUM_SHOWN:
+                why[pair].append(text)
+    return {pair: "; ".join(texts) for pair, texts in why.items()}

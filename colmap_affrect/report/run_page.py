@@ -22,6 +22,7 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.page import TEMPLATES, write_page
+from colmap_affrect.report.pairs import KINDS as LINES
 from colmap_affrect.report.pictures import base64_text
 from colmap_affrect.report.scene import read_view
 
@@ -54,12 +55,15 @@ def write_run_page(
     pair_inliers: Mapping[Pair, int],
     image_path: Path | None,
     progress: Progress = SILENT,
+    *,
     marks: Marks | None = None,
+    looks: Sequence[Mapping[str, Any]] = (),
 ) -> Path:
     """Write ``report.html`` of a run, one file that loads nothing; WorkspaceError if it cannot.
 
     ``names`` are those of all photographs, ``image_path`` their folder, if known; ``pair_inliers``
-    are of the verified pairs, ``marks`` those of the tie points by hand.
+    are of the verified pairs, ``marks`` those of the tie points by hand; ``looks`` see
+    :func:`.pairs.pairs_of_page`.
     """
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
     cards = [_card(name, report, model) for name in names]
@@ -78,6 +82,8 @@ def write_run_page(
         "kinds": {kind: f"{text} ({kinds[kind]})" for kind, text in KINDS.items() if kinds[kind]},
         "cards": cards,
         "num_pairs": len(pair_inliers),
+        "looks": looks,
+        "line_colors": LINES,
         "matrix": _matrix(names, pair_inliers),
         **_cameras(report, names),
         **_tie_points(workspace, model, names, marks or {}),

@@ -305,6 +305,17 @@ def test_show_pair_says_what_it_lacks_and_makes_nothing(
     assert not list(tmp_path.iterdir())
 
 
+def test_page_of_a_run_has_pictures_of_pairs(verified: Path, call: Call) -> None:
+    assert call("map", "--output-path", verified, "-q").code == 0
+    page = (verified / "report.html").read_text(encoding="utf-8")
+    section = page.partition('<section id="looks">')[2].partition("</section>")[0]
+    assert "the strongest pair of a.png" in section
+    assert "--reject-pair &#39;a.png,b c.png&#39;" in section
+    widths = re.findall(r'src="data:image/jpeg;base64,[^"]{9999,}" width="(\d+)"', section)
+    assert 1 <= len(widths) <= 3
+    assert set(widths) == {"900"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,10 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from small_comparison import write_scene
+from small_run import small_report
+from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.by_hand import NOTHING, ByHand
 from colmap_affrect.colmap.database import keypoint_counts, open_database
+from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
+from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.report import pairs
 from colmap_affrect.report.inspection import WIDTH_PX
 from colmap_affrect.report.pairs import (
@@ -183,6 +190,22 @@ def test_of_the_database_of_another_program_inliers_are_of_one_kind(scene: Path)
         reader.read((NAMES[3], NAMES[3]))
 
 
+def test_a_pair_without_any_match_is_drawn_too(scene: Path, tmp_path: Path) -> None:
+    path = tmp_path / "any.db"
+    copy_database(scene / "database.db", path)
+    with open_database(path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        pair = ids[NAMES[0]], ids[NAMES[1]]
+        database.delete_matches(*pair)
+        database.delete_two_view_geometry(*pair)
+        database.write_matches(*pair, np.zeros((0, 2), np.uint32))
+    (tmp_path / "photographs").mkdir()
+    for name in NAMES[:2]:
+        write_image(tmp_path / "photographs" / name, texture((160, 120), 1))
+    said = pairs.draw_pair(path, NAMES[:2], tmp_path / "photographs", tmp_path / "pair.png")
+    assert said == f"a.png and b.png: 0 raw matches, 0 inliers\n{tmp_path / 'pair.png'}"
+
+
 def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
     one, other = (model.find_image_with_name(name) for name in NAMES[:2])
@@ -190,3 +213,46 @@ def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
     shares = agreements(scene / "database.db", model)
     for pair, share in shares.items():
         assert share < 0.5 if NAMES[0] in pair else share > 0.95
+
+
+def chosen(
+    report: Any, verified: Any, by_hand: ByHand = NOTHING, shares: Any = None, guided: Any = ()
+) -> dict[tuple[str, str], str]:
+    context: Any = SimpleNamespace(by_hand=by_hand, guided=SimpleNamespace(read=lambda: guided))
+    reader: Any = SimpleNamespace(context=context, shares=shares or {})
+    return pairs._chosen(reader, report, verified)
+
+
+def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
+    model = ModelSummary(tuple("abcdef"), 9, 2.0, 0.5, doubtful={"f": "why"})
+    report = replace(small_report(tmp_path), models=(model,), unregistered={"g": "not registered"})
+    verified = {
+        ("a", "b"): 900, ("b", "c"): 800, ("c", "d"): 50, ("d", "e"): 40, ("a", "f"): 30,
+        ("e", "f"): 20, ("f", "g"): 60, ("a", "c"): 700,
+    }  # fmt: skip
+    guided = [SimpleNamespace(names=("b", "c"), exact=range(500), num_inliers=800)]
+    guided += [SimpleNamespace(names=("a", "b"), exact=range(500), num_inliers=0)]
+    shares = {("a", "c"): 0.1, ("a", "b"): 0.9, ("a", "e"): 0.0}
+    found = chosen(report, verified, ByHand(rejected=(("e", "a"),)), shares, guided)
+    assert found == {
+        ("a", "c"): "most inliers disagree with the model",
+        ("a", "e"): "rejected by hand; most inliers disagree with the model",
+        ("a", "f"): "f is doubtful; the strongest pair of f",
+        ("f", "g"): "g is missing",
+        ("d", "e"): "the strongest pair of e",
+        ("b", "c"): "guided",
+        ("c", "d"): "the strongest pair of d",
+    }
+
+
+def test_of_many_pairs_twelve_are_shown_and_without_a_model_the_missing_ones(
+    tmp_path: Path,
+) -> None:
+    names = [f"{number:03d}.jpg" for number in range(150)]
+    verified = dict.fromkeys(pairwise(names), 100)
+    report = small_report(tmp_path)
+    doubtful = dict.fromkeys(names, "why")
+    whole = replace(report, models=(ModelSummary(tuple(names), 9, 2.0, 0.5, doubtful=doubtful),))
+    assert len(chosen(whole, verified)) == 12
+    without = replace(report, models=(), unregistered={"007.jpg": "not registered"})
+    assert chosen(without, verified) == {("006.jpg", "007.jpg"): "007.jpg is missing"}
