@@ -32,12 +32,13 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.pairs import pairs_of_page
 from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.stages.advice import advice
 from colmap_affrect.stages.climb import climb
 from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_descriptors
 from colmap_affrect.stages.guide import guide, guided_counts
-from colmap_affrect.stages.map import advice, image_names, map_images, unregistered
+from colmap_affrect.stages.map import image_names, map_images, unregistered
 from colmap_affrect.stages.match import load_matchers, match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
@@ -78,6 +79,7 @@ class RunOptions(InputOptions):
     extend: Extension | None = None  # the model that the photographs are registered into
     by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
     max_minutes: float = math.inf  # after which nothing more is tried for photographs in need
+    command: tuple[str, ...] = ()  # words of the command line, for advice
 
 
 def run(
@@ -114,7 +116,8 @@ def run(
     _check_by_hand(options.by_hand, names, mapper)
     shown = progress.with_forecast(Forecast(len(names), _num_pairs(names, options.pairs)))
     until_s, workspace = time.monotonic() + 60 * options.max_minutes, Workspace(output_path)
-    context = Context(workspace, options.resources, executor, shown, until_s, options.by_hand)
+    given = options.by_hand, options.command
+    context = Context(workspace, options.resources, executor, shown, until_s, *given)
     if options.extend:
         if overwrite:
             options.extend.refuse_discarding(output_path)
@@ -233,7 +236,7 @@ def map_and_report(
             for camera_id, record in cameras.items()
         ),
         extended=tuple(before),
-        advice=advice(context, missing, models),
+        advice=advice(context, missing, models, pair_inliers),
         by_hand=context.by_hand.texts(),
     )
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report

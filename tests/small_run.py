@@ -10,6 +10,7 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.report import (
+    Advice,
     Bridge,
     ModelSummary,
     ReconstructionReport,
@@ -21,6 +22,8 @@ from colmap_affrect.report.run_page import write_run_page
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "b\u202egnp.c", "c.png", "d.png", "e.png", "f.png")
 """The second one is shown turned round where nobody takes care."""
+
+MORE = Advice("more photographs")
 
 
 def small_report(folder: Path) -> ReconstructionReport:
@@ -54,7 +57,7 @@ def small_report(folder: Path) -> ReconstructionReport:
         preset="sparse",
         verification={"max_error_px": 3.0},
         mapping={"name": "sparse", "mapper_options": {}},
-        advice=("--camera-mode single", "more photographs"),
+        advice=(Advice("one camera", f"colmap-affrect run --output-path {folder}/out-2"), MORE),
         guided={"pairs": 2, "matches_before": 20, "matches_after": 1050},
         cameras=(camera,),
     )

@@ -22,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         given = sys.argv[1:] if arguments is None else arguments
         options = build_parser().parse_args(given or ["--help"])
+        options.words = ("colmap-affrect", *(word for word in given if word != "--overwrite"))
         with _logging(options):
             from colmap_affrect.cli import commands  # not for --help
 

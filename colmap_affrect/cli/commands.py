@@ -6,6 +6,7 @@ runs: ``--help`` loads no heavy package.
 
 import argparse
 import shlex
+import shutil
 import sys
 from collections.abc import Iterable
 
@@ -51,6 +52,7 @@ def run(options: argparse.Namespace) -> None:
         extend=given.extension(options),
         by_hand=given.by_hand(options),
         max_minutes=options.max_minutes,
+        command=options.words,
         **given.inputs(options, recipe),
     )
     with given.executor(options) as executor:
@@ -239,15 +241,16 @@ def _next_steps(report: ReconstructionReport, workspace: Workspace) -> list[str]
     photos, model = workspace.photographs(), workspace.path / "sparse" / "0"
     page = f", to look at: {workspace.page}" if workspace.page.exists() else ""
     lines = [f"results     {workspace.path}{page}"]
-    if report.models:
+    if report.status not in ("ok", "partial"):
+        return lines
+    places = ["--model-path", str(model), "--output-path", str(workspace.path / "export")]
+    lines += ["next", f"            colmap-affrect export {shlex.join(places)}"]
+    if shutil.which("colmap"):
         mapped = workspace.mapped_database
         database = mapped if mapped.exists() else workspace.database
         look = ["--import_path", str(model), "--database_path", str(database)]
         look += ["--image_path", str(photos)] if photos else []
-        lines += ["next", f"            colmap gui {shlex.join(look)}"]
-    if report.status in ("ok", "partial"):
-        places = ["--model-path", str(model), "--output-path", str(workspace.path / "export")]
-        lines.append(f"            colmap-affrect export {shlex.join(places)}")
+        lines.append(f"            colmap gui {shlex.join(look)}")
     return lines
 
 
@@ -255,7 +258,8 @@ def _refuse_failures(failures: Iterable[str], options: argparse.Namespace) -> No
     """End with an error if more images than allowed could not be read."""
     names = list(dict.fromkeys(failures))
     if len(names) > (options.max_failures or 0):
-        raise ImageError(f"could not read {len(names)} of the images: {', '.join(names)}")
+        rest = f"the results are of the others (--max-failures {len(names)} accepts that)"
+        raise ImageError(f"could not read {len(names)} of the images: {', '.join(names)}; {rest}")
 
 
 def inspect(options: argparse.Namespace) -> None:

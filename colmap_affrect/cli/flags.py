@@ -92,6 +92,10 @@ FLAGS: dict[str, Settings] = {
         "with one label share a camera)", dest="cameras.cameras_path"),
     "--focal-length-px": _value("PX", "known focal length of images that --cameras-path does not "
         "name; the rest is refined", dest="cameras.focal_length_px", type=float),
+    "--focal-mm": _value("MM", "focal length of the lens of all images that have none by these or "
+        "by EXIF; with --film-width-mm", dest="cameras.focal_mm", type=float),
+    "--film-width-mm": _value("MM", "longer side of what an image shows of film, plate or sensor, "
+        "36 of small-format film", dest="cameras.film_width_mm", type=float),
     "--principal-point": _value("CX,CY", "where the optical axis meets the image, in px from its "
         "corner (default: its middle, wrong for prints and scans that were cropped off centre)",
         dest="cameras.principal_point"),

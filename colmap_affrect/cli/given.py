@@ -136,7 +136,8 @@ def context(options: argparse.Namespace) -> Iterator[Context]:
     with Workspace(options.output_path).locked() as workspace, executor(options) as where:
         is_first, maps = options.command == "extract", options.command == "map"
         said = by_hand(options) if maps else NOTHING
-        found = Context(workspace, resources(options), where, progress(options), by_hand=said)
+        shown, command = progress(options), options.words
+        found = Context(workspace, resources(options), where, shown, by_hand=said, command=command)
         discards = is_first and options.overwrite
         with watched(found, follows=not is_first, maps=maps, discards=discards):
             yield found

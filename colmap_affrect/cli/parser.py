@@ -111,7 +111,7 @@ VOLUME = "-q,--quiet|-v,--verbose"  # of all commands
 RESULTS = "--output-path! --overwrite"
 MASKS = "--mask-path --camera-mask-path"
 CAMERAS = """--camera-mode --camera-model --camera-params --cameras-path --focal-length-px
-    --principal-point --ignore-exif"""
+    --focal-mm --film-width-mm --principal-point --ignore-exif"""
 IMAGES = f"--image-path! --image-list-path {MASKS} --from-database {CAMERAS} --max-failures"
 RECIPE = "--recipe --set"
 PAIRS = "--match-list-path --pairs --num-neighbors --max-distance-m"

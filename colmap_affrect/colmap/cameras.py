@@ -167,6 +167,8 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     Raises OptionError for options that are wrong or contradict each other, and for a file that
     cannot be read, naming the line.
     """
+    if bool(options.focal_mm) != bool(options.film_width_mm):
+        raise OptionError("--focal-mm, --film-width-mm: one without the other; give both")
     says = {"name": "", "model": options.model, "params": options.params}
     if options.focal_length_px:
         says["focal_px"] = str(options.focal_length_px)

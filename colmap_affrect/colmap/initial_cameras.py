@@ -171,6 +171,13 @@ class InitialCameras:
             found = self._exif_focal(names)
             source = "exif-rescaled" if found.is_rescaled else "exif"
             focal, why = found.focal_px, found.why
+        if not focal and self.options.focal_mm:
+            source, why = "given", ""
+            focal = (
+                self.options.focal_mm
+                / self.options.film_width_mm
+                * max(camera.width, camera.height)
+            )
         if not focal:
             return "guess", why
         for index in camera.focal_length_idxs():

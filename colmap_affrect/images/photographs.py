@@ -35,6 +35,10 @@ class CameraOptions(Options):
     """COLMAP model, or CSV table by image name, with cameras that are known; empty for none."""
     focal_length_px: Annotated[float, within(0.0, 1e7)] = 0.0
     """Of all images that ``cameras_path`` does not name; 0 if it is not known."""
+    focal_mm: Annotated[float, within(0.0, 1e5)] = 0.0
+    """Of the lens of all images whose focal length nothing else says; 0 if it is not known."""
+    film_width_mm: Annotated[float, within(0.0, 1e5)] = 0.0
+    """Longer side of what these images show of film, plate or sensor."""
     principal_point: str = ""
     """``cx,cy`` in px from the image's corner; empty for the middle."""
 

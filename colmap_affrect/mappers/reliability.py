@@ -63,6 +63,9 @@ NUM_REASONS = 2  # that are said of a photograph
 
 FOCAL_CONTRADICTED = "the given focal length does not fit"
 FOCAL_UNKNOWN = "any focal length fits"
+CONTRADICTIONS = (
+    "its matches speak against its place", "of the matches of its pairs agree with the model",
+)  # fmt: skip
 COEFFICIENTS = Path(__file__).with_suffix(".json")
 
 
@@ -103,15 +106,11 @@ def _bridge_reason(m: Measures) -> str:
 TERMS: Mapping[str, Term] = {
     "evidence": Term(
         lambda m: math.copysign(math.log1p(abs(m.evidence) / 3.0), m.evidence),
-        lambda m: (
-            "its matches speak against its place"
-            if m.evidence < 0.0
-            else "few matches speak for its place"
-        ),
+        lambda m: CONTRADICTIONS[0] if m.evidence < 0.0 else "few matches speak for its place",
     ),
     "agreement": Term(
         lambda m: m.agreement,
-        lambda m: f"only {m.agreement:.0%} of the matches of its pairs agree with the model",
+        lambda m: f"only {m.agreement:.0%} {CONTRADICTIONS[1]}",
     ),
     "points of three": Term(
         lambda m: math.log1p(min(m.num_three, 300)),

@@ -61,6 +61,14 @@ def by_story(stories: Mapping[str, str]) -> list[str]:
 
 
 @dataclass(frozen=True)
+class Advice:
+    """What may help."""
+
+    why: str
+    command: str = ""  # for a shell; empty where none does it
+
+
+@dataclass(frozen=True)
 class StageReport:
     """One stage of a run."""
 
@@ -184,7 +192,7 @@ class ReconstructionReport:
     verification: dict[str, Any]  # options of two-view geometry
     mapping: dict[str, Any]  # the mapper and its options
     extended: tuple[str, ...] = ()  # names of the images of the model that was extended, if any
-    advice: tuple[str, ...] = ()  # what to try for the images that are missing
+    advice: tuple[Advice, ...] = ()  # what to try for images that are missing or doubtful
     # ``pairs`` that guided matching gave more inliers, and these inliers ``matches_before`` and
     # ``matches_after``; empty where no pair needed it
     guided: dict[str, int] = field(default_factory=dict)
@@ -290,9 +298,9 @@ class ReconstructionReport:
             lines += _some(f"warning     {name}: {why}" for name, why in self.warnings.items())
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines += [f"seconds     {seconds}"]
-        if self.advice:
+        for one in self.advice[:MAX_ADVICE]:
             lines += [
-                "try         (with another --output-path)",
-                *(f"            {text}" for text in self.advice[:MAX_ADVICE]),
+                f"try         {one.why}",
+                *([f"            {one.command}"] * bool(one.command)),
             ]
         return "\n".join(lines)

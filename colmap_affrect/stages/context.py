@@ -218,6 +218,7 @@ class Context:
     progress: Progress = SILENT  # where to show progress
     deadline_s: float = math.inf  # of time.monotonic(): from then on nothing more is tried
     by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
+    command: tuple[str, ...] = ()  # words of the command line, for advice
 
     def verified_digest(self) -> str:
         """Return digests of the verified pairs and, after a plus, of what is said by hand."""

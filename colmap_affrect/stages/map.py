@@ -2,7 +2,7 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
@@ -10,18 +10,15 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.errors import StoreError
-from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, read_summaries
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
-from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import unmeasured_pairs
 
-STRONGEST = "default"  # of the recipes
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
 
@@ -162,40 +159,3 @@ def unregistered(
             why = f"taken out, {taken_out[name]}" if name in taken_out else "not registered"
             reasons[name] = f"{why}; verified with {pairs}"
     return reasons
-
-
-def advice(
-    context: Context, missing: Collection[str], models: Sequence[ModelSummary]
-) -> tuple[str, ...]:
-    """Say what may help when images are missing or the largest model is doubtful, best first."""
-    against = [models[0].doubtful, models[0].taken_out] if models else []
-    doubts = "; ".join(why for reasons in against for why in reasons.values())
-    workspace = context.workspace
-    num_keypoints = colmap_database.keypoint_counts(workspace.database)
-    if (missing or doubts) and sum(map(bool, num_keypoints.values())) < 2:
-        return ("more photographs: two that can be read and show the same make a model",)
-    missing = [name for name in missing if name in num_keypoints]  # nothing helps unreadable ones
-    if not (missing or doubts):
-        return ()
-    is_foreign = workspace.is_foreign
-    texts = []
-    if FOCAL_CONTRADICTED in doubts:
-        texts.append("run again without the given focal lengths, or with others: they do not fit")
-    if not is_foreign and workspace.recipe() != STRONGEST:
-        texts.append(f"run again with --recipe {STRONGEST}, which tries more for these photographs")
-    elif not is_foreign and (how := context.resources.how_to_complete(context.extraction)):
-        texts.append(f"{how}; then run again: learned matching helps where light or age differ")
-    if FOCAL_UNKNOWN in doubts and not (is_foreign or context.inputs.from_database):
-        texts.append(
-            "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
-            "several focal lengths fit"
-        )
-    if is_foreign:
-        texts.append("run --from-database, with --image-path, makes new features for its images")
-    elif context.inputs.masks == MaskOptions():
-        texts.append(
-            "run again with --mask-path, if things move, repeat or are written on the photographs"
-        )
-    if missing:
-        texts.append("more photographs that show the missing places")
-    return tuple(texts)

@@ -90,6 +90,7 @@ def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], messa
     ("options", "message"),
     [
         ({"focal_length_px": -1.0}, "greater than or equal"),
+        ({"focal_mm": 50.0}, "--focal-mm, --film-width-mm: one without the other; give both"),
         (
             {"params": "900,450,300,0", "focal_length_px": 5.0},
             "--camera-params, .*: params have focal length",

@@ -137,6 +137,17 @@ def test_what_is_given_stays_and_the_rest_is_as_it_would_be(
     assert record.is_fixed == ("distortion" in record.given)
 
 
+def test_lens_and_film_stand_where_nothing_else_is_known(photos: Path) -> None:
+    lens = CameraOptions(focal_mm=50.0, film_width_mm=36.0)
+    camera, record = InitialCameras(photos, lens).camera(["a.jpg"], (90, 60))
+    assert (camera.focal_length, record.source) == (WIDE_PX, "exif")
+    ignoring = InitialCameras(photos, lens.changed(ignore_exif=True))
+    for size in ((90, 60), (60, 90)):  # the longer side is that of the film
+        camera, record = ignoring.camera(["a.jpg"], size)
+        assert camera.focal_length == pytest.approx(125.0)
+        assert (record.source, record.given, record.why) == ("given", ("focal",), "")
+
+
 def test_table_decides_who_shares_a_camera_and_the_rest_is_as_without(
     photos: Path, tmp_path: Path
 ) -> None:

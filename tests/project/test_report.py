@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from colmap_affrect.project.report import (
+    Advice,
     Bridge,
     ModelSummary,
     ReconstructionReport,
@@ -45,7 +46,7 @@ REPORT = ReconstructionReport(
         "random_seed": 7,
         "mapper_options": {"mapper.init_max_error": 3.0},
     },
-    advice=("--recipe on-demand",),
+    advice=(Advice("it tries more", "colmap-affrect run"), Advice("more photographs")),
     cameras=(
         {"id": 4, "source": "exif"},
         {"id": 2, "source": "guess"},
@@ -70,7 +71,10 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "status": "partial", "images_total": 5, "images_registered": 2, "num_models": 2,
         "registered_names": ["a.png", "č d.png"], "unregistered": REPORT.unregistered,
         "doubtful": {}, "probabilities": {}, "moves": [], "guided": {},
-        "advice": ["--recipe on-demand"],
+        "advice": [
+            {"why": "it tries more", "command": "colmap-affrect run"},
+            {"why": "more photographs", "command": ""},
+        ],
         "cameras": list(REPORT.cameras), "points3D": 120, "mean_track_length": 2.25,
         "mean_reprojection_error_px": 0.512, "models": [["a.png", "č d.png"], ["e.png", "f.png"]],
         "extended": [], "added": [], "num_pairs": 10, "num_verified_pairs": 3,
@@ -110,7 +114,7 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         "registered  2 of 5 images",
         "not broken.png: unreadable",
         "not e.png: not registered",
-        "try         (with another --output-path)\n            --recipe on-demand",
+        "try         it tries more\n            colmap-affrect run\ntry         more photographs",
         "joined      č d.png bridged by a.png, 32 of 36 depths agree, scale +-3.1%",
         "3 of 10 verified",
         "cameras     focal lengths: 2 from EXIF, 1 not known beforehand",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sqlite3
 from dataclasses import replace
@@ -16,20 +17,22 @@ from numpy.testing import assert_array_equal
 from results import database_content, hdf5_content
 from small_scene import IMAGE_SIZE, INTRINSICS, NAMES
 
+from colmap_affrect.cli.parser import build_parser
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.reliability import FOCAL_CONTRADICTED, FOCAL_UNKNOWN
+from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pipeline import RunOptions, run
-from colmap_affrect.project.report import ReconstructionReport
+from colmap_affrect.project.report import Bridge, ModelSummary, ReconstructionReport
 from colmap_affrect.project.stores import FeatureStore, pair_key
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.advice import advice
 from colmap_affrect.stages.context import Context, Resources
-from colmap_affrect.stages.map import advice
 from colmap_affrect.stages.verify import verify_matches
 
 CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
@@ -146,20 +149,42 @@ def test_advice_is_about_what_is_wrong(
     finished: tuple[Workspace, ReconstructionReport], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     workspace, report = finished
-    context, (model, *_) = Context(workspace), report.models
-    assert advice(context, ["unreadable.png"], [model]) == ()
-    masks = "run again with --mask-path, if things move, repeat or are written on the photographs"
-    doubtful = replace(model, doubtful={NAMES[0]: FOCAL_UNKNOWN})
-    assert masks in advice(context, ["unreadable.png"], [doubtful])
-    learned = "learned matching helps where light or age differ"
-    monkeypatch.setattr(Resources, "how_to_complete", lambda *_: "pip install it")
-    assert any(text.endswith(learned) for text in advice(context, [], [doubtful]))
-    assert masks in advice(context, [NAMES[0]], [model])
-    wrong = replace(model, taken_out={NAMES[0]: f"{FOCAL_CONTRADICTED}, 9 px: 8 px does"})
-    assert advice(context, [NAMES[0]], [wrong])[0].startswith("run again without the given focal")
-    first, *_, last = advice(context, [NAMES[0]], [doubtful])
-    assert first.endswith(learned)
-    assert last.startswith("more photographs that show")
+    command = ("colmap-affrect", "run", "--image-path", "a b", "--output-path", "out", "-q")
+    context, (model, *_) = Context(workspace, command=command), report.models
+    lost, wanted = NAMES[0], str(workspace.path.with_name(f"{workspace.path.name}-2"))
+
+    monkeypatch.setattr(Workspace, "recipe", lambda _: "rectified")
+
+    def commands(missing: list[str], model: ModelSummary, at: Context = context) -> list[str]:
+        found = [one.command for one in advice(at, missing, [model], {})]
+        for words in filter(None, found):  # the parser takes what is advised
+            build_parser().parse_args(shlex.split(words)[1:])
+        return found
+
+    assert commands(["unreadable.png"], model) == []
+    again = "colmap-affrect run --image-path 'a b' --output-path out -q"
+    anew = f"colmap-affrect run --image-path 'a b' -q {{}} --output-path {wanted}"
+    tied = f"{again} --tie-points tie-points.csv"
+    more = anew.format("--recipe default")
+    assert commands([lost], model) == [more, tied, ""]
+    unknown = replace(model, doubtful={lost: FOCAL_UNKNOWN})
+    assert commands([], unknown) == [anew.format("--focal-mm 50 --film-width-mm 36")]
+    wrong = replace(model, taken_out={lost: f"{FOCAL_CONTRADICTED}, 9 px: 8 px does"})
+    assert commands([lost], wrong)[0] == anew.format("--focal-length-px 8")
+    disputed = replace(model, doubtful={lost: f"9% {CONTRADICTIONS[1]}"}, gains={lost: 0.3})
+    assert commands([], disputed) == [more, anew.format("--mask-path masks")]
+    bridged = {lost: Bridge(NAMES[1], 5, 9, 0.2)}
+    alone = replace(model, doubtful={lost: f"bridged by {NAMES[1]} alone"}, bridges=bridged)
+    assert commands([], alone) == [f"{again} --reject-pair '{lost},{NAMES[1]}'"]
+    said = replace(context, by_hand=ByHand(Path("t.csv")), command=())
+    (_, tie_points, _) = advice(said, [lost], [model], {})
+    assert tie_points.why.startswith("no point of t.csv is seen by two photographs of one model")
+    assert tie_points.command.startswith("colmap-affrect map --output-path ")
+    (copies,) = advice(context, [*NAMES], [], {(lost, NAMES[1]): 900})
+    assert "from other places" in copies.why
+    monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
+    monkeypatch.setattr(Resources, "how_to_complete", lambda *_: "pip install it, or fetch it")
+    assert advice(context, [lost], [model], {})[0].command == f"pip install it && {again}"
 
 
 def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
