@@ -70,13 +70,19 @@
     document.getElementById("shown").textContent = `${shown} of ${cards.length} photographs shown`;
   });
 
-  // Everything that is folded is printed.
+  // Printed are also what is folded, and models from three sides, on white paper.
   let folded = [];
   addEventListener("beforeprint", () => {
+    document.documentElement.classList.add("printing");
     folded = all("details:not([open])");
     folded.forEach((item) => (item.open = true));
+    models.forEach((model) => model.drawSides());
   });
-  addEventListener("afterprint", () => folded.forEach((item) => (item.open = false)));
+  addEventListener("afterprint", () => {
+    document.documentElement.classList.remove("printing");
+    folded.forEach((item) => (item.open = false));
+    redraw();
+  });
 
   // Matrix of inliers: colours of the classes, numbers in a few large cells, and that under the pointer.
   const MAX_NUMBERED = 14;
@@ -124,6 +130,7 @@
 
   // Models: all are seen from the same place, a camera pointed at is marked in all.
   const [FRONT, TOP, DISTANCE, MAX_ZOOM] = [0.35, Math.PI / 2, 4, 20];
+  const SIDES = { front: [0, FRONT], side: [Math.PI / 2, 0], top: [0, TOP] };
   const [NEAR_PX, DRAG_PX, MAX_LABELLED] = [16, 6, 80];
   const eye = { yaw: 0, pitch: FRONT, zoom: 0, isMoved: false };
   let pointedAt = -1;
@@ -252,6 +259,18 @@
         labels.push([isPointedAt, camera.index + 1, ...camera.place]);
       }
       if (labels.length <= MAX_LABELLED) this.drawLabels(labels, density, style);
+    }
+
+    drawSides() {
+      const known = [this.canvas, this.context, { ...eye }];
+      for (const canvas of all(".sides canvas", this.canvas.closest("figure"))) {
+        [this.canvas, this.context] = [canvas, canvas.getContext("2d")];
+        [eye.yaw, eye.pitch] = SIDES[canvas.dataset.side];
+        eye.zoom = this.fittingZoom();
+        this.draw();
+      }
+      [this.canvas, this.context] = known;
+      Object.assign(eye, known[2]);
     }
 
     drawLabels(labels, density, style) {
