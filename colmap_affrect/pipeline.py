@@ -236,7 +236,7 @@ def map_and_report(
             for camera_id, record in cameras.items()
         ),
         extended=tuple(before),
-        advice=advice(context, missing, models, pair_inliers),
+        advice=advice(context, missing, models, max(pair_inliers.values(), default=0)),
         by_hand=context.by_hand.texts(),
     )
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report

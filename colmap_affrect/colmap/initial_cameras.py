@@ -48,6 +48,7 @@ from colmap_affrect.images.reading import is_too_large
 from colmap_affrect.project.outputs import database_files, remove_own, temporary_folder
 
 MAX_LINES = 5  # that are logged; report.json says all
+MAX_ASPECT = 4.0  # longer by shorter side of a photograph, that of film for panoramas
 
 logger = logging.getLogger(__name__)
 
@@ -152,6 +153,8 @@ class InitialCameras:
         camera.has_prior_focal_length = source in TRUSTED
         focal = _focal(camera)
         low, high = PLAUSIBLE_FOCALS
+        if longer > MAX_ASPECT * min(size):
+            why = "a panorama, which no camera model fits? give the photographs that it is made of"
         if source == "given" and focal and not low <= focal / longer <= high:
             why = f"{focal / longer:.2g} longer sides; is it in px of the stored files?"
         return camera, CameraRecord(
@@ -172,12 +175,8 @@ class InitialCameras:
             source = "exif-rescaled" if found.is_rescaled else "exif"
             focal, why = found.focal_px, found.why
         if not focal and self.options.focal_mm:
-            source, why = "given", ""
-            focal = (
-                self.options.focal_mm
-                / self.options.film_width_mm
-                * max(camera.width, camera.height)
-            )
+            source, why, longer = "given", "", max(camera.width, camera.height)
+            focal = self.options.focal_mm / self.options.film_width_mm * longer
         if not focal:
             return "guess", why
         for index in camera.focal_length_idxs():

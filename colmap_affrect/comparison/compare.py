@@ -4,6 +4,7 @@ What differs between methods are features and raw matches, and nothing else: cam
 masks, pairs, verification, mapping and seeds are the same for all.
 """
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import installed_versions
@@ -62,10 +63,17 @@ def compare(
     with Workspace(output_path).locked():
         for run in runs:
             run.begin(overwrite=overwrite)
-        results = []
+        results, units, pace, start_s = [], len(names) + len(pairs) / 4, 1.0, time.monotonic()
+        left = {run.method.label: units * run.seconds for run in runs if not run.finished()}
+        total = sum(left.values())
         for number, run in enumerate(runs, 1):
             title = f"method {number} of {len(runs)}, {run.method.label}: "
+            if run.method.label in left and progress.stream:
+                minutes = max(1.0, pace * sum(left.values()) / 60)
+                show(f"{title}about {minutes:.0f} min left for all", file=progress.stream)
             failed = "" if run.finished() else run_alone(run, title, progress)
+            if left.pop(run.method.label, 0.0):
+                pace = (time.monotonic() - start_s) / (total - sum(left.values()))
             found = run.finished() or replace(run.result, seeds=())
             results.append(replace(found, failed=failed or found.failed))
         if truth:

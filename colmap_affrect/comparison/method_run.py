@@ -122,6 +122,11 @@ class MethodRun:
         self.database = self.workspace.database
 
     @property
+    def seconds(self) -> float:
+        """What an image, or four pairs, take about; of COLMAP's SIFT, a recipe, one of levels."""
+        return 6.0 if self.method.escalates else 1.5 if self.method.recipe else 0.5
+
+    @property
     def result(self) -> MethodResult:
         """What is done of the method, as it is on disk."""
         with suppress(FileNotFoundError, ValidationError):  # of a version before: features stay
@@ -201,6 +206,7 @@ class MethodRun:
     def _match_recipe(self, watch: Stopwatch) -> dict[str, str]:
         context = Context(self.workspace, self.options.resources, None, self.progress)
         inputs, recipe = self.options.inputs(self.image_path), self.method.recipe or Recipe()
+        self.keep(lacks=context.resources.how_to_complete(recipe.extraction))
         with watch.step("extract"):
             failures = extract(context, inputs, recipe).failures
         choose_pairs(context, self.options.pairs)

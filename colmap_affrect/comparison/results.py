@@ -144,6 +144,7 @@ class MethodResult:
     options: Mapping[str, Any] = field(default_factory=dict)
     failed: str = ""  # why it failed as a whole; empty if it did not
     failures: Mapping[str, str] = field(default_factory=dict)  # images that cannot be used: why
+    lacks: str = ""  # how to get the weights that it ran without
     wall_s: Mapping[str, float] = field(default_factory=dict)  # of stages before all seeds
     peak_memory_bytes: int = 0
     seeds: tuple[SeedResult, ...] = ()  # in the order asked for; empty if the method failed

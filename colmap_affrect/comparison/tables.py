@@ -50,32 +50,26 @@ def span_text(span: Span | None, digits: int = 1) -> str:
 
 def verdict(comparison: Comparison) -> list[str]:
     """Return what the numbers mean, the most important paragraph first."""
-    return [headline(comparison), *notes(comparison)]
+    return [*headline(comparison), *notes(comparison)]
 
 
-def headline(comparison: Comparison) -> str:
+def headline(comparison: Comparison) -> list[str]:
     """Say what COLMAP, our mapper with its SIFT, and our features get from the photographs."""
     finished, total = comparison.finished, len(comparison.image_names)
     if not finished:
-        return "No method finished."
+        return ["No method finished."]
     most = max(method.registered.max for method in finished)
     if most < MIN_IMAGES <= total:
         few = f"no method registers more than {most:g} of the {total} photographs"
-        return f"Nothing was reconstructed: {few}."
+        return [f"Nothing was reconstructed: {few}."]
     named = {method.name: method for method in finished}
     ours = next((name for name in named if name not in SIFT_SUMMARIES), "")
-    kinds = {
-        SIFT_COLMAP: "COLMAP as it is",
-        SIFT: f"our mapper with COLMAP's SIFT ({SIFT})",
-        ours: f"our features ({ours})",
-    }
-    what = "correct" if comparison.has_ground_truth else "sure"
-    texts = [
-        f"{kind} {span_text(named[name].registered)}, {span_text(named[name].right)} of them {what}"
-        for name, kind in kinds.items()
-        if name in named
-    ]
-    return f"Of {total} photographs are registered: {'; '.join(texts)}."
+    kinds = {SIFT_COLMAP: "COLMAP as it is", SIFT: "our mapper with SIFT", ours: "our features"}
+    what, texts = "correct" if comparison.has_ground_truth else "sure", list[str]()
+    for name in filter(named.get, kinds):
+        counts = span_text(named[name].registered), span_text(named[name].right)
+        texts.append(f"{kinds[name]} ({name}): {counts[0]} of {total}, {counts[1]} of them {what}")
+    return ["Photographs that are registered:", *texts]
 
 
 def notes(comparison: Comparison) -> list[str]:
@@ -87,6 +81,8 @@ def notes(comparison: Comparison) -> list[str]:
             texts.append(f"Only {method.name} registers {such_as(names, MAX_NAMES)}.")
     if finished and (missing := comparison.registered_by_none):
         texts.append(f"Registered by no method: {such_as(missing, MAX_NAMES)}.")
+    lacking = "{} ran without some of its weights; get them, and compare again with --overwrite: {}"
+    texts += [lacking.format(method.name, method.lacks) for method in finished if method.lacks]
     texts += [f"{m.name} failed: {m.failed}" for m in comparison.methods if m.failed]
     if not comparison.has_ground_truth:
         for method in finished:
@@ -102,7 +98,8 @@ def summary(comparison: Comparison) -> str:
     rows = [[name, *(cells[k] for cells in columns.values())] for k, name in enumerate(names)]
     rows += [[method.name, "failed"] for method in comparison.methods if method.failed]
     lines = [aligned([["method", *columns], *rows])]
-    for paragraph in verdict(comparison):
+    lines += ["", *headline(comparison)]
+    for paragraph in notes(comparison):
         lines += ["", *textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)]
     return "\n".join(lines)
 

@@ -19,6 +19,7 @@ from colmap_affrect.project.outputs import is_output_folder
 from colmap_affrect.project.stores import pair_key
 
 TIFF_SUFFIXES = (".tif", ".tiff")
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 
 
 class CameraOptions(Options):
@@ -147,9 +148,9 @@ def left_out(image_path: Path) -> dict[str, str]:
     """Return why photographs in a folder are passed over: for their format, names, or as pages."""
     found: dict[str, list[str]] = {}
     notes: dict[str, str] = {}
-    for name in photograph_files(image_path):
+    for name in photograph_files(image_path, (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS)):
         suffix = _suffix(name)
-        if suffix in OTHER_IMAGE_SUFFIXES:
+        if suffix not in IMAGE_SUFFIXES:
             found.setdefault(f"*{suffix}", []).append(name)
         elif _odd(name):
             found.setdefault("names", []).append(name)
@@ -160,7 +161,9 @@ def left_out(image_path: Path) -> dict[str, str]:
             )
     for kind, names in found.items():
         why = "COLMAP or OpenCV cannot read this format; colmap-affrect convert makes PNG"
-        if kind == "names":
+        if kind[1:] in VIDEOS:
+            why = "it is a video; take photographs out of it, as: ffmpeg -i it -vf fps=2 %04d.jpg"
+        elif kind == "names":
             why = f"{_odd(names[0])}; rename it"
         notes[kind] = f"{len(names)} left out, such as {one_line(names[0])}: {why}"
     return notes

@@ -299,8 +299,5 @@ class ReconstructionReport:
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines += [f"seconds     {seconds}"]
         for one in self.advice[:MAX_ADVICE]:
-            lines += [
-                f"try         {one.why}",
-                *([f"            {one.command}"] * bool(one.command)),
-            ]
+            lines += ["try         " + "\n            ".join(filter(None, (one.why, one.command)))]
         return "\n".join(lines)

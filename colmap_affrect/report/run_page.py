@@ -35,6 +35,7 @@ KINDS = {
 """How cameras came in; each has a colour of this name."""
 
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
+MAX_NUM_MODELS = 6  # that are drawn
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 
 
@@ -69,8 +70,10 @@ def write_run_page(
     cards = [_card(name, report, model) for name in names]
     known = set(names)
     pair_inliers = {pair: n for pair, n in pair_inliers.items() if known >= set(pair)}
-    view = read_view(workspace.sparse / "0" if report.models else None)
-    kinds = Counter(card.kind for card in cards)
+    shown = report.models[:MAX_NUM_MODELS]
+    kinds = [{name: _card(name, report, m).kind for name in m.registered_names} for m in shown]
+    views = [read_view(workspace.sparse / str(k)) for k in range(len(shown))] or [read_view(None)]
+    counts = Counter(kind for of_model in kinds for kind in of_model.values())
     content = {
         "report": report,
         "model": model,
@@ -78,8 +81,8 @@ def write_run_page(
         "doubts": _doubts(report, model),
         "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
         "max_num_lines": MAX_LINES,
-        "view": view,
-        "kinds": {kind: f"{text} ({kinds[kind]})" for kind, text in KINDS.items() if kinds[kind]},
+        "views": views,
+        "kinds": {kind: f"{text} ({counts[kind]})" for kind, text in KINDS.items() if counts[kind]},
         "cards": cards,
         "num_pairs": len(pair_inliers),
         "looks": looks,
@@ -88,9 +91,8 @@ def write_run_page(
         **_cameras(report, names),
         **_tie_points(workspace, model, names, marks or {}),
     }
-    views = [(view, {card.name: card.kind for card in cards})]
-    template = TEMPLATES / "run.html"
-    return write_page(workspace.page, template, content, names, image_path, views, progress)
+    template, drawn = TEMPLATES / "run.html", zip(views, kinds, strict=False)
+    return write_page(workspace.page, template, content, names, image_path, drawn, progress)
 
 
 def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
@@ -106,7 +108,8 @@ def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
     if name in model.probabilities:
         text += f", right with a probability of {model.probabilities[name]:.0%}"
     if name in model.doubtful:
-        kind, text = "doubtful", f"{text}; doubtful: {model.doubtful[name]}"
+        why, reasons = model.doubtful[name], list(model.doubtful.values())
+        kind, text = "doubtful", f"{text}; doubtful" + f": {why}" * (reasons.count(why) == 1)
         groups.append("doubtful")
     return Card(name, kind, text, tuple(groups))
 

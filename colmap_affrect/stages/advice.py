@@ -3,7 +3,7 @@
 import itertools
 import re
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
@@ -11,7 +11,6 @@ from colmap_affrect.errors import such_as
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
-from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import Advice, ModelSummary
 from colmap_affrect.stages.context import Context
 
@@ -22,14 +21,11 @@ FITTING_PX = re.compile(rf"{FOCAL_CONTRADICTED}, .*?(\d+) px does")
 
 
 def advice(
-    context: Context,
-    missing: Collection[str],
-    models: Sequence[ModelSummary],
-    pair_inliers: Mapping[Pair, int],
+    context: Context, missing: Collection[str], models: Sequence[ModelSummary], strongest: int
 ) -> tuple[Advice, ...]:
     """Say what may help when images are missing or the largest model is doubtful, best first.
 
-    ``pair_inliers`` are the numbers of inliers of the verified pairs.
+    ``strongest`` is the largest number of inliers of a verified pair.
     """
     num_keypoints = colmap_database.keypoint_counts(context.workspace.database)
     lost = [n for n in missing if n in num_keypoints and n not in context.by_hand.left_out]
@@ -37,7 +33,7 @@ def advice(
     doubts = "; ".join([*model.doubtful.values(), *model.taken_out.values()])
     if (missing or doubts) and sum(map(bool, num_keypoints.values())) < 2:
         return (Advice("more photographs: two that can be read and show the same make a model"),)
-    if not models and max(pair_inliers.values(), default=0) >= ENOUGH:
+    if not models and strongest >= ENOUGH:
         return (Advice("more photographs, from other places: the matches of these show no depth"),)
     if not (lost or doubts):
         return ()
@@ -49,7 +45,12 @@ def advice(
     if helped := lost or [n for n in model.doubtful if model.gains.get(n, 0.0) >= MIN_GAIN]:
         found += _of_recipe(context, such_as(helped))
     if lost and len(model.likely) > 1 and context.mapping.name == MAPPERS.default:
-        found.append(_of_tie_points(context, such_as(lost), models))
+        table, why = context.by_hand.tie_points_path, f"mark six points or more of {such_as(lost)}"
+        why += " in two photographs of the model too, in report.html"
+        if table and not any(m.tie_points for m in models):
+            why = f"no point of {table.name} is seen by two photographs of one model: {why}"
+        words = ("--tie-points", str(table or "tie-points.csv"))
+        found.append(Advice(why, _again(context, *words)))
     for name, bridge in model.bridges.items():
         if f"bridged by {bridge.by}" in model.doubtful.get(name, ""):
             why = f"if the matches of {name} and {bridge.by} are wrong by eye, leave them out"
@@ -60,10 +61,9 @@ def advice(
     if inputs and inputs.masks == MaskOptions() and any(t in doubts for t in CONTRADICTIONS):
         why = "mask what moves, repeats or is written on photographs (black, in a folder masks)"
         found.append(Advice(why, _anew(context, "--mask-path", "masks")))
-    return (
-        *found,
-        *([Advice(f"more photographs, between {such_as(lost)} and the others")] * bool(lost)),
-    )
+    if lost:
+        found.append(Advice(f"more photographs, between {such_as(lost)} and the others"))
+    return tuple(found)
 
 
 def _of_recipe(context: Context, names: str) -> list[Advice]:
@@ -79,16 +79,13 @@ def _of_recipe(context: Context, names: str) -> list[Advice]:
     return [Advice(why, f"{how} && {_again(context)}")] if how else []
 
 
-def _of_tie_points(context: Context, names: str, models: Sequence[ModelSummary]) -> Advice:
-    why = f"mark six points or more of {names} in two photographs of the model too, in report.html"
-    if (table := context.by_hand.tie_points_path) and not any(m.tie_points for m in models):
-        why = f"no point of {table.name} is seen by two photographs of one model: {why}"
-    return Advice(why, _again(context, "--tie-points", str(table or "tie-points.csv")))
-
-
 def _again(context: Context, *words: str) -> str:
-    folder = str(context.workspace.path)
-    base = context.command or ("colmap-affrect", "map", "--output-path", folder)
+    base = context.command or (
+        "colmap-affrect",
+        "map",
+        "--output-path",
+        str(context.workspace.path),
+    )
     return shlex.join([*base, *words])
 
 
@@ -96,9 +93,8 @@ def _anew(context: Context, *words: str) -> str:
     """Return a command for other options, which take the place of those that were given."""
     path, photos = context.workspace.path, context.workspace.photographs() or Path("photos")
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
-    new = (*words, "--output-path", str(next(folder for folder in numbered if not folder.exists())))
-    base = context.command
-    if base[1:2] != ("run",):
-        base = ("colmap-affrect", "run", "--image-path", str(photos))
+    new = (*words, "--output-path", str(next(place for place in numbered if not place.exists())))
+    usual = ("colmap-affrect", "run", "--image-path", str(photos))
+    base = context.command if context.command[1:2] == ("run",) else usual
     kept = [w for last, w in zip(("", *base), base, strict=False) if not {last, w} & {*new[::2]}]
     return shlex.join([*kept, *new])

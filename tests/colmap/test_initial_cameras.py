@@ -146,6 +146,8 @@ def test_lens_and_film_stand_where_nothing_else_is_known(photos: Path) -> None:
         camera, record = ignoring.camera(["a.jpg"], size)
         assert camera.focal_length == pytest.approx(125.0)
         assert (record.source, record.given, record.why) == ("given", ("focal",), "")
+    _, record = ignoring.camera(["a.jpg"], (24000, 3000))
+    assert record.why.startswith("a panorama, which no camera model fits?")
 
 
 def test_table_decides_who_shares_a_camera_and_the_rest_is_as_without(

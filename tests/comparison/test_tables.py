@@ -12,6 +12,7 @@ from colmap_affrect.comparison.results import Comparison, MethodResult, PoseScor
 from colmap_affrect.comparison.tables import headline, notes, summary, table, to_json
 
 NAMES = tuple("abcdef")
+FIRST = "Photographs that are registered:"
 Methods = list[MethodResult]
 
 
@@ -43,25 +44,31 @@ FAILED = MethodResult("sift", failed="no weights")
 @pytest.mark.parametrize(
     ("methods", "expected"),
     [
-        ([], "No method finished."),
+        ([], ["No method finished."]),
         (
             [SIFT, method("default", "abcd", "abcde"), COLMAP],
-            "Of 6 photographs are registered: COLMAP as it is 2, 2 of them sure; our mapper with "
-            "COLMAP's SIFT (sift) 3, 3 of them sure; our features (default) 4.5 (4-5), 4.5 (4-5) "
-            "of them sure.",
+            [
+                FIRST,
+                "COLMAP as it is (sift-colmap): 2 of 6, 2 of them sure",
+                "our mapper with SIFT (sift): 3 of 6, 3 of them sure",
+                "our features (default): 4.5 (4-5) of 6, 4.5 (4-5) of them sure",
+            ],
         ),
         (
             [method("sift", "abc", correct="abc"), method("default", "abcdef", correct="ab")],
-            "Of 6 photographs are registered: our mapper with COLMAP's SIFT (sift) 3, 3 of them "
-            "correct; our features (default) 6, 2 of them correct.",
+            [
+                FIRST,
+                "our mapper with SIFT (sift): 3 of 6, 3 of them correct",
+                "our features (default): 6 of 6, 2 of them correct",
+            ],
         ),
         (
             [method("sift", ""), method("default", "ab", "")],
-            "Nothing was reconstructed: no method registers more than 2 of the 6 photographs.",
+            ["Nothing was reconstructed: no method registers more than 2 of the 6 photographs."],
         ),
     ],
 )
-def test_headline_counts_what_each_kind_of_method_registers(methods: Methods, expected: str):
+def test_headline_counts_what_each_kind_of_method_registers(methods: Methods, expected: list[str]):
     assert headline(comparison(*methods)) == expected
 
 
@@ -74,6 +81,11 @@ def test_headline_counts_what_each_kind_of_method_registers(methods: Methods, ex
              "Registered by no method: e, f."],
         ),
         ([DEFAULT, FAILED], ["sift failed: no weights"]),
+        (
+            [replace(DEFAULT, lacks="fetch it")],
+            ["default ran without some of its weights; get them, and compare again with "
+             "--overwrite: fetch it"],
+        ),
         ([FAILED], ["sift failed: no weights"]),
         (
             [method("default", NAMES, c="any focal length fits", d="any focal length fits")],
@@ -107,7 +119,7 @@ def test_table_has_the_best_method_first_and_ranges_over_the_seeds():
 def test_json_and_summary_say_the_same():
     compared = comparison(SIFT, method("default", "abcd", "abcde", correct="abc"), FAILED)
     values = json.loads(to_json(compared))
-    assert values["verdict"] == [headline(compared), *notes(compared)]
+    assert values["verdict"] == [*headline(compared), *notes(compared)]
     assert (values["images_total"], values["registered_by_none"]) == (6, ["e", "f"])
     default = values["methods"]["default"]
     assert default["registered"] == {"mean": 4.5, "min": 4.0, "max": 5.0}

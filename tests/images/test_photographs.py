@@ -19,7 +19,7 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError
-from colmap_affrect.images.photographs import MaskOptions, Photographs, list_images
+from colmap_affrect.images.photographs import MaskOptions, Photographs, left_out, list_images
 from colmap_affrect.images.reading import read_mask, shrink_mask
 from colmap_affrect.project.stores import FeatureStore
 
@@ -202,3 +202,11 @@ def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: s
     listed.write_text(line.format(folder=folder))
     with pytest.raises(ImageError, match=r"list\.txt: (lists .* not in|is empty)"):
         list_images(folder, listed)
+
+
+def test_videos_are_named_with_what_to_do(photo_path: Path) -> None:
+    for name in ("film.MP4", "side.mov"):
+        (photo_path.parent / name).write_bytes(b"")
+    found = left_out(photo_path.parent)
+    assert set(found) == {"*.mp4", "*.mov"}
+    assert found["*.mp4"].startswith("1 left out, such as film.MP4: it is a video; take")

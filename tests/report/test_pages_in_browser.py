@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,9 +17,11 @@ from browser import (
     until_drawn,
 )
 from small_comparison import make_comparison
-from small_run import NAMES, make_run_page
+from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.comparison.page import write_page
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.run_page import write_run_page
 
 pytestmark = [needs_chromium, pytest.mark.long]
 
@@ -142,3 +146,35 @@ def test_no_table_scrolls_on_a_phone(browser: Browser) -> None:
     browser.resize(390)
     table = "const table = document.querySelector('.scroll');"
     assert browser.run(f"{table} return table.scrollWidth - table.clientWidth") == 0
+
+
+def test_models_are_chosen_from_a_list_and_seen_beside_each_other(
+    running: Browser, tmp_path: Path
+) -> None:
+    make_run_page(tmp_path)
+    workspace, report = Workspace(tmp_path / "out"), small_report(tmp_path)
+    (first,) = report.models
+    shutil.copytree(workspace.sparse / "0", workspace.sparse / "1")
+    both = replace(report, models=(first, replace(first, doubtful={})))
+    running.open(write_run_page(workspace, both, NAMES, {}, None))
+    shown = "return [...document.querySelectorAll('#model figure')].map((one) => !one.hidden)"
+    assert running.run(shown) == [True, False]
+    running.click('[data-shows="1"]')
+    assert running.run(shown) == [True, True]
+    running.click('[data-shows="0"]')
+    assert running.run(shown) == [False, True]
+    kinds = running.run("return JSON.parse(document.getElementById('data').textContent).views")
+    assert [camera["kind"] for camera in kinds[0]["cameras"]][-1] == "doubtful"
+    assert [camera["kind"] for camera in kinds[1]["cameras"]][-1] == "tracks"
+    assert running.log() == []
+
+
+def test_what_is_printed_has_three_sides_of_the_model_and_no_buttons(browser: Browser) -> None:
+    browser.command("Emulation.setEmulatedMedia", media="print")
+    sides = "return [...document.querySelectorAll('#model .sides img')].map((i) => i.naturalWidth)"
+    assert browser.run(sides) == [600] * 3
+    buttons = (
+        "return [...document.querySelectorAll('button:not(.photo)')].map((b) => b.offsetWidth)"
+    )
+    assert set(browser.run(buttons)) == {0}
+    browser.command("Emulation.setEmulatedMedia", media="")

@@ -33,7 +33,8 @@ def test_everything_of_the_report_is_told(html: str) -> None:
     for text in (
         "<title>4 of 6 photographs registered</title>", "right with a probability of 95%",
         "d.png: hangs on few &lt;points&gt;", "right with a probability of 40%; doubtful: hangs",
-        ">colmap-affrect run --output-path out-2<", "no verified pair", "unreadable: f.png: not a readable image",
+        ">colmap-affrect run --output-path out-2<", "no verified pair",
+        "unreadable: f.png: not a readable image",
         "12 of 15 depths agree, scale +-3.1%",
         "1 camera, focal lengths: 1 from EXIF.", "one of them",
         "15 pairs are verified", "Pairs to look at", "is doubtful; guided", "60 inliers.",

@@ -156,7 +156,7 @@ def test_advice_is_about_what_is_wrong(
     monkeypatch.setattr(Workspace, "recipe", lambda _: "rectified")
 
     def commands(missing: list[str], model: ModelSummary, at: Context = context) -> list[str]:
-        found = [one.command for one in advice(at, missing, [model], {})]
+        found = [one.command for one in advice(at, missing, [model], 0)]
         for words in filter(None, found):  # the parser takes what is advised
             build_parser().parse_args(shlex.split(words)[1:])
         return found
@@ -177,14 +177,14 @@ def test_advice_is_about_what_is_wrong(
     alone = replace(model, doubtful={lost: f"bridged by {NAMES[1]} alone"}, bridges=bridged)
     assert commands([], alone) == [f"{again} --reject-pair '{lost},{NAMES[1]}'"]
     said = replace(context, by_hand=ByHand(Path("t.csv")), command=())
-    (_, tie_points, _) = advice(said, [lost], [model], {})
+    (_, tie_points, _) = advice(said, [lost], [model], 0)
     assert tie_points.why.startswith("no point of t.csv is seen by two photographs of one model")
     assert tie_points.command.startswith("colmap-affrect map --output-path ")
-    (copies,) = advice(context, [*NAMES], [], {(lost, NAMES[1]): 900})
+    (copies,) = advice(context, [*NAMES], [], 900)
     assert "from other places" in copies.why
     monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
     monkeypatch.setattr(Resources, "how_to_complete", lambda *_: "pip install it, or fetch it")
-    assert advice(context, [lost], [model], {})[0].command == f"pip install it && {again}"
+    assert advice(context, [lost], [model], 0)[0].command == f"pip install it && {again}"
 
 
 def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:

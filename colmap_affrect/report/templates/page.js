@@ -70,19 +70,13 @@
     document.getElementById("shown").textContent = `${shown} of ${cards.length} photographs shown`;
   });
 
-  // Printed are also what is folded, and models from three sides, on white paper.
+  // Everything that is folded is printed.
   let folded = [];
   addEventListener("beforeprint", () => {
-    document.documentElement.classList.add("printing");
     folded = all("details:not([open])");
     folded.forEach((item) => (item.open = true));
-    models.forEach((model) => model.drawSides());
   });
-  addEventListener("afterprint", () => {
-    document.documentElement.classList.remove("printing");
-    folded.forEach((item) => (item.open = false));
-    redraw();
-  });
+  addEventListener("afterprint", () => folded.forEach((item) => (item.open = false)));
 
   // Matrix of inliers: colours of the classes, numbers in a few large cells, and that under the pointer.
   const MAX_NUMBERED = 14;
@@ -130,6 +124,7 @@
 
   // Models: all are seen from the same place, a camera pointed at is marked in all.
   const [FRONT, TOP, DISTANCE, MAX_ZOOM] = [0.35, Math.PI / 2, 4, 20];
+  const SIDE_PX = [300, 225];
   const SIDES = { front: [0, FRONT], side: [Math.PI / 2, 0], top: [0, TOP] };
   const [NEAR_PX, DRAG_PX, MAX_LABELLED] = [16, 6, 80];
   const eye = { yaw: 0, pitch: FRONT, zoom: 0, isMoved: false };
@@ -164,8 +159,10 @@
     isWaiting = true;
     requestAnimationFrame(() => {
       isWaiting = false;
-      if (!eye.zoom) eye.zoom = Math.min(...models.map((model) => model.fittingZoom()));
-      models.forEach((model) => model.draw());
+      const visible = models.filter((model) => model.canvas.clientWidth);
+      if (!visible.length) return;
+      if (!eye.zoom) eye.zoom = Math.min(...visible.map((model) => model.fittingZoom()));
+      visible.forEach((model) => model.draw());
     });
   }
 
@@ -183,7 +180,9 @@
       this.preview = canvas.parentElement.querySelector(".preview");
       this.pointers = new Map();
       this.dragged = 0;
+      this.size = null;
       this.listen();
+      this.drawSides();
       new ResizeObserver(refit).observe(canvas);
     }
 
@@ -203,7 +202,7 @@
 
     // With which all cameras and nine points of ten are inside.
     fittingZoom() {
-      const { clientWidth: width, clientHeight: height } = this.canvas;
+      const [width, height] = this.size ?? [this.canvas.clientWidth, this.canvas.clientHeight];
       const project = this.projection(width, height, 1);
       const reach = (place) => {
         const [x, y] = project(...place);
@@ -223,9 +222,9 @@
 
     draw() {
       const { canvas, context } = this;
-      const density = Math.min(devicePixelRatio || 1, 2);
-      const width = Math.round(canvas.clientWidth * density);
-      const height = Math.round(canvas.clientHeight * density);
+      const density = this.size ? 2 : Math.min(devicePixelRatio || 1, 2);
+      const [width, height] = (this.size ?? [canvas.clientWidth, canvas.clientHeight])
+        .map((length) => Math.round(length * density));
       if (!width || !height) return;
       if (canvas.width !== width || canvas.height !== height) {
         canvas.width = width;
@@ -233,7 +232,7 @@
       }
       const project = this.projection(width, height, eye.zoom);
       this.drawPoints(project, width, height, density);
-      const style = getComputedStyle(canvas);
+      const style = getComputedStyle(document.documentElement);
       context.lineJoin = "round";
       context.font = `600 ${12 * density}px system-ui, sans-serif`;
       const labels = [];
@@ -261,14 +260,21 @@
       if (labels.length <= MAX_LABELLED) this.drawLabels(labels, density, style);
     }
 
+    // For paper: drawn once, since pictures that are made when printing begins come too late.
     drawSides() {
       const known = [this.canvas, this.context, { ...eye }];
-      for (const canvas of all(".sides canvas", this.canvas.closest("figure"))) {
-        [this.canvas, this.context] = [canvas, canvas.getContext("2d")];
-        [eye.yaw, eye.pitch] = SIDES[canvas.dataset.side];
+      document.documentElement.classList.add("printing");
+      this.size = SIDE_PX;
+      for (const image of all("[data-side]", known[0].closest("figure"))) {
+        this.canvas = document.createElement("canvas");
+        this.context = this.canvas.getContext("2d");
+        [eye.yaw, eye.pitch] = SIDES[image.dataset.side];
         eye.zoom = this.fittingZoom();
         this.draw();
+        image.src = this.canvas.toDataURL();
       }
+      document.documentElement.classList.remove("printing");
+      this.size = null;
       [this.canvas, this.context] = known;
       Object.assign(eye, known[2]);
     }
@@ -409,6 +415,13 @@
   };
   document.getElementById("view")?.addEventListener("click", (event) => {
     actions[event.target.closest("button")?.dataset.view]?.();
+  });
+  document.getElementById("chosen")?.addEventListener("click", (event) => {
+    const button = event.target.closest("button");
+    if (!button) return;
+    const panel = models[button.dataset.shows].canvas.closest("figure");
+    panel.hidden = !panel.hidden;
+    button.setAttribute("aria-pressed", String(!panel.hidden));
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 })();
