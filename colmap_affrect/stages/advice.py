@@ -46,7 +46,9 @@ def advice(
         found += _of_recipe(context, such_as(helped))
     if lost and len(model.likely) > 1 and context.mapping.name == MAPPERS.default:
         table, why = context.by_hand.tie_points_path, f"mark six points or more of {such_as(lost)}"
-        why += " in two photographs of the model too, in report.html"
+        why += " in two photographs of the model too, at Tie points by hand in report.html"
+        if len(models) > 1:
+            why += "; seven, each in two photographs of both, join two models"
         if table and not any(m.tie_points for m in models):
             why = f"no point of {table.name} is seen by two photographs of one model: {why}"
         words = ("--tie-points", str(table or "tie-points.csv"))
@@ -86,7 +88,7 @@ def _again(context: Context, *words: str) -> str:
         "--output-path",
         str(context.workspace.path),
     )
-    return shlex.join([*base, *words])
+    return shlex.join([*base, *(() if {*words} <= {*base} else words)])
 
 
 def _anew(context: Context, *words: str) -> str:

@@ -180,6 +180,10 @@ def test_advice_is_about_what_is_wrong(
     (_, tie_points, _) = advice(said, [lost], [model], 0)
     assert tie_points.why.startswith("no point of t.csv is seen by two photographs of one model")
     assert tie_points.command.startswith("colmap-affrect map --output-path ")
+    given = replace(said, command=("colmap-affrect", "map", "--tie-points", "t.csv"))
+    (_, tie_points, _) = advice(given, [lost], [model, model], 0)
+    assert tie_points.why.endswith("join two models")
+    assert tie_points.command == "colmap-affrect map --tie-points t.csv"
     (copies,) = advice(context, [*NAMES], [], 900)
     assert "from other places" in copies.why
     monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
