@@ -391,7 +391,7 @@ def test_finished_model_is_extended_and_another_database_mapped(
 def test_model_that_nobody_can_trust_ends_with_3(
     verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def judge(mapped: MappedModel, _: object) -> dict[str, Judgement]:
+    def judge(mapped: MappedModel, *_: object) -> dict[str, Judgement]:
         return dict.fromkeys(model_poses(mapped.reconstruction), Judgement(0.3, "no parallax"))
 
     monkeypatch.setattr(mapping, "judge", judge)
