@@ -6,7 +6,7 @@ for good.
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,11 +126,15 @@ class TiePoints:
 NONE = TiePoints({})
 
 
-def tied_evidence(residuals: Iterable[Mark]) -> dict[int, float]:
-    """Return what residuals say for the places of images, by image id, in nats."""
-    errors = defaultdict[int, list[float]](list)
-    for _, image_id, error_px in residuals:
-        errors[image_id].append(error_px)
+def tied_evidence(residuals: Sequence[Mark]) -> dict[int, float]:
+    """Return what residuals say for the places of images, by image id, in nats.
+
+    Of points that three images see or more: two nearly always agree.
+    """
+    errors, views = defaultdict[int, list[float]](list), Counter(name for name, *_ in residuals)
+    for name, image_id, error_px in residuals:
+        if views[name] > 2:
+            errors[image_id].append(error_px)
     agreeing = math.log(AGREES_IF_RIGHT / AGREES_BY_CHANCE)
     differing = math.log((1.0 - AGREES_IF_RIGHT) / (1.0 - AGREES_BY_CHANCE))
     found = {}

@@ -271,7 +271,13 @@ def test_tie_points_of_too_few_photographs_join_nothing(tmp_path: Path) -> None:
 
 
 def test_evidence_of_tie_points_grows_with_those_that_agree() -> None:
-    agreeing = [("p", 1, 2.0)] * 6
-    assert tied_evidence(agreeing[:3]) == {1: 0.0}
-    assert tied_evidence(agreeing)[1] > tied_evidence(agreeing[:3])[1] + 2.0
-    assert tied_evidence([*agreeing[:3], ("q", 1, 50.0), ("q", 2, 1.0)])[1] < -2.0
+    agreeing = [(f"{point}", image_id, 2.0) for point in range(6) for image_id in (1, 2, 3)]
+    assert tied_evidence(agreeing[:9])[1] == 0.0
+    assert tied_evidence(agreeing)[1] > 2.0
+    assert tied_evidence([*agreeing, ("q", 1, 50.0), ("q", 2, 1.0), ("q", 3, 1.0)])[2] > 2.0
+    wrong = [(f"{point}", image_id, 20.0 * image_id) for point in "qrs" for image_id in (0, 1, 2)]
+    assert tied_evidence(wrong)[2] < -5.0 < tied_evidence(wrong)[0]
+
+
+def test_two_photographs_alone_prove_nothing() -> None:
+    assert tied_evidence([(f"{point}", i, 0.0) for point in range(8) for i in (1, 2)]) == {}
