@@ -1,13 +1,16 @@
 """Rectified wide-baseline features for COLMAP.
 
-Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)``. The
-public names are loaded when first used, so that importing the package stays light.
+Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)``. The public names
+are those of ``__init__.pyi``; they are loaded when first used, so that importing the package stays
+light.
 """
 
 import importlib
 import logging
+import re
 import sys
 import zlib
+from pathlib import Path
 from typing import Any
 
 __version__ = "0.1.0"
@@ -22,41 +25,15 @@ if not PYCOLMAP_CAME_FIRST:
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
-_PUBLIC = {
-    "AffrectError": "colmap_affrect.errors",
-    "CameraOptions": "colmap_affrect.images.photographs",
-    "CompareOptions": "colmap_affrect.comparison.compare",
-    "Comparison": "colmap_affrect.comparison.results",
-    "EvaluateOptions": "colmap_affrect.evaluation.evaluate",
-    "Evaluation": "colmap_affrect.evaluation.results",
-    "Extension": "colmap_affrect.mappers.existing",
-    "ExtractionOptions": "colmap_affrect.recipes",
-    "LocalFeatures": "colmap_affrect.data",
-    "IncrementalOptions": "colmap_affrect.mappers.incremental",
-    "SparseOptions": "colmap_affrect.mappers.sparse",
-    "NearestOptions": "colmap_affrect.matchers.nearest",
-    "PairOptions": "colmap_affrect.pairs.lists",
-    "ReconstructionReport": "colmap_affrect.project.report",
-    "RunOptions": "colmap_affrect.pipeline",
-    "VerificationOptions": "colmap_affrect.colmap.verification",
-    "MaskOptions": "colmap_affrect.images.photographs",
-    "compare": "colmap_affrect.comparison.compare",
-    "evaluate": "colmap_affrect.evaluation.evaluate",
-    "extract_features": "colmap_affrect.interop.pycolmap_api",
-    "load_recipe": "colmap_affrect.recipes",
-    "incremental_mapping": "colmap_affrect.interop.pycolmap_api",
-    "map_from_database": "colmap_affrect.pipeline",
-    "match_exhaustive": "colmap_affrect.interop.pycolmap_api",
-    "match_image_pairs": "colmap_affrect.interop.pycolmap_api",
-    "match_sequential": "colmap_affrect.interop.pycolmap_api",
-    "match_spatial": "colmap_affrect.interop.pycolmap_api",
-    "run": "colmap_affrect.pipeline",
-    "verify": "colmap_affrect.interop.pycolmap_api",
-    "verify_matches": "colmap_affrect.interop.pycolmap_api",
-}
+_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+_PUBLIC = {n: module for module, n in re.findall(r"^from (\S+) import (\w+)", _STUB, re.MULTILINE)}
 
 __all__ = ["__version__"]
 __all__ += list(_PUBLIC)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:

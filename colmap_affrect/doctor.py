@@ -20,6 +20,7 @@ from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, Work
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
@@ -84,11 +85,12 @@ class Diagnosis:
         return json.dumps(content, indent=2, ensure_ascii=False)
 
 
-def diagnose(path: Path | None = None, *, weights_path: Path | None = None) -> Diagnosis:
+def diagnose(path: PathLike | None = None, *, weights_path: PathLike | None = None) -> Diagnosis:
     """Examine the installation and, if a path is given, an output folder or a COLMAP database.
 
     OptionError when something that is given is not there.
     """
+    path, weights_path = (as_path(given) if given else None for given in (path, weights_path))
     if path is not None and not path.exists():
         wanted = "give a COLMAP database or output folder"
         raise OptionError(f"{path}: no such file or folder; {wanted}")

@@ -12,6 +12,7 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
+from os import PathLike
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import tomli_w
@@ -40,9 +41,10 @@ class Options(BaseModel):
     )
 
     def __init__(self, /, **values: Any) -> None:
-        """Check the values; OptionError names the option."""
+        """Check the values, paths as text too; OptionError names the option."""
+        paths = {key: str(value) for key, value in values.items() if isinstance(value, PathLike)}
         try:
-            super().__init__(**values)
+            super().__init__(**(values | paths))
         except ValidationError as error:
             raise OptionError(self._problem(error.errors()[0])) from None
 

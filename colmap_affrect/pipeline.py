@@ -8,7 +8,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks
 from colmap_affrect.colmap.cameras import read_camera_records
-from colmap_affrect.colmap.database import num_matched_pairs
+from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
 from colmap_affrect.colmap.database_copy import read_names, schema_version
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
@@ -22,6 +22,7 @@ from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.paths import PathLike, TakesPaths, as_path
 from colmap_affrect.project.report import (
     ReconstructionReport,
     StageReport,
@@ -36,7 +37,7 @@ from colmap_affrect.stages.advice import advice
 from colmap_affrect.stages.climb import climb
 from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import escalate
-from colmap_affrect.stages.extract import extract, write_descriptors
+from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.map import image_names, map_images, unregistered
 from colmap_affrect.stages.match import load_matchers, match
@@ -46,7 +47,7 @@ from colmap_affrect.stages.verify import copy_verified, num_verified_inliers, ve
 
 
 @dataclass(frozen=True, kw_only=True)
-class InputOptions:
+class InputOptions(TakesPaths):
     """What runs and comparisons of methods both depend on, beside images and recipes."""
 
     cameras: CameraOptions = field(default_factory=CameraOptions)  # how images share cameras
@@ -61,13 +62,8 @@ class InputOptions:
 
     def inputs(self, image_path: Path) -> Inputs:
         """Return the photographs of a folder, with their cameras and masks."""
-        return Inputs.of(
-            image_path,
-            image_list_path=self.image_list_path,
-            from_database=self.from_database,
-            cameras=self.cameras,
-            masks=self.masks,
-        )
+        names = ("image_list_path", "from_database", "cameras", "masks")
+        return Inputs.of(image_path, **{name: getattr(self, name) for name in names})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +79,8 @@ class RunOptions(InputOptions):
 
 
 def run(
-    image_path: Path,
-    output_path: Path,
+    image_path: PathLike,
+    output_path: PathLike,
     options: RunOptions | None = None,
     *,
     executor: Executor | None = None,
@@ -108,6 +104,7 @@ def run(
         page: also write ``report.html``.
         progress: where to show progress.
     """
+    image_path, output_path = as_path(image_path), as_path(output_path)
     options = options or RunOptions()
     recipe = options.recipe
     mapper = MAPPERS.make(options.mapping)
@@ -140,7 +137,7 @@ def run(
         else:
             reports += climb(context, mapper, recipe)
         if options.database_descriptors:
-            write_descriptors(context)
+            fill_descriptors(workspace.database, context.features)
         return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
 
 
@@ -163,10 +160,10 @@ def _num_pairs(names: Sequence[str], options: PairOptions) -> int:
 
 
 def map_from_database(
-    database_path: Path,
-    output_path: Path,
+    database_path: PathLike,
+    output_path: PathLike,
     *,
-    image_path: Path | None = None,
+    image_path: PathLike | None = None,
     mapping: MapperOptions | None = None,
     verification: VerificationOptions | None = None,
     extend: Extension | None = None,
@@ -180,6 +177,7 @@ def map_from_database(
     Pairs without two-view geometry are verified. ``image_path`` is the folder of the photographs,
     for the colours of the points; see :func:`run` for all else.
     """
+    database_path, output_path = as_path(database_path), as_path(output_path)
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
     schema_version(database_path)  # refuses what is no database before anything is made
     if extend:
@@ -190,7 +188,8 @@ def map_from_database(
     context = Context(Workspace(output_path), progress=progress, by_hand=by_hand)
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()
-        report = copy_verified(context, database_path, image_path, chosen, overwrite=overwrite)
+        photos = as_path(image_path) if image_path else None
+        report = copy_verified(context, database_path, photos, chosen, overwrite=overwrite)
         return map_and_report(context, mapper, extend, earlier=[report], page=page)
 
 

@@ -14,6 +14,7 @@ from colmap_affrect import doctor as examination
 from colmap_affrect import pipeline
 from colmap_affrect.cli import given
 from colmap_affrect.colmap import old_databases
+from colmap_affrect.colmap.database import fill_descriptors
 from colmap_affrect.comparison import compare as comparing
 from colmap_affrect.comparison import tables
 from colmap_affrect.comparison.method_run import CompareOptions
@@ -32,12 +33,12 @@ from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import ReconstructionReport
+from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.report.pairs import draw_pair
 from colmap_affrect.stages.extract import extract as extract_features
-from colmap_affrect.stages.extract import write_descriptors
 from colmap_affrect.stages.match import match as match_pairs
 from colmap_affrect.stages.one_image import prepare
 from colmap_affrect.stages.pairs import choose_pairs
@@ -75,7 +76,7 @@ def extract(options: argparse.Namespace) -> None:
             context, inputs, given.recipe(options), overwrite=options.overwrite
         )
         if options.database_descriptors:
-            write_descriptors(context)
+            fill_descriptors(context.workspace.database, context.features)
         show(report.summary())
     _refuse_failures(report.failures, options)
 
@@ -187,10 +188,15 @@ def export_h5(options: argparse.Namespace) -> None:
 
 
 def export_database(options: argparse.Namespace) -> None:
-    path = Workspace(options.path).database if options.path.is_dir() else options.path
-    old_databases.export_database(path, options.database_path)
+    workspace = Workspace(options.path)
+    if options.descriptors and not workspace.features.exists():
+        raise OptionError(f"--descriptors: {options.path} is no output folder with features.h5")
+    features = FeatureStore(workspace.features) if options.descriptors else None
+    path = workspace.database if options.path.is_dir() else options.path
+    number = old_databases.export_database(path, options.database_path, features)
     show(
-        f"{options.database_path}: for COLMAP {options.colmap} to 3.13\n"
+        f"{options.database_path}: for COLMAP {options.colmap} to 3.13; {number or 'no'} images "
+        "have descriptors, which COLMAP's own matchers need (--descriptors)\n"
         "then, for few photographs (the folder of models must be there): colmap mapper "
         f"--database_path {options.database_path} --image_path PHOTOS --output_path MODELS "
         f"{old_databases.MAPPER_OPTIONS}"

@@ -177,6 +177,8 @@ FLAGS: dict[str, Settings] = {
         choices=["3.8"], default="3.8"),
     "path": _path("PATH", "output folder, or any COLMAP database; a copy of it is read"),
     "database_path": _path("OUT.db", "the database to make; must not exist"),
+    "--descriptors": _switch("of an output folder, with the descriptors of features.h5 as 8-bit "
+        "SIFT, which COLMAP's own matchers need"),
     "--model-path": _path("MODEL", "folder of a COLMAP model, such as out/sparse/0"),
     "--output-path@files": _path("FOLDER", "folder for the files; nothing in it is overwritten",
         dest="target_path"),

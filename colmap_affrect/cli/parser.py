@@ -155,7 +155,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "--database-path@read! --features-path! --matches-path!"),
     "export-database": (
         "any database for COLMAP 3.8 to 3.13, as Linux distributions have them",
-        "path database_path --colmap"),
+        "path database_path --colmap --descriptors"),
     "export": (
         "a model for other programs: points, text, undistorted photographs, tables",
         "--model-path! --output-path@files! --format --image-path@export"),

@@ -17,6 +17,7 @@ from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import suggestion
+from colmap_affrect.project.paths import TakesPaths
 from colmap_affrect.project.tables import read_table
 
 SIGMA_PX = 3.0  # standard deviation of a mark by hand
@@ -35,7 +36,7 @@ Indices = Mapping[str, Mapping[str, int]]
 
 
 @dataclass(frozen=True)
-class ByHand:
+class ByHand(TakesPaths):
     """What is to be done otherwise than matches alone say.
 
     Attributes:

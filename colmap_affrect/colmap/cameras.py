@@ -21,6 +21,7 @@ from pydantic import (
 )
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import CHECKS
 from colmap_affrect.colmap.model_files import camera_like, read_given_model
 from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_again
 from colmap_affrect.images.photographs import CameraOptions
@@ -96,6 +97,8 @@ def _known_model(name: str) -> str:
         for model, number in pycolmap.CameraModelId.__members__.items()
         if (like := camera_like(number.value)) and len(like.focal_length_idxs())
     ]
+    if name == "EQUIRECTANGULAR":
+        raise ValueError(f"{name}: {CHECKS['camera-panorama']['advice']}")
     if name not in models:
         raise ValueError(f"{name} is not one of {', '.join(models)}")
     return name

@@ -21,6 +21,7 @@ from colmap_affrect.geometry.conventions import (
     pixel_from_colmap,
 )
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.stores import FeatureStore
 
 BYTES_PER_ROW = 4096
 BYTES_OF_EMPTY_DATABASE = 1 << 19  # what :func:`require_database_space` reckons with
@@ -209,6 +210,20 @@ def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: F
     rows = np.asarray(np.minimum(np.rint(scaled), 255), dtype=np.uint8)
     sift = pycolmap.FeatureExtractorType.SIFT
     database.write_descriptors(image_id, pycolmap.FeatureDescriptors(type=sift, data=rows))
+
+
+def fill_descriptors(path: Path, features: FeatureStore) -> None:
+    """Write the descriptors of all images into a database as COLMAP's matchers take them."""
+    ids = image_ids(path)
+    counts = {name: count for name, count in features.num_keypoints().items() if name in ids}
+    with open_database(path) as database:
+        written = {name: database.num_descriptors_for_image(ids[name]) for name in counts}
+        if any(written[name] not in (0, count) for name, count in counts.items()):
+            database.clear_descriptors()  # from before an escalation; COLMAP cannot replace them
+            written = dict.fromkeys(counts, 0)
+        for name, count in counts.items():
+            if count and not written[name]:
+                write_descriptors(database, ids[name], features.read(name).descriptors)
 
 
 def camera_matrix(camera: pycolmap.Camera) -> Array:

@@ -5,7 +5,7 @@ Lists, sets and arrays are left out.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,10 @@ def flat_values(options: Any) -> dict[str, Any]:
     return flat(options.todict())
 
 
-def differences(options: Any, default: Any) -> dict[str, Plain]:
-    """Return what differs from other options of the same class, by dotted key."""
-    others = _plain_values(default)
-    return {key: value for key, value in _plain_values(options).items() if value != others[key]}
+def differences(options: Any, default: Any, named: Collection[str] = ()) -> dict[str, Plain]:
+    """Return what is ``named``, or differs from options of the same class, by dotted key."""
+    others, values = _plain_values(default), _plain_values(options)
+    return {key: value for key, value in values.items() if key in named or value != others[key]}
 
 
 def set_values(options: Any, values: Mapping[str, Any]) -> None:

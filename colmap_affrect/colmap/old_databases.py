@@ -6,11 +6,12 @@ from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import fill_descriptors, open_database
 from colmap_affrect.colmap.database_copy import copy_database, read_names
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.stores import FeatureStore
 
 MAPPER_OPTIONS = (
     "--Mapper.tri_ignore_two_view_tracks 0 --Mapper.init_min_num_inliers 50 "
@@ -24,16 +25,19 @@ LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
 FILL = Path(__file__).with_name("colmap_3_8.sql")  # makes the tables, from an attached ``new``
 
 
-def export_database(source: Path, target: Path) -> None:
+def export_database(source: Path, target: Path, features: FeatureStore | None = None) -> int:
     """Write a database as COLMAP 3.8 makes them; ids stay, and the source is only read.
 
-    Rigs and descriptors of networks are left out. Positions are those of the priors, latitude,
+    Rigs and descriptors of networks are left out, but those of ``features`` are written as 8-bit
+    SIFT. Returns how many images have descriptors. Positions are those of the priors, latitude,
     longitude and altitude, or in metres. DatabaseError when the source cannot be used or has a
     camera model that COLMAP 3.8 does not know, OptionError when the target exists.
     """
     with new_results(target, names=read_names(source)) as (old,):
         new = old.with_name("new.db")
         copy_database(source, new, FATAL)
+        if features:
+            fill_descriptors(new, features)
         require_space(target, new.stat().st_size)
         with open_database(new) as database:
             for camera in database.read_all_cameras():
@@ -52,5 +56,6 @@ def export_database(source: Path, target: Path) -> None:
                     [(*prior.position.tolist(), prior.corr_data_id.id) for prior in priors],
                 )
                 connection.commit()
+                return int(connection.execute("SELECT COUNT(*) FROM descriptors").fetchone()[0])
         except sqlite3.Error as error:
             raise cannot_write(target, error) from error

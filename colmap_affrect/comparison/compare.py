@@ -24,6 +24,7 @@ from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
@@ -33,8 +34,8 @@ NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
 
 
 def compare(
-    image_path: Path,
-    output_path: Path,
+    image_path: PathLike,
+    output_path: PathLike,
     options: CompareOptions | None = None,
     *,
     overwrite: bool = False,
@@ -46,6 +47,7 @@ def compare(
     ``overwrite`` methods run again. Writes ``comparison.json`` and ``report.html``, too. Raises
     AffrectError for anything that the caller can mend, before any method is run.
     """
+    image_path, output_path = as_path(image_path), as_path(output_path)
     options = options or CompareOptions()
     Workspace(output_path).require_own(image_path)
     methods = parse_methods(options.methods)

@@ -33,6 +33,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
+from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
@@ -184,8 +185,8 @@ class RecipeRun:
 
 def evaluate(
     protocol: str,
-    dataset_path: Path,
-    output_path: Path,
+    dataset_path: PathLike,
+    output_path: PathLike,
     options: EvaluateOptions | None = None,
     *,
     overwrite: bool = False,
@@ -197,6 +198,7 @@ def evaluate(
     again, unless ``overwrite`` discards those of these recipes. Writes ``evaluation.json``, too.
     AffrectError for what the caller can mend, before any image is worked on.
     """
+    dataset_path, output_path = as_path(dataset_path), as_path(output_path)
     if protocol not in PROTOCOLS:
         raise OptionError(f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}")
     options = options or EvaluateOptions()

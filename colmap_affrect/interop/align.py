@@ -16,6 +16,7 @@ from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.paths import PathLike, TakesPaths, as_path
 from colmap_affrect.project.tables import read_table
 
 GEOREFERENCE = "georeference.json"  # beside a model: what COLMAP's files have no place for
@@ -28,7 +29,7 @@ Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reference:
+class Reference(TakesPaths):
     """What a model is aligned to; exactly one of the first three, or distances."""
 
     gps_database: Path | None = None  # COLMAP database with positions of the photographs
@@ -57,12 +58,13 @@ class Alignment:
         return "\n".join(lines)
 
 
-def align(model_path: Path, output_path: Path, reference: Reference) -> Alignment:
+def align(model_path: PathLike, output_path: PathLike, reference: Reference) -> Alignment:
     """Write a COLMAP model in metres to a new folder; the old one stays as it is.
 
     Positions and control points give scale, rotation and place, distances the scale alone.
     Raises AffrectError when the reference is unreadable, or leaves open how the model lies.
     """
+    model_path, output_path = as_path(model_path), as_path(output_path)
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
     model, origin = read_given_model(model_path), tuple[float, ...]()

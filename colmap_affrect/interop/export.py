@@ -17,10 +17,10 @@ from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
+from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.workspace import Workspace
 
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
-NO_EXTRA = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0)  # nerfstudio's distortion
 
 FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL and nerfstudio
 
@@ -40,7 +40,11 @@ class Source:
 
 
 def export(
-    model_path: Path, output_path: Path, formats: Sequence[str], *, image_path: Path | None = None
+    model_path: PathLike,
+    output_path: PathLike,
+    formats: Sequence[str],
+    *,
+    image_path: PathLike | None = None,
 ) -> dict[str, Path]:
     """Write a COLMAP model in some of ``FORMATS``; return what was written by format.
 
@@ -48,6 +52,8 @@ def export(
     photographs to undistort, by default those of the run that made the model. Raises AffrectError
     when a format cannot hold the model, or a file exists; nothing is written then.
     """
+    model_path, output_path = as_path(model_path), as_path(output_path)
+    image_path = as_path(image_path) if image_path else None
     for name in formats:
         if name not in FORMATS:
             raise OptionError(f"--format {name}: unknown{suggestion(name, FORMATS)}")
@@ -119,7 +125,7 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
             "transform_matrix": pose.tolist(),
             "fl_x": camera.focal_length_x, "fl_y": camera.focal_length_y,
             "cx": camera.principal_point_x, "cy": camera.principal_point_y,
-            "w": camera.width, "h": camera.height, **NO_EXTRA,
+            "w": camera.width, "h": camera.height,
         })  # fmt: skip
     flat.model.export_PLY(path / "points3D.ply")
     (path / "sparse" / "0").mkdir(exist_ok=True)  # where Gaussian splatting looks
@@ -130,12 +136,12 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
 
 
 def _cameras(source: Source, folder: Path) -> Path:
-    """Write a table: a row for each photograph, with its camera, where it stands and looks."""
+    """Write a table of photographs: their cameras, and poses world_from_cam (docs/formats.md)."""
     path = folder / "cameras.csv"
     rows: list[dict[str, Any]] = []
     for image in source.images():
         camera, center = source.model.cameras[image.camera_id], image.projection_center()
-        qx, qy, qz, qw = image.cam_from_world().rotation.quat.tolist()
+        qx, qy, qz, qw = image.cam_from_world().rotation.inverse().quat.tolist()
         rows.append({
             "name": _no_formula(image.name), **dict(zip("xyz", center, strict=True)),
             "qw": qw, "qx": qx, "qy": qy, "qz": qz,

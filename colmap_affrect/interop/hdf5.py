@@ -49,6 +49,7 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import leads_outside, new_results
+from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.stores import PairMatches, frame_datasets, hloc_matches, pair_key
 
 Datasets = dict[str, NDArray[Any]]
@@ -136,10 +137,10 @@ def _opened(path: Path) -> Iterator[_Source]:
 
 
 def import_h5(
-    image_path: Path,
-    features_path: Path,
-    matches_path: Path,
-    database_path: Path,
+    image_path: PathLike,
+    features_path: PathLike,
+    matches_path: PathLike,
+    database_path: PathLike,
     *,
     cameras: CameraOptions | None = None,
     skip_verification: bool = False,
@@ -155,6 +156,8 @@ def import_h5(
     Raises OptionError when the database exists, StoreError for files that cannot be read, or
     contradict the photographs or each other.
     """
+    features_path, matches_path = map(as_path, (features_path, matches_path))
+    image_path, database_path = map(as_path, (image_path, database_path))
     cameras = cameras or CameraOptions()
     names = list_images(image_path)
     InitialCameras(image_path, cameras).check(names)
@@ -283,7 +286,11 @@ def _write_matches(
 
 
 def export_h5(
-    database_path: Path, features_path: Path, matches_path: Path, *, progress: Progress = SILENT
+    database_path: PathLike,
+    features_path: PathLike,
+    matches_path: PathLike,
+    *,
+    progress: Progress = SILENT,
 ) -> InterchangeReport:
     """Write features and raw matches of a COLMAP database, which stays as it is, for hloc.
 
@@ -291,6 +298,8 @@ def export_h5(
     have, are 1. Of several matches of a keypoint of the first image one is kept. Raises OptionError
     when a file exists, StoreError for names that hloc's layout cannot hold.
     """
+    paths = database_path, features_path, matches_path
+    database_path, features_path, matches_path = map(as_path, paths)
     if features_path.resolve() == matches_path.resolve():
         raise OptionError(f"{features_path}: features and matches need a file each")
     with open_copy(database_path) as database:
@@ -299,9 +308,7 @@ def export_h5(
         names = [image.name for image in known]
         _check_names(names)
         pairs = list(map(pycolmap.pair_id_to_image_pair, database.read_num_matches()[0]))
-        features = (
-            (image.name, _feature_datasets(database, image, database_path)) for image in known
-        )
+        features = ((i.name, _feature_datasets(database, i, database_path)) for i in known)
         matches = _match_groups(database, known, pairs)
         with new_results(features_path, matches_path, names=names) as made:
             with progress.stage("features", len(names), "images") as advance:
@@ -322,12 +329,8 @@ def _match_groups(
     for id1, id2 in pairs:
         indices = np.asarray(database.read_matches(id1, id2), np.int64)
         _, one_each = np.unique(indices[:, 0], return_index=True)
-        pair = PairMatches(
-            (names[id1], names[id2]),
-            indices[one_each],
-            np.ones(len(one_each), np.float32),
-            database.num_keypoints_for_image(id1),
-        )
+        scores, count = np.ones(len(one_each), np.float32), database.num_keypoints_for_image(id1)
+        pair = PairMatches((names[id1], names[id2]), indices[one_each], scores, count)
         yield pair_key(*pair.names), hloc_matches(pair)
 
 

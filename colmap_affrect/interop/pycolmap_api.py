@@ -5,6 +5,7 @@ database has no place for is kept in a folder beside it, ``x.affrect`` for ``x.d
 functions go on where an earlier call stopped.
 """
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, such_as
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
@@ -28,6 +29,7 @@ from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.outputs import new_results, temporary_folder
+from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
@@ -42,7 +44,6 @@ from colmap_affrect.stages.pairs import add_pairs
 
 CANCELLED = "Operation cancelled"  # what pycolmap says
 
-PathLike = Path | str
 Native = Mapping[str, Any] | None  # nested dictionaries are taken for all options of pycolmap
 GivenMatching = pycolmap.FeatureMatchingOptions | MatcherOptions | Native
 GivenVerification = VerificationOptions | pycolmap.TwoViewGeometryOptions | Native
@@ -79,25 +80,25 @@ def extract_features(
     """Extract rectified features of photographs into a COLMAP database, which may be new.
 
     Images that have features already are passed over. One that cannot be read is named in the
-    report. Raises AffrectError for anything that the caller can mend. A cancelled token stops by
-    InterruptedError; what is done is kept. Other arguments are those of pycolmap, but
-    ``extraction_options`` are a recipe by name or path, or our options; of pycolmap's, the image
-    size and where the work is done.
+    report, and warned of (UserWarning). Raises AffrectError for anything that the caller can mend.
+    A cancelled token stops by InterruptedError; what is done is kept. Other arguments are those of
+    pycolmap, but ``extraction_options`` are a recipe by name or path, or our options; of
+    pycolmap's, the image size and where the work is done.
 
     ``from_database``: begin ``database_path`` with the images, cameras, rigs, frames and pose
     priors of this one, which stays as it is. ``weights_path``: folder with weights of networks.
     """
     cameras, masks = translate.reader_options(reader_options, camera_mode)
-    inputs = Inputs.of(
-        Path(image_path),
-        from_database=Path(from_database) if from_database else None,
-        cameras=cameras,
-        masks=masks,
-    )
+    original = as_path(from_database) if from_database else None
+    inputs = Inputs.of(as_path(image_path), from_database=original, cameras=cameras, masks=masks)
     recipe, asked = translate.extraction_recipe(extraction_options)
     shown = _Cancellable(progress, cancellation_token)
     with _context(database_path, device, asked, weights_path, shown) as context:
-        return extract(context, inputs, recipe, image_names=image_names)
+        report = extract(context, inputs, recipe, image_names=image_names)
+    if report.failures:  # a script of pycolmap does not look at the report
+        first, *_ = report.failures.values()
+        warnings.warn(f"left out: {such_as(report.failures)}; the first: {first}", stacklevel=2)
+    return report
 
 
 def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
@@ -220,13 +221,13 @@ def verify_matches(
     counterpart, in any database; DatabaseError where a match points at no keypoint. ``pairs_path``
     has two names per line; None stands for all pairs.
     """
-    path, pairs = Path(database_path), None
+    path, pairs = as_path(database_path), None
     verification = translate.verification_options(options, None)
     refuse_unusable(path)
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
         if pairs_path is not None:
             ids = image_ids(path)
-            listed = read_pairs(Path(pairs_path), list(ids))
+            listed = read_pairs(as_path(pairs_path), list(ids))
             pairs = {(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in listed}
         verify_database(path, verification, advance=advance, pairs=pairs)
 
@@ -258,23 +259,23 @@ def incremental_mapping(
 ) -> dict[int, pycolmap.Reconstruction]:
     """Map any verified database by our mapper and write the models as pycolmap does.
 
-    ``options`` that differ from pycolmap's defaults win over our preset for sparse sets. Models are
-    written to 0, 1, ... in ``output_path``, or, with ``input_path``, a model to be extended, into
-    it; they are returned by the number of their folder, largest first. A cancelled token stops by
-    InterruptedError.
+    ``options`` that differ from pycolmap's defaults, or that a dictionary names, win over our
+    preset for sparse sets. Models are written to 0, 1, ... in ``output_path``, or, with
+    ``input_path``, a model to be extended, into it; they are returned by the number of their
+    folder, largest first. A cancelled token stops by InterruptedError.
     """
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
-    mapper = MAPPERS.make(translate.mapper_options(native))
-    database, output = Path(database_path), Path(output_path)
+    mapper = MAPPERS.make(translate.mapper_options(options))
+    database, output = as_path(database_path), as_path(output_path)
     refuse_unusable(database)
     with temporary_folder(output) as folder:
         existing = None
         if translate.given_path(input_path):
-            extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)
+            extension = Extension(as_path(input_path), not native.fix_existing_frames)
             existing = read_existing(extension, database)
         task = MappingTask(
             database,
-            Path(image_path) if str(image_path) else None,
+            as_path(image_path) if image_path else None,
             extend=existing,
             cancellation=cancellation_token,
         )
@@ -353,11 +354,11 @@ def _context(
     progress: Progress,
 ) -> Iterator[Context]:
     """Lock the folder beside a database and return what the stages work with."""
-    weights = Path(weights_path) if weights_path else None
-    name = str(getattr(device, "name", device))
+    weights = as_path(weights_path) if weights_path else None
+    resources = Resources(weights, str(getattr(device, "name", device)))
     threads = asked.get("num_threads", -1)
     executor = Threads(threads) if threads > 0 else None
-    with Workspace.beside(Path(database_path)).locked() as workspace:
-        context = Context(workspace, Resources(weights, name), executor, progress)
+    with Workspace.beside(as_path(database_path)).locked() as workspace:
+        context = Context(workspace, resources, executor, progress)
         with watched(context):
             yield context

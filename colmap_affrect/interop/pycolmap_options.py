@@ -1,7 +1,8 @@
 """What pycolmap's option objects, or nested dictionaries of their fields, ask of us.
 
-A field that keeps pycolmap's default asks for nothing. One that differs is honoured where
-:data:`HONOURED` has it, and refused by its name elsewhere.
+A field of an object that keeps pycolmap's default asks for nothing; a dictionary asks for all that
+it names, but -1, which leaves it to pycolmap. What differs is honoured where :data:`HONOURED` has
+it, and refused by its name elsewhere.
 """
 
 from collections.abc import Mapping
@@ -16,6 +17,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MatcherOptions
 from colmap_affrect.options import CUSTOM, flat
+from colmap_affrect.project.paths import PathLike
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 
 Native = TypeVar("Native")  # an option class of pycolmap
@@ -66,7 +68,7 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
         options = given
     elif given is None or isinstance(given, Mapping):
         usual = flat_values(options)
-        values = {k: v for k, v in flat(given or {}).items() if k not in usual or v != usual[k]}
+        values = {k: v for k, v in _named(given).items() if k not in usual or v != usual[k]}
         resolve(options, values, f"{argument}:", owned={})
     else:
         shown = f"{argument}: {type(given).__name__} does not apply here"
@@ -84,8 +86,14 @@ def _differing(options: Any) -> dict[str, Any]:
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
-    """Return fields that differ from pycolmap's defaults; OptionError for one we do not have."""
-    return _differing(native(given, kind, argument))
+    """Return fields that are asked for; OptionError for one we do not have."""
+    options: Any = native(given, kind, argument)
+    named = {k: v for k, v in flat_values(options).items() if k in _named(given) and v != -1}
+    return {k: v for k, v in (named | _differing(options)).items() if k in HONOURED[kind]}
+
+
+def _named(given: object) -> Mapping[str, Any]:
+    return flat(given) if isinstance(given, Mapping) else {}
 
 
 def extraction_recipe(given: object) -> tuple[Recipe, dict[str, Any]]:
@@ -140,18 +148,19 @@ def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, M
     return cameras, masks
 
 
-def given_path(path: Path | str) -> str:
+def given_path(path: PathLike) -> str:
     """Return an absolute path, or nothing for pycolmap's '.', which stands for none."""
     return "" if Path(path) == Path() else str(Path(path).resolve())
 
 
-def mapper_options(given: pycolmap.IncrementalPipelineOptions) -> MapperOptions:
-    """Translate what differs from pycolmap's defaults into options of our mapper."""
+def mapper_options(asked: object) -> MapperOptions:
+    """Translate what is asked of pycolmap's mapper into options of ours."""
+    given = native(asked, pycolmap.IncrementalPipelineOptions, "options")
     for key, value in _differing(given).items():
         if isinstance(value, list | set):
             raise OptionError(f"options: {key}={value} cannot be carried over")
-    values = differences(given, pycolmap.IncrementalPipelineOptions())
-    seed = {"random_seed": given.random_seed} if "random_seed" in values else {}
+    values = differences(given, pycolmap.IncrementalPipelineOptions(), _named(asked))
+    seed = {"random_seed": given.random_seed} if given.random_seed >= 0 else {}
     kept = {k: v for k, v in values.items() if k.rpartition(".")[2] not in SET_OTHERWISE}
     options: MapperOptions = MAPPERS.options(
         {"name": MAPPERS.default, **seed, "mapper_options": kept}, where="options"

@@ -17,13 +17,14 @@ from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.project.paths import TakesPaths
 
 SAME_POSE = 1e-6
 """Largest difference of the elements of two poses that are the same; quaternions round."""
 
 
 @dataclass(frozen=True)
-class Extension:
+class Extension(TakesPaths):
     """What is to be extended, and how."""
 
     model_path: Path  # folder of a COLMAP model, text or binary

@@ -184,10 +184,10 @@ class Workspace:
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage; OptionError when it was not run."""
         if stage not in self.begun:
-            raise OptionError(
-                f"{self.path}: the {stage} stage has not been run there; run "
-                f"'colmap-affrect {stage}' with this --output-path first"
-            )
+            first = f"run 'colmap-affrect {stage}' with this --output-path first"
+            if self.users_database:
+                first = "call extract_features first, or move this folder along with its database"
+            raise OptionError(f"{self.path}: the {stage} stage has not been run there; {first}")
         return dict(self.recorded()[stage])
 
     def photographs(self) -> Path | None:

@@ -30,6 +30,7 @@ from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.outputs import database_files
+from colmap_affrect.project.paths import TakesPaths
 from colmap_affrect.project.record import Content, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
@@ -138,7 +139,7 @@ def source_files(path: Path) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class Resources:
+class Resources(TakesPaths):
     """What is needed from outside and does not change results."""
 
     weights_path: Path | None = None  # folder with the weights of networks; None: the usual places

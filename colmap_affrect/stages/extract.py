@@ -214,22 +214,6 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
     return rejected
 
 
-def write_descriptors(context: Context) -> None:
-    """Write the descriptors of all images into the database as COLMAP's matchers take them."""
-    features, path = context.features, context.workspace.database
-    ids = colmap_database.image_ids(path)
-    counts = {name: count for name, count in features.num_keypoints().items() if name in ids}
-    with colmap_database.open_database(path) as database:
-        written = {name: database.num_descriptors_for_image(ids[name]) for name in counts}
-        if any(written[name] not in (0, count) for name, count in counts.items()):
-            database.clear_descriptors()  # from before an escalation; COLMAP cannot replace them
-            written = dict.fromkeys(counts, 0)
-        for name, count in counts.items():
-            if count and not written[name]:
-                descriptors = features.read(name).descriptors
-                colmap_database.write_descriptors(database, ids[name], descriptors)
-
-
 # Inputs that have changed since a run began: what was made from them is forgotten, and made again.
 # Features hang on photographs, masks and depth maps; matches on the features of two images; pairs,
 # the database and all that follows on all images, and on cameras that are given.

@@ -91,8 +91,11 @@ def test_command_takes_an_output_folder(source: Path, tmp_path: Path, call: Call
     shutil.copy(source, tmp_path / "out" / "database.db")
     done = call("export-database", tmp_path / "out", tmp_path / "old.db", "--colmap", "3.8")
     assert done.code == 0
-    assert done.stdout.startswith(f"{tmp_path / 'old.db'}: for COLMAP 3.8 to 3.13\n")
+    assert done.stdout.startswith(f"{tmp_path / 'old.db'}: for COLMAP 3.8 to 3.13; ")
     assert MAPPER_OPTIONS in done.stdout
+    none = call("export-database", tmp_path / "out", tmp_path / "b.db", "--descriptors")
+    assert (none.code, len(none.errors)) == (2, 1)
+    assert "is no output folder with features.h5" in none.errors[0]
     again = call("export-database", tmp_path / "out", tmp_path / "old.db")
     assert (again.code, len(again.errors)) == (2, 1)
     assert "exists, and is left as it is" in again.errors[0]

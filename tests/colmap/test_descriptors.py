@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,15 @@ from small_scene import write_photographs
 
 import colmap_affrect
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids, open_database, write_descriptors
+from colmap_affrect.colmap.database import (
+    fill_descriptors,
+    image_ids,
+    open_database,
+    write_descriptors,
+)
+from colmap_affrect.colmap.old_databases import export_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages import extract as stage
 from colmap_affrect.stages.context import Context
 
 MAX_RATIO = 0.8
@@ -48,11 +55,16 @@ def test_colmap_matches_what_float_descriptors_match(tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", 2)
     colmap_affrect.extract_features(tmp_path / "a.db", tmp_path / "photos")
     context = Context(Workspace.beside(tmp_path / "a.db"))
-    stage.write_descriptors(context)
+    fill_descriptors(context.workspace.database, context.features)
     path, store = context.workspace.database, context.features
     first, second = (store.read(name).descriptors for name in sorted(image_ids(path)))
     expected, found = float_matches(first, second), colmap_matches(path)
     assert len(expected) > 500
+    old = tmp_path / "old.db"
+    assert export_database(path, old, store) == 2
+    with open_database(path) as database, closing(sqlite3.connect(old)) as copied:
+        data = copied.execute("SELECT data FROM descriptors WHERE image_id = 1").fetchone()[0]
+        assert data == np.asarray(database.read_descriptors(1).data).tobytes()
     assert len(expected & found) >= 0.95 * len(expected)
     assert len(found - expected) <= 0.05 * len(expected)
 

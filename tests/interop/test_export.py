@@ -70,7 +70,18 @@ def test_table_has_harmless_cells(tmp_path: Path) -> None:
     written = export(tmp_path / "model", tmp_path / "out", ["cameras"])
     (row,) = csv.DictReader(written["cameras"].read_text().splitlines())
     assert row["name"] == "'=1+1.png"
-    assert (float(row["x"]), float(row["focal_px"])) == (pytest.approx(1000.0), 100.0)
+    assert row["focal_px"] == "100.0"
+    values = {
+        key: float(value)
+        for key, value in row.items()
+        if key in ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    }
+    center = np.array([values[key] for key in "xyz"])
+    np.testing.assert_allclose(center, [1000.0, 20.0, 5.0])
+    turned = pycolmap.Rotation3d(np.array([values[f"q{key}"] for key in "xyzw"]))  # world_from_cam
+    np.testing.assert_allclose(turned * np.array([0.0, 0.0, 1.0]), [1.0, 0.0, 0.0], atol=1e-12)
+    seen = np.array([5.0, 6.0, 7.0])  # in the camera: right, down, forward
+    np.testing.assert_allclose(turned * seen + center, [1007.0, 15.0, -1.0])
 
 
 def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:

@@ -96,6 +96,8 @@ def test_options_that_differ_from_the_defaults_of_pycolmap_are_carried_over() ->
     usual = pycolmap_options.mapper_options(pycolmap.IncrementalPipelineOptions())
     assert (usual.mapper_options, usual.random_seed) == ({}, 0)
     assert usual.preset_name == "sparse"
+    asked = pycolmap_options.mapper_options({"min_model_size": 10, "random_seed": -1})
+    assert (asked.mapper_options, asked.random_seed) == ({"min_model_size": 10}, 0)
 
 
 @pytest.mark.parametrize(

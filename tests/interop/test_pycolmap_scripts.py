@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import shutil
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -30,6 +27,7 @@ from colmap_affrect.interop.pycolmap_options import (
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.pycolmap import panorama
 from colmap_affrect.recipes import load_recipe
 
 COARSE = colmap_affrect.ExtractionOptions(rectifier="identity", max_image_size_px=320)
@@ -48,31 +46,39 @@ def extracted(once_extracted: Path, tmp_path: Path) -> Path:
     return tmp_path / "a.db"
 
 
-def changed_import(source: str) -> ModuleType:
-    """Load a module of pycolmap's package that takes ours for pycolmap."""
-    origin = Path(str(importlib.util.find_spec(source).origin))
-    text = origin.read_text(encoding="utf-8")
-    line = "from . import _core as pycolmap"
-    assert text.count(line) == 1
-    module = ModuleType(f"changed_{origin.stem}")
-    sys.modules[module.__name__] = module  # its dataclasses look there
-    code = text.replace(line, "from colmap_affrect import pycolmap")
-    exec(compile(code, str(origin), "exec"), module.__dict__)
-    return module
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("matcher", ["sequential", "exhaustive"])
 def test_panorama_script_of_pycolmap_registers_all_images(tmp_path: Path, matcher: str) -> None:
     (tmp_path / "panoramas").mkdir()
     write_panoramas(tmp_path / "panoramas", 3)
-    script = changed_import("pycolmap.panorama")
-    options = script.PanoramaReconstructionOptions(matcher=script.Matcher(matcher))
-    models = script.reconstruct(tmp_path / "panoramas", tmp_path / "out", options)
+    options = panorama.PanoramaReconstructionOptions(matcher=panorama.Matcher(matcher))
+    models = panorama.reconstruct(str(tmp_path / "panoramas"), str(tmp_path / "out"), options)
     assert models[0].num_reg_images() == 3 * 12
     assert models[0].num_reg_frames() == 3
+    with open_database(tmp_path / "out" / "database.db") as database:
+        assert not database.exists_descriptors(1)  # SIFT leaves some
     equirectangular = pycolmap.Reconstruction(tmp_path / "out/sparse_equirectangular/0")
     assert equirectangular.num_reg_images() == 3
+
+
+def test_panoramas_themselves_are_refused_with_advice(tmp_path: Path) -> None:
+    write_panoramas(tmp_path, 1)
+    spherical = panorama.PanoramaReconstructionOptions(
+        render_type=panorama.PanoRenderType.SPHERICAL
+    )
+    with pytest.raises(
+        OptionError, match=r"EQUIRECTANGULAR: cut perspective views .*panorama does"
+    ):
+        panorama.reconstruct(tmp_path, tmp_path / "out", spherical)
+
+
+def test_names_are_all_there_and_those_of_the_module_are_its_own() -> None:
+    assert {*pycolmap.__all__} - {*dir(replaced)} == {"match_vocabtree"}
+    assert all(hasattr(replaced, name) for name in replaced.__all__)
+    assert {"run", "extract_features", "RunOptions"} <= {*dir(colmap_affrect)}
+    assert replaced.__path__ != pycolmap.__path__
+    with pytest.raises(AttributeError, match="has no attribute '__nothing__'"):
+        replaced.__nothing__  # noqa: B018
 
 
 @pytest.mark.parametrize(
@@ -133,6 +139,8 @@ def test_options_are_translated() -> None:
     assert verification_options(pycolmap.TwoViewGeometryOptions(), None) == usual
     nested = verification_options({"ransac": {"random_seed": 7, "max_error": 2.5}}, None)
     assert nested == usual.changed(random_seed=7, max_error_px=2.5, scale_max_error=False)
+    named = verification_options({"ransac": {"max_error": 4.0, "random_seed": -1}}, None)
+    assert named == usual.changed(max_error_px=4.0, scale_max_error=False)
     with pytest.raises(OptionError, match=r"ransac\.max_eror: .*did you mean 'ransac\.max_error'"):
         verification_options({"ransac": {"max_eror": 2}}, None)
 

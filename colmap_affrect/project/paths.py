@@ -1,0 +1,28 @@
+"""Paths as users of the functions give them: as text, too."""
+
+import os
+from dataclasses import fields
+from pathlib import Path
+
+from colmap_affrect.errors import OptionError
+
+PathLike = str | os.PathLike[str]
+
+
+def as_path(given: PathLike) -> Path:
+    """Return a path; OptionError for bytes and anything else that is none."""
+    try:
+        return Path(given)
+    except TypeError as error:
+        kind = type(given).__name__
+        raise OptionError(f"{given!r}: give a path as str or os.PathLike, not {kind}") from error
+
+
+class TakesPaths:
+    """Base of dataclasses whose fields of paths may be given as text."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if field.type in (Path, Path | None) and value is not None:
+                object.__setattr__(self, field.name, as_path(value))  # of a frozen one, too

@@ -1,0 +1,95 @@
+"""What functions take and say in Python: paths as text, types that checkers see, argument names."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import colmap_affrect
+from colmap_affrect.doctor import diagnose
+from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.interop.align import Reference, align
+from colmap_affrect.interop.export import export
+from colmap_affrect.interop.hdf5 import export_h5, import_h5
+
+TAKING_PATHS: dict[str, Callable[[Any, Any], object]] = {
+    "run": colmap_affrect.run,
+    "map_from_database": colmap_affrect.map_from_database,
+    "compare": colmap_affrect.compare,
+    "evaluate": lambda a, b: colmap_affrect.evaluate("evd", a, b),
+    "export_h5": lambda a, b: export_h5(a, b, b + b),
+    "import_h5": lambda a, b: import_h5(a, b, b, b),
+    "export": lambda a, b: export(a, b, ["ply"]),
+    "align": lambda a, b: align(a, b, Reference(gps_database=a)),
+    "diagnose": lambda a, b: diagnose(a, weights_path=b),
+    "extract_features": lambda a, b: colmap_affrect.extract_features(b, a),
+    "match_exhaustive": lambda a, _: colmap_affrect.match_exhaustive(a),
+    "verify": lambda a, _: colmap_affrect.verify(a),
+    "incremental_mapping": lambda a, b: colmap_affrect.incremental_mapping(a, "", b),
+}
+
+
+@pytest.mark.parametrize("name", TAKING_PATHS)
+def test_paths_are_text_too_and_bytes_are_refused_in_words(name: str, tmp_path: Path) -> None:
+    missing, out = str(tmp_path / "missing"), str(tmp_path / "out")
+    with pytest.raises(AffrectError, match="missing"):
+        TAKING_PATHS[name](missing, out)
+    with pytest.raises(
+        OptionError, match=r"^b'.*': give a path as str or os\.PathLike, not bytes$"
+    ):
+        TAKING_PATHS[name](missing.encode(), out.encode())
+
+
+def test_options_take_both_kinds_of_paths() -> None:
+    options = colmap_affrect.RunOptions(
+        image_list_path="list.txt",  # type: ignore[arg-type]
+        extend=colmap_affrect.Extension("model"),  # type: ignore[arg-type]
+        cameras=colmap_affrect.CameraOptions(cameras_path=Path("model")),  # type: ignore[arg-type]
+    )
+    assert options.image_list_path == Path("list.txt")
+    assert options.extend == colmap_affrect.Extension(Path("model"))
+    assert (options.cameras.cameras_path, options.from_database) == ("model", None)
+
+
+SCRIPT = """
+import colmap_affrect
+from colmap_affrect import pycolmap
+from colmap_affrect.pycolmap.panorama import reconstruct
+
+report = colmap_affrect.run("photos", "out", colmap_affrect.RunOptions())
+reveal_type(report)
+reveal_type(pycolmap.extract_features("a.db", "photos"))
+reveal_type(pycolmap.match_exhaustive("a.db"))
+reveal_type(pycolmap.Reconstruction())
+reveal_type(reconstruct("panoramas", "out"))
+reveal_type(pycolmap.__version__)
+pycolmap.no_such_name
+"""
+
+
+@pytest.mark.long
+def test_type_checkers_see_the_types(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(SCRIPT)
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--cache-dir", tmp_path, "script.py"],
+        cwd=tmp_path,
+        env={**os.environ, "MYPYPATH": str(Path(colmap_affrect.__file__).parents[1])},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    *lines, error, _ = done.stdout.splitlines()
+    report = "colmap_affrect.project.report"
+    assert [line.partition("Revealed type is ")[2] for line in lines] == [
+        f'"{report}.ReconstructionReport"',
+        f'"{report}.StageReport"',
+        f'"tuple[{report}.StageReport, ...]"',
+        '"pycolmap._core.Reconstruction"',
+        '"dict[int, pycolmap._core.Reconstruction]"',
+        '"str"',
+    ]
+    assert "no_such_name" in error
