@@ -1,10 +1,12 @@
 """What is said to people: errors of one line, what, where and what to do; names out of files."""
 
+import re
 import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import ClassVar
 
 DAMAGE = (
     OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError,
@@ -28,10 +30,22 @@ def lacks_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or any(t in str(error).lower() for t in NO_MEMORY)
 
 
+FLAG = re.compile(r"(?:colmap-affrect|colmap|pip) [^';)]*|--([a-z][a-z-]*)")  # not of a command
+
+
 class AffrectError(Exception):
     """Base of all errors that the command line prints as one line."""
 
     exit_code = 1
+    names_flags: ClassVar[bool] = False  # as the command line does; else arguments of functions
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        return text if AffrectError.names_flags else FLAG.sub(_argument, text)
+
+
+def _argument(flag: re.Match[str]) -> str:
+    return (flag[1] or "").replace("-", "_") or flag[0]
 
 
 class OptionError(AffrectError, ValueError):

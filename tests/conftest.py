@@ -21,6 +21,7 @@ from command import Call, Ended
 from small_scene import write_photographs
 
 from colmap_affrect.cli import main
+from colmap_affrect.errors import AffrectError
 
 settings.register_profile(
     "ci",
@@ -43,6 +44,12 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("photos č")
     write_photographs(folder)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _flags_in_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have errors of functions name flags as those of commands; tests of functions turn it off."""
+    monkeypatch.setattr(AffrectError, "names_flags", True)
 
 
 @pytest.fixture

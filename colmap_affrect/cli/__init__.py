@@ -19,6 +19,7 @@ logger = logging.getLogger("colmap_affrect")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
+    errors.AffrectError.names_flags = True
     try:
         given = sys.argv[1:] if arguments is None else arguments
         options = build_parser().parse_args(given or ["--help"])

@@ -57,6 +57,19 @@ def test_options_take_both_kinds_of_paths() -> None:
     assert (options.cameras.cameras_path, options.from_database) == ("model", None)
 
 
+def test_errors_of_functions_name_arguments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(AffrectError, "names_flags", False)
+    with pytest.raises(OptionError, match=r"^image_path \S+none: no such folder$"):
+        export(tmp_path, tmp_path / "out", ["ply"], image_path=tmp_path / "none")
+    assert str(AffrectError("--mask-path x: use 'colmap-affrect run --set a=1' or --extend")) == (
+        "mask_path x: use 'colmap-affrect run --set a=1' or extend"
+    )
+    with pytest.raises(OptionError, match=r"call extract_features first, or move this folder"):
+        colmap_affrect.match_exhaustive(tmp_path / "a.db")
+
+
 SCRIPT = """
 import colmap_affrect
 from colmap_affrect import pycolmap
