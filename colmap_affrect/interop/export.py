@@ -130,9 +130,24 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     flat.model.export_PLY(path / "points3D.ply")
     (path / "sparse" / "0").mkdir(exist_ok=True)  # where Gaussian splatting looks
     flat.model.write(path / "sparse" / "0")
-    content = {"camera_model": "OPENCV", "ply_file_path": "points3D.ply", "frames": frames}
+    content = {
+        "camera_model": "OPENCV", "ply_file_path": "points3D.ply", **_place(flat), "frames": frames,
+    }  # fmt: skip
     replace_text(path / "transforms.json", json.dumps(content, indent=1) + "\n")
     return path / "transforms.json"
+
+
+def _place(source: Source) -> dict[str, Any]:
+    """Return what instant-ngp puts into its unit cube, centred on the points, and where up is.
+
+    Cameras are then 1.32 from the middle on average, as its own converter has them.
+    """
+    poses = np.array([image.cam_from_world().inverse().matrix() for image in source.images()])
+    points = [point.xyz for point in source.model.points3D.values()]
+    middle = np.median(points or poses[:, :, 3], axis=0)
+    half = np.linalg.norm(poses[:, :, 3] - middle, axis=1).mean() / 2.64 or 1.0
+    box, up = [(middle - half).tolist(), (middle + half).tolist()], -poses[:, :, 1].mean(axis=0)
+    return {"aabb_scale": 32, "aabb": box, "up": (up / np.linalg.norm(up)).tolist()}
 
 
 def _cameras(source: Source, folder: Path) -> Path:

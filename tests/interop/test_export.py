@@ -43,7 +43,8 @@ def test_transforms_are_of_cameras_that_look_along_minus_z_with_y_up(tmp_path: P
     written = export(tmp_path / "model", tmp_path / "out", formats, image_path=tmp_path / "photos")
     dense = written["undistorted"]
     flat = pycolmap.Reconstruction(dense / "sparse")
-    frames = json.loads(written["nerfstudio"].read_text())["frames"]
+    content = json.loads(written["nerfstudio"].read_text())
+    frames, (low, high) = content["frames"], np.array(content["aabb"])
     assert len(frames) == 4
     point = np.array([0.4, -0.3, 6.0])
     for frame in frames:
@@ -54,6 +55,13 @@ def test_transforms_are_of_cameras_that_look_along_minus_z_with_y_up(tmp_path: P
         name = frame["file_path"].removeprefix("images/")
         np.testing.assert_allclose([u, v], projected(flat, name, point), atol=1e-6)
     assert pycolmap.Reconstruction(dense / "sparse" / "0").num_points3D() == 60
+    xyz = np.array([point.xyz for point in flat.points3D.values()])
+    np.testing.assert_allclose((low + high) / 2, np.median(xyz, axis=0))
+    poses = np.array([frame["transform_matrix"] for frame in frames])
+    far = np.linalg.norm(poses[:, :3, 3] - (low + high) / 2, axis=1).mean()
+    np.testing.assert_allclose((high - low) * 1.32, far)
+    up = poses[:, :3, 1].mean(axis=0)
+    np.testing.assert_allclose(content["up"], up / np.linalg.norm(up))
 
 
 def test_table_has_harmless_cells(tmp_path: Path) -> None:
