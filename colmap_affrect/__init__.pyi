@@ -1,5 +1,6 @@
 """The public names and where they are; ``__init__.py`` reads this."""
 
+from colmap_affrect.colmap.by_hand import ByHand as ByHand
 from colmap_affrect.colmap.verification import VerificationOptions as VerificationOptions
 from colmap_affrect.comparison.compare import compare as compare
 from colmap_affrect.comparison.method_run import CompareOptions as CompareOptions

@@ -106,8 +106,7 @@ def run(
     """
     image_path, output_path = as_path(image_path), as_path(output_path)
     options = options or RunOptions()
-    recipe = options.recipe
-    mapper = MAPPERS.make(options.mapping)
+    recipe, mapper = options.recipe, MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
     _check_by_hand(options.by_hand, names, mapper)

@@ -33,7 +33,9 @@ from colmap_affrect.stages.one_image import ImageExtractor
 Color = tuple[int, int, int]
 Marks = dict[tuple[float, float], str]  # text by place, px
 
-PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#882255")
+PALETTE: Sequence[str] = (
+    "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#882255",
+)  # fmt: skip
 """Okabe and Ito's colours for all kinds of colour vision, and one of Paul Tol's."""
 TINT = 0.45  # share of the colour over a region
 WIDTH_PX, PANELS_PER_ROW, WARPS_PER_ROW, MAX_NUM_WARPS = 1596, 2, 6, 24
