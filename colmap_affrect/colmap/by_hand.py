@@ -31,23 +31,16 @@ COLUMNS = {
 
 Marks = Mapping[str, Mapping[str, Array]]
 """(2,) px from the upper left corner of the image, as COLMAP has them, by point and image name."""
-Indices = Mapping[str, Mapping[str, int]]
-"""Numbers of keypoints, by point and image name."""
+Indices = Mapping[str, Mapping[str, int]]  # numbers of keypoints, by point and image name
 
 
 @dataclass(frozen=True)
 class ByHand(TakesPaths):
-    """What is to be done otherwise than matches alone say.
+    """What is to be done otherwise than matches alone say."""
 
-    Attributes:
-        tie_points_path: table of the same points in several photographs.
-        rejected: pairs of names whose matches are wrong.
-        left_out: names of photographs that are not to be mapped.
-    """
-
-    tie_points_path: Path | None = None
-    rejected: tuple[tuple[str, str], ...] = ()
-    left_out: tuple[str, ...] = ()
+    tie_points_path: Path | None = None  # table of the same points in several photographs
+    rejected: tuple[tuple[str, str], ...] = ()  # pairs of names whose matches are wrong
+    left_out: tuple[str, ...] = ()  # names of photographs that are not to be mapped
 
     def marks(self, names: Collection[str]) -> Marks:
         """Read the tie points; OptionError also where photographs are named that are not there."""

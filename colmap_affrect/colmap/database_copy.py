@@ -71,10 +71,7 @@ def copy_database(
 
 
 def copy_without_features(source: Path, target: Path) -> None:
-    """Copy cameras, rigs, frames, images and pose priors of a database; every image gets a frame.
-
-    Ids stay the same.
-    """
+    """Copy cameras, rigs, frames, images and pose priors, with their ids; all images get frames."""
 
     def change(database: pycolmap.Database) -> None:
         database.clear_keypoints()

@@ -260,7 +260,6 @@ def load_pairs(folder: Path) -> Pairs:
 
 
 PROTOCOLS = {"evd": load_evd, "svp": load_svp, "imc": load_imc, "pairs": load_pairs}
-"""How datasets are read."""
 
 
 def _entry(values: Any, where: str) -> _Entry:

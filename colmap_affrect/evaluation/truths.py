@@ -33,8 +33,7 @@ CONFIDENCE = 0.9999  # at which estimators may end before all iterations
 NUM_ESTIMATES = 5  # orders of the matches, of which the one of median error counts
 MIN_POSE_MATCHES = 6  # five leave several essential matrices, none of which another supports
 MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices
-CORRECT_PX = 3.0
-"""Matches are correct up to this transfer error in image 2, or Sampson distance from a pose."""
+CORRECT_PX = 3.0  # of correct matches: transfer error in image 2, or Sampson distance from a pose
 GRID_STEP_PX = 4
 MAX_ERROR_PX, MAX_ERROR_DEG = 5.0, 5.0  # homographies and rotations of solved pairs are better
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD

@@ -28,8 +28,7 @@ NOISE_PX = 0.7  # standard deviation of keypoints
 UNKNOWN_SIGMA = 1e6  # of parameters that have no prior
 DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one
 MIN_LONG_TRACKS = 100  # of three images, that each image needs to do without tracks of two
-FAST, MEDIUM, FINAL = 15, 50, 300
-"""Iterations of adjustments on the way, of models to compare, and of the last ones."""
+FAST, MEDIUM, FINAL = 15, 50, 300  # iterations on the way, of models to compare, and at last
 
 
 @dataclass(frozen=True)
@@ -160,8 +159,7 @@ class Adjuster:
         mean[focal], sigma[focal] = prior.focal_px, prior.sigma * prior.focal_px
         mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
         # Reprojection errors are in px, priors in units of their deviation times the noise.
-        covariance = np.diag((sigma / self.noise_px) ** 2)
-        normal = pyceres.factors.NormalPrior(mean, covariance)
+        normal = pyceres.factors.NormalPrior(mean, np.diag((sigma / self.noise_px) ** 2))
         problem.add_residual_block(normal, None, [camera.params])
 
 

@@ -1,7 +1,6 @@
 """What a mapper is: it makes models from verified pairs.
 
-A mapper of another package becomes known by an entry point of the group
-``colmap_affrect.mappers``.
+Entry points of other packages are in the group ``colmap_affrect.mappers``.
 """
 
 from __future__ import annotations
@@ -39,31 +38,26 @@ class MapperOptions(PartOptions, PresetOptions):
 
 @dataclass(frozen=True, eq=False)
 class MappingTask:
-    """What to map.
+    """What to map."""
 
-    Attributes:
-        database_path: COLMAP database with two-view geometries.
-        image_path: folder of the photographs, for the colours of the points; None for no colours.
-        extend: register images into this model.
-        before: the model from before pairs were matched again, and what made it: mappers may begin
-            with it.
-        snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
-        cancellation: a token by which mapping is stopped from outside.
-        unmeasured: pairs of image names that only frames verify which were not measured one by one.
-        cameras: what is known of the cameras, by id.
-        may_share: images of one size may turn out to share a camera that nobody knows.
-        tie_points: which keypoints show the same by hand, by point and image name.
-    """
-
-    database_path: Path
-    image_path: Path | None
-    extend: ExistingModel | None = None
+    database_path: Path  # COLMAP database with two-view geometries
+    image_path: (
+        Path | None
+    )  # folder of the photographs, for the colours of points; None: no colours
+    extend: ExistingModel | None = None  # register images into this model
+    # the model from before pairs were matched again, and what made it: mappers may begin with it
     before: MappedModel | None = None
-    snapshot_path: Path | None = None
-    cancellation: pycolmap.CancellationToken | None = None
+    snapshot_path: Path | None = None  # of snapshots to go on from; mappers may leave it unused
+    cancellation: pycolmap.CancellationToken | None = (
+        None  # by which mapping is stopped from outside
+    )
+    # pairs of image names that only frames verify which were not measured one by one
     unmeasured: frozenset[tuple[str, str]] = frozenset()
-    cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
-    may_share: bool = False
+    cameras: Mapping[int, CameraRecord] = field(
+        default_factory=dict
+    )  # what is known of them, by id
+    may_share: bool = False  # images of one size may turn out to share a camera that nobody knows
+    # which keypoints show the same by hand, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     @property

@@ -28,19 +28,12 @@ from colmap_affrect.mappers.pair_graph import (
 )
 from colmap_affrect.project.report import Bridge
 
-RADIUS_FRAC = 0.03
-"""Places of known depth are neighbours up to this part of the longer side of the image."""
-
-PLANE_RADIUS = 4.0
-"""Known depths on a plane may be so many times farther away."""
-
-MIN_AGREEING = 10
-MIN_AGREEING_SHARE = 0.5
+RADIUS_FRAC = 0.03  # of the longer side of an image: places of known depth so near are neighbours
+PLANE_RADIUS = 4.0  # known depths on a plane may be so many times farther away
+MIN_AGREEING, MIN_AGREEING_SHARE = 10, 0.5
 """A scale needs so many places that agree, and this share of all: right pairs have 80 to 100 %, and
 chance a quarter."""
-
-FOCAL_STEP = 0.02
-"""Relative poses are estimated again when a focal length has changed by about this part."""
+FOCAL_STEP = 0.02  # change of a focal length from which on relative poses are estimated again
 
 
 class _Part:
@@ -97,7 +90,9 @@ class Bridges:
                 scale = self._scale(part, near, side, relative)
                 if scale is None:
                     continue
-                turn, shift = relative.pose if side == 0 else _inverse(relative.pose)
+                turn, shift = relative.pose  # cam2_from_cam1
+                if side == 1:
+                    turn, shift = turn.T, -turn.T @ shift
                 rotation, translation = part.poses[near]
                 pose = turn @ rotation, turn @ translation + scale.scale * shift
                 agreeing = self._agreeing(part, far, pose, camera)
@@ -123,10 +118,7 @@ class Bridges:
     def _agreeing(
         self, part: _Part, image_id: int, pose: Pose, camera: pycolmap.Camera
     ) -> float | None:
-        """Return the weight of the pairs between the model and an image, as far as they agree.
-
-        None where they disagree.
-        """
+        """Return the weight of agreeing pairs of model and image; None where most disagree."""
         poses, cameras = {**part.poses, image_id: pose}, {**part.cameras, image_id: camera}
         weight = agreeing = 0.0
         for pair in self.graph.pairs_inside(poses):
@@ -142,8 +134,3 @@ class Bridges:
         if key not in self._relative:
             self._relative[key] = self.graph.relative_poses(pair, cameras, self.random_seed)
         return self._relative[key]
-
-
-def _inverse(pose: Pose) -> Pose:
-    """Return cam1_from_cam2 of cam2_from_cam1."""
-    return pose[0].T, -pose[0].T @ pose[1]

@@ -19,8 +19,7 @@ from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.project.paths import TakesPaths
 
-SAME_POSE = 1e-6
-"""Largest difference of the elements of two poses that are the same; quaternions round."""
+SAME_POSE = 1e-6  # largest difference of elements of two poses that are the same: quaternions round
 
 
 @dataclass(frozen=True)
@@ -120,8 +119,7 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     return ExistingModel(new, extension.refine_existing)
 
 
-ImagePairs = list[tuple[pycolmap.Image, pycolmap.Image]]
-"""Images of the old model and the same ones of the database."""
+ImagePairs = list[tuple[pycolmap.Image, pycolmap.Image]]  # of the old model, and of the database
 
 
 def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

@@ -61,9 +61,7 @@ def model_folders(sparse_path: Path) -> list[Path]:
     return sorted((p for p in folders if p.name.isdecimal()), key=lambda p: int(p.name))
 
 
-Judgements = Mapping[str, Judgement]
-"""By the names of the images."""
-
+Judgements = Mapping[str, Judgement]  # by the names of the images
 WRONG = 0.1  # probability below which an image leaves its model: nine of ten are wrong
 
 

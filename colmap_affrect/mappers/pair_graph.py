@@ -24,28 +24,19 @@ from colmap_affrect.mappers.thinning import matches_of_best_tracks
 
 Ids = tuple[int, int]  # of two images
 PoseById = Mapping[int, Pose]
-CameraById = Mapping[int, pycolmap.Camera]
-"""Cameras by image id."""
+CameraById = Mapping[int, pycolmap.Camera]  # by image id
 
 MAX_ERROR_PX, MAX_ERROR = 4.0, 0.003
 """An inlier agrees with poses up to this Sampson error, or this part of the longer side if that is
 more: COLMAP's limit for observations, and what features of a shrunk photograph allow."""
-
-MIN_ANGLE_DEG = 1.0
-"""Rays closer to parallel say nothing about depth, nor which side of the camera a point is."""
-
+MIN_ANGLE_DEG = 1.0  # rays closer to parallel tell no depth, nor which side of a camera a point is
 MAX_MATCHES, MAX_TRIALS = 500, 1000
 """What agreement is measured with and relative poses are estimated from: inliers already, so that
 few are enough."""
-
 MAX_PAIRS_OF_IMAGE = 15
 """An image's pairs with fewer inliers have no say, unless they are among those of the other one."""
-
-MIN_NUM_MATCHES = 15
-"""Pairs with fewer inliers are left out, as by COLMAP's mappers."""
-
-MIN_SHARE = 0.5
-"""A pair speaks for poses when at least this share of its inliers agrees."""
+MIN_NUM_MATCHES = 15  # pairs with fewer inliers are left out, as by COLMAP's mappers
+MIN_SHARE = 0.5  # a pair speaks for poses when at least this share of its inliers agrees
 
 
 @dataclass(frozen=True)
@@ -271,10 +262,7 @@ def _strongest(pairs: Iterable[VerifiedPair]) -> tuple[Pairs, Pairs]:
 def _empty_copy(
     cache: pycolmap.DatabaseCache, camera_of: Mapping[str, int]
 ) -> pycolmap.DatabaseCache:
-    """Return cameras and images without pairs; some images, by name, have another camera.
-
-    Cameras without images go, and their rigs.
-    """
+    """Return used cameras, rigs and images, without pairs; some images have another camera."""
     new = pycolmap.DatabaseCache()
     rigs = {rig.ref_sensor_id: rig for rig in cache.rigs.values()}
     frames, images = dict(cache.frames), []

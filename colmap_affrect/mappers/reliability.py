@@ -8,7 +8,7 @@ the others. ``tests/benchmarks/reliability.py`` fits it on photographs whose pos
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -103,14 +103,13 @@ def _bridge_reason(m: Measures) -> str:
     return text.format(m.bridge.by, m.bridge.scale_error_frac) if m.bridge else ""
 
 
-TERMS: Mapping[str, Term] = {
+TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
     "evidence": Term(
         lambda m: math.copysign(math.log1p(abs(m.evidence) / 3.0), m.evidence),
         lambda m: CONTRADICTIONS[0] if m.evidence < 0.0 else "few matches speak for its place",
     ),
     "agreement": Term(
-        lambda m: m.agreement,
-        lambda m: f"only {m.agreement:.0%} {CONTRADICTIONS[1]}",
+        lambda m: m.agreement, lambda m: f"only {m.agreement:.0%} {CONTRADICTIONS[1]}"
     ),
     "points of three": Term(
         lambda m: math.log1p(min(m.num_three, 300)),
@@ -140,8 +139,6 @@ TERMS: Mapping[str, Term] = {
         ),
     ),
 }
-"""The terms, by their names in the file of coefficients."""
-
 OF_MATCHES = {"evidence", "agreement", "points of three", "bridge"}  # terms that more may mend
 
 
@@ -309,8 +306,10 @@ def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int
         held = Adjuster(priors, NOISE_PX, refining, fixed.union(keys))
         least = math.inf
         for factor in FACTORS:
-            trial = held.adjust(_scaled(sparse, keys, factor), NUM_ITERATIONS)
-            least = min(least, trial / max(cost, 1e-9))
+            trial = pycolmap.Reconstruction(sparse)
+            for camera in map(trial.camera, keys):
+                camera.params[list(camera.focal_length_idxs())] *= factor
+            least = min(least, held.adjust(trial, NUM_ITERATIONS) / max(cost, 1e-9))
             if least - 1.0 <= MIN_GROWTH:
                 break
         return least - 1.0
@@ -336,7 +335,10 @@ def _fitting_focals(
     held, freed = _with_fewer_points(model), _with_fewer_points(model)
     before = Adjuster(priors, NOISE_PX, refining, frozenset(given)).adjust(held, FINAL)
     gain = before - Adjuster(free, NOISE_PX, refining).adjust(freed, FINAL)
-    num = _num_cells(held)
+    num = 0  # of cells of all images that hold observations
+    for image_id, camera in cameras_of(held).items():
+        seen = [p.xy for p in held.images[image_id].get_observation_points2D()]
+        num += cells(camera, np.array(seen).reshape(-1, 2))
     gain *= num / max(1, held.compute_num_observations())
     if gain < 0.5 * len(given) * np.log(max(2, num)):
         return {}
@@ -348,15 +350,6 @@ def _is_tried(model: pycolmap.Reconstruction) -> bool:
     return model.num_reg_images() <= MAX_NUM_IMAGES and model.num_points3D() > 0
 
 
-def _num_cells(model: pycolmap.Reconstruction) -> int:
-    """Return how many cells of all images of a model hold observations."""
-    total = 0
-    for image_id, camera in cameras_of(model).items():
-        seen = [p.xy for p in model.images[image_id].get_observation_points2D()]
-        total += cells(camera, np.array(seen).reshape(-1, 2))
-    return total
-
-
 def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Return a copy with every n-th point, of ``MAX_NUM_POINTS`` at most."""
     fewer = pycolmap.Reconstruction(model)
@@ -366,13 +359,3 @@ def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstructio
         if point_id not in kept:
             fewer.delete_point3D(point_id)
     return fewer
-
-
-def _scaled(
-    model: pycolmap.Reconstruction, cameras: Collection[int], factor: float
-) -> pycolmap.Reconstruction:
-    """Return a copy with other focal lengths of some cameras."""
-    copy = pycolmap.Reconstruction(model)
-    for camera in map(copy.camera, cameras):
-        camera.params[list(camera.focal_length_idxs())] *= factor
-    return copy

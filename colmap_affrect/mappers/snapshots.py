@@ -18,9 +18,7 @@ logger = logging.getLogger(__name__)
 SNAPSHOT_FRAMES = 100
 """Images between two snapshots. A model of so many is not tried again with another seed, so that
 nothing but the attempt that made it can be gone on with."""
-
-NUM_KEPT = 2
-"""A snapshot may be half written when a run is killed; the one before it is complete."""
+NUM_KEPT = 2  # a snapshot may be half written when a run is killed; the one before is complete
 
 
 @contextmanager

@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-NUM_TRACKS, NUM_MATCHES_OF_PAIR = 500, 100
-"""Tracks of an image, and matches of a pair at least, that are kept."""
+NUM_TRACKS, NUM_MATCHES_OF_PAIR = 500, 100  # kept, of an image, and of a pair at least
 
 
 def matches_of_best_tracks(

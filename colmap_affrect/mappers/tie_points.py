@@ -32,13 +32,9 @@ Mark = tuple[str, int, float]  # of a point in an image, by its id, and its repr
 
 @dataclass(frozen=True)
 class TiePoints:
-    """Tie points of one database.
+    """Tie points of one database."""
 
-    Attributes:
-        keypoints: their keypoints by image id, of each point.
-    """
-
-    keypoints: Mapping[str, Mapping[int, int]]
+    keypoints: Mapping[str, Mapping[int, int]]  # of each point, by image id
 
     def observe(self, model: pycolmap.Reconstruction) -> None:
         """Give a model a point for each tie point that two of its images see, with all of them."""

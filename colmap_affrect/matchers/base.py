@@ -50,16 +50,12 @@ class ImageFeatures:
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches of two images before geometric verification, one to one.
+    """Matches of two images before geometric verification, one to one."""
 
-    Attributes:
-        indices: (M, 2) int64 features of image 1 and 2, strictly rising in column 0, and no
-            feature twice in column 1: verification and tracks count on it.
-        scores: (M,) float32 in [0, 1], larger is better.
-    """
-
+    # (M, 2) int64 features of image 1 and 2, strictly rising in column 0, and no feature twice in
+    # column 1: verification and tracks count on it
     indices: Indices
-    scores: Singles
+    scores: Singles  # (M,) float32 in [0, 1], larger is better
 
     @classmethod
     def none(cls) -> Self:

@@ -9,11 +9,7 @@ from colmap_affrect.options import suggestion
 
 
 def read_table(
-    path: Path,
-    where: str,
-    columns: Sequence[str],
-    key: str = "name",
-    header: Sequence[str] = (),
+    path: Path, where: str, columns: Sequence[str], key: str = "name", header: Sequence[str] = ()
 ) -> list[tuple[str, dict[str, str]]]:
     """Return the rows of a CSV file, without empty cells, and for each the place to name.
 

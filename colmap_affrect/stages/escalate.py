@@ -42,8 +42,7 @@ from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers,
 
 logger = logging.getLogger(__name__)
 
-LIKELY = 0.25
-"""Part of a gain that counts for images that are likely right: matches tell that, and mend few."""
+LIKELY = 0.25  # part of a gain that counts for images that are likely right: matches mend few
 
 
 def escalate(context: Context, options: EscalateOptions | None = None) -> StageReport:
@@ -85,8 +84,7 @@ class Escalation:
 
     def __init__(self, context: Context, options: EscalateOptions) -> None:
         self.context, self.options = context, options
-        self.extraction = context.extraction
-        self.matching = context.matching
+        self.extraction, self.matching = context.extraction, context.matching
         self.verification = context.verification
         self.pairs = listed_pairs(context)
         self.features, self.matches = context.features, context.matches
@@ -223,8 +221,7 @@ class Escalation:
         missing = [(name, k) for name in images for k in needed if k not in there[name]]
         left = f" (at most about {self.left_s / 60:.0f} min)" if self.left_s >= 60 else ""
         title = f"escalate, {self.extraction.levels[level].name}{left}"
-        total = len(missing) + len(pairs)
-        with self.context.progress.stage(title, total, "steps") as advance:
+        with self.context.progress.stage(title, len(missing) + len(pairs), "steps") as advance:
             self._extend(missing, advance)
             if pairs:
                 self._match_again(pairs, level, advance)
