@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Singles
-from colmap_affrect.geometry.conventions import is_inside
 
 GrayImage = Bytes  # (H, W) gray values, 0.299 R + 0.587 G + 0.114 B
 ColorImage = Bytes  # (H, W, 3) red, green, blue
@@ -123,10 +122,6 @@ class LocalFeatures:
     def with_rectification_id(self, rectification_id: int) -> Self:
         """Say which rectification all features come from."""
         return replace(self, rectification_ids=np.full(len(self), rectification_id, np.int32))
-
-    def inside(self, size: tuple[int, int]) -> Mask:
-        """Tell which centres lie in an image of (width, height)."""
-        return is_inside(self.keypoints, size)
 
 
 def of_one_size(parts: list[LocalFeatures]) -> list[LocalFeatures]:

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Collection, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -110,7 +111,8 @@ def run(
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
     _check_by_hand(options.by_hand, names, mapper)
-    shown = progress.with_forecast(Forecast(len(names), _num_pairs(names, options.pairs)))
+    shown = copy(progress)
+    shown.forecast = Forecast(len(names), _num_pairs(names, options.pairs))
     until_s, workspace = time.monotonic() + 60 * options.max_minutes, Workspace(output_path)
     given = options.by_hand, options.command
     context = Context(workspace, options.resources, executor, shown, until_s, *given)

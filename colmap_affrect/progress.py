@@ -5,9 +5,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from copy import copy
 from dataclasses import dataclass
-from typing import Self, TextIO
+from typing import TextIO
 
 from tqdm import tqdm
 
@@ -72,12 +71,6 @@ class Progress:
             return self.stream.fileno() if self.stream else subprocess.DEVNULL
         except OSError:  # only in this process
             return subprocess.DEVNULL
-
-    def with_forecast(self, forecast: Forecast) -> Self:
-        """Return the same that also says how long all stages take."""
-        new = copy(self)
-        new.forecast = forecast
-        return new
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:

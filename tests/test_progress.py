@@ -36,7 +36,7 @@ def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent
 def test_forecast_measures_what_has_begun_and_guesses_the_rest_from_it() -> None:
     now_s, lines = 0.0, io.StringIO()
     forecast = Forecast(20, 190, clock=lambda: now_s)
-    with Progress(lines).with_forecast(forecast).stage("extract", 20, "images") as advance:
+    with Progress(lines, forecast=forecast).stage("extract", 20, "images") as advance:
         for _ in range(20):
             now_s += 60.0
             advance(1)

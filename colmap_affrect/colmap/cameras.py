@@ -10,15 +10,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    TypeAdapter,
-    model_validator,
-)
+import pydantic
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import CHECKS
@@ -72,7 +64,7 @@ class CameraRecord:
         return {"focal", "distortion"} <= set(self.given)
 
 
-_RECORDS = TypeAdapter(dict[int, CameraRecord])
+_RECORDS = pydantic.TypeAdapter(dict[int, CameraRecord])
 
 
 def read_camera_records(path: Path) -> dict[int, CameraRecord]:
@@ -109,26 +101,26 @@ def _split(text: object) -> object:
     return text.replace(",", " ").replace(";", " ").split() if isinstance(text, str) else text
 
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Positive = Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]
 
 
 class GivenCamera(Options):
     """What the user says of the camera of an image, in a table, a model or the options."""
 
-    model_config = ConfigDict(strict=False)
+    model_config = pydantic.ConfigDict(strict=False)
 
     name: str
     """Of the image; empty for all others."""
     camera: str = ""
     """Label; images with the same one share a camera."""
-    model: Annotated[str, AfterValidator(_known_model)]
-    params: Annotated[tuple[FiniteFloat, ...], BeforeValidator(_split)] = ()
+    model: Annotated[str, pydantic.AfterValidator(_known_model)]
+    params: Annotated[tuple[pydantic.FiniteFloat, ...], pydantic.BeforeValidator(_split)] = ()
     focal_px: Positive | None = None
     focal_mm: Positive | None = None
     plate_width_mm: Positive | None = None
     """Width of what the whole image shows, of a plate or a sensor."""
-    cx: FiniteFloat | None = None
-    cy: FiniteFloat | None = None
+    cx: pydantic.FiniteFloat | None = None
+    cy: pydantic.FiniteFloat | None = None
     """Principal point in COLMAP's px, from the corner of the image."""
     size: tuple[int, ...] = ()
     """(width, height) in px of its images; only of a model."""
@@ -140,7 +132,7 @@ class GivenCamera(Options):
         """The same of any image: equal where the same is said."""
         return self.changed(name="", camera="", where="")
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _says_all_once(self) -> Self:
         if self.params and (self.focal_px or self.focal_mm or self.cx is not None):
             raise ValueError("params have focal length and principal point; leave these out")

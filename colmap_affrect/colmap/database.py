@@ -14,12 +14,8 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.geometry import conventions
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
-from colmap_affrect.geometry.conventions import (
-    MEASUREMENT_SIGMAS,
-    colmap_from_pixel,
-    pixel_from_colmap,
-)
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.stores import FeatureStore
 
@@ -151,8 +147,8 @@ def colmap_keypoints(lafs: Floats) -> Singles:
 
     The centre moves to COLMAP's corner origin; the shape maps the unit circle to one sigma.
     """
-    centers = colmap_from_pixel(lafs[:, :, 2].astype(np.float32))
-    shapes = (lafs[:, :, :2] / MEASUREMENT_SIGMAS).astype(np.float32).reshape(-1, 4)
+    centers = conventions.colmap_from_pixel(lafs[:, :, 2].astype(np.float32))
+    shapes = (lafs[:, :, :2] / conventions.MEASUREMENT_SIGMAS).astype(np.float32).reshape(-1, 4)
     return np.concatenate([centers, shapes], axis=1)
 
 
@@ -229,7 +225,7 @@ def fill_descriptors(path: Path, features: FeatureStore) -> None:
 def camera_matrix(camera: pycolmap.Camera) -> Array:
     """Return (3, 3) intrinsics in pixel-centre px, without distortion."""
     matrix = np.asarray(camera.calibration_matrix(), dtype=np.float64)
-    matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])
+    matrix[:2, 2] = conventions.pixel_from_colmap(matrix[:2, 2])
     return matrix
 
 

@@ -17,17 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from colmap_affrect import errors
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import (
-    DAMAGE,
-    AffrectError,
-    OptionError,
-    StoreError,
-    damage,
-    lacks_memory,
-    made_again,
-    reason,
-)
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.project.atomic_files import cannot_write
 
@@ -119,7 +110,7 @@ OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")  # of COLMAP before 
 
 def _read_records(path: Path) -> list[Any]:
     """Read all records of a file; StoreError unless they end where it ends."""
-    with damage(path, _mend(path.parent)):
+    with errors.damage(path, _mend(path.parent)):
         reader, record = _Reader(path.read_bytes()), RECORDS[path.name]
         try:
             records = [record(reader) for _ in range(reader.take("Q")[0])]
@@ -133,7 +124,7 @@ def _read_records(path: Path) -> list[Any]:
 def _mend(folder: Path) -> str:
     """Say how a model is made again."""
     if (folder.parent.parent / "config.toml").exists():
-        return made_again("map", folder.parent.parent)
+        return errors.made_again("map", folder.parent.parent)
     return "make the model again"
 
 
@@ -154,7 +145,7 @@ def require_intact(folder: Path) -> None:
             _read_records(folder / name)
     changed = [name for name in RECORDS if known and known.get(name) != now.get(name)]
     if changed:
-        raise StoreError(
+        raise errors.StoreError(
             f"{folder / changed[0]}: is not as it was written (see {SUMMARY} in its folder); if "
             f"you have edited the model, copy it to a folder of its own without {SUMMARY} and use "
             f"that; else {_mend(folder)}"
@@ -169,7 +160,7 @@ def kept_digests(folder: Path) -> dict[str, str]:
     """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
         known = json.loads((folder / SUMMARY).read_bytes())["model"]
-    except DAMAGE:
+    except errors.DAMAGE:
         return {}
     return known if isinstance(known, dict) else {}
 
@@ -189,7 +180,7 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     model.write(folder)
     try:
         registered_names(folder)
-    except StoreError as error:
+    except errors.StoreError as error:
         raise cannot_write(folder, error) from error
 
 
@@ -200,10 +191,10 @@ def read_given_model(folder: Path, option: str = "") -> pycolmap.Reconstruction:
     """
     wanted = "give the folder that holds cameras, images and points3D as .bin or .txt"
     if not folder.is_dir():
-        raise OptionError(f"{option}{folder}: no such folder; {wanted}")
+        raise errors.OptionError(f"{option}{folder}: no such folder; {wanted}")
     if _is_binary(folder) or kept_digests(folder):
         require_intact(folder)
-        with damage(folder, _mend(folder)):
+        with errors.damage(folder, _mend(folder)):
             model = pycolmap.Reconstruction(folder)
             seen = sum(image.num_points3D for image in model.images.values())
             if seen != sum(point.track.length() for point in model.points3D.values()):
@@ -211,11 +202,11 @@ def read_given_model(folder: Path, option: str = "") -> pycolmap.Reconstruction:
         return model
     try:
         return pycolmap.Reconstruction(folder)
-    except DAMAGE as error:
-        if lacks_memory(error):
+    except errors.DAMAGE as error:
+        if errors.lacks_memory(error):
             raise
-        why = f"not a COLMAP model; {wanted} ({reason(error)})"
-        raise OptionError(f"{option}{folder}: {why}") from error
+        why = f"not a COLMAP model; {wanted} ({errors.reason(error)})"
+        raise errors.OptionError(f"{option}{folder}: {why}") from error
 
 
 def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
@@ -236,7 +227,7 @@ def read_poses(model_path: Path) -> Poses:
     """Read the poses of a COLMAP model, text or binary; AffrectError when it has none."""
     poses = model_poses(read_given_model(model_path))
     if not poses:
-        raise AffrectError(f"{model_path}: the model has no images with poses")
+        raise errors.AffrectError(f"{model_path}: the model has no images with poses")
     return poses
 
 

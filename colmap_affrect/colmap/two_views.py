@@ -11,14 +11,8 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.affine import rotation
-from colmap_affrect.geometry.arrays import Array, Floats
-from colmap_affrect.geometry.epipolar import (
-    EpipolarModel,
-    HomographyModel,
-    PairModel,
-    Rows,
-    common_sign,
-)
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
+from colmap_affrect.geometry.epipolar import EpipolarModel, HomographyModel, PairModel, common_sign
 from colmap_affrect.geometry.significance import log10_bayes_factor, log10_false_alarms, shuffled
 from colmap_affrect.geometry.tilts import of_unit_area, vary_singly
 
@@ -135,7 +129,7 @@ def _telling_shapes(keypoints: Floats) -> Array | None:
     return None if alike or not vary_singly(shapes) else shapes
 
 
-def _frame_evidence(model: PairModel, inliers: Rows, shapes: tuple[Array, Array]) -> float:
+def _frame_evidence(model: PairModel, inliers: Indices, shapes: tuple[Array, Array]) -> float:
     """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
     cosines = model.cosines(inliers, inliers, shapes)
     first, second = shuffled(len(inliers))

@@ -11,16 +11,8 @@ import networkx
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import (
-    cameras_of_images,
-    colmap_keypoints,
-    image_ids,
-    open_database,
-    read_cameras,
-    require_database_space,
-    unverified_pairs,
-)
 from colmap_affrect.colmap.two_views import significance
 from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
@@ -187,14 +179,14 @@ def verify(
     written when it has been judged: whatever ends this, no pair counts as verified that was not.
     ``advance`` is called with the number of pairs that are done.
     """
-    todo = unverified_pairs(path)
+    todo = colmap_database.unverified_pairs(path)
     if pairs is not None:
         todo = todo[[tuple(pair) in pairs for pair in todo.tolist()]]
     if not len(todo):
         return
-    require_database_space(path, len(todo))
-    with open_database(path) as database:
-        cameras = cameras_of_images(database)
+    colmap_database.require_database_space(path, len(todo))
+    with colmap_database.open_database(path) as database:
+        cameras = colmap_database.cameras_of_images(database)
 
         @lru_cache(NUM_CACHED_IMAGES)
         def side(image_id: int) -> Side:
@@ -203,8 +195,7 @@ def verify(
 
         def estimate(task: _Task) -> _Done:
             ids, sides, matches = task
-            size_px = of_pair(extracted_px, ids)
-            return ids, estimate_geometry(sides, matches, options, size_px)
+            return ids, estimate_geometry(sides, matches, options, of_pair(extracted_px, ids))
 
         tasks = (
             ((one, two), (side(one), side(two)), database.read_matches(one, two))
@@ -226,7 +217,8 @@ class PairVerifier:
         self, path: Path, options: VerificationOptions, extracted_px: ExtractedPx = None
     ) -> None:
         self._options, self._extracted_px = options, extracted_px
-        self._ids, self._cameras = image_ids(path), read_cameras(path)
+        self._ids = colmap_database.image_ids(path)
+        self._cameras = colmap_database.read_cameras(path)
 
     def inliers(self, names: Names, frames: Frames, indices: Matches) -> Indices:
         """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected."""
@@ -238,7 +230,7 @@ class PairVerifier:
         """Return the geometry of the same from the image with the lower id; empty if rejected."""
         ids = self._ids[names[0]], self._ids[names[1]]
         first, second = (
-            Side(self._cameras[name], colmap_keypoints(lafs))
+            Side(self._cameras[name], colmap_database.colmap_keypoints(lafs))
             for name, lafs in zip(names, frames, strict=True)
         )
         if ids[0] > ids[1]:
@@ -249,7 +241,7 @@ class PairVerifier:
 
 def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:
     """Return the number of inliers of each verified pair of image ids."""
-    with open_database(path) as database:
+    with colmap_database.open_database(path) as database:
         pair_ids, counts = database.read_two_view_geometry_num_inliers()
     return {
         pycolmap.pair_id_to_image_pair(pair_id): int(count)
@@ -268,7 +260,7 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
 
 def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], Indices]:
     """Return the (M, 2) features of each verified pair of image ids that are inliers."""
-    with open_database(path) as database:
+    with colmap_database.open_database(path) as database:
         pair_ids, geometries = database.read_two_view_geometries()
     return {
         pycolmap.pair_id_to_image_pair(pair_id): np.asarray(geometry.inlier_matches, np.int64)

@@ -20,14 +20,9 @@ from pydantic import Field
 from colmap_affrect.data import GrayImage, Mask, ShapeGrid, ShapeSamples
 from colmap_affrect.features.base import PATCH_SIZE_PX, FeatureOptions, NetworkContext, ShapeOptions
 from colmap_affrect.features.sift import DogOptions, detect_dog
-from colmap_affrect.geometry import tilts
+from colmap_affrect.geometry import conventions, tilts
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
-from colmap_affrect.geometry.conventions import (
-    MEASUREMENT_SIGMAS,
-    grid_origin,
-    resized_from_original,
-)
 from colmap_affrect.geometry.tilts import STEP_PX
 from colmap_affrect.images.reading import shrink_to
 from colmap_affrect.options import within
@@ -35,6 +30,7 @@ from colmap_affrect.options import within
 if TYPE_CHECKING:
     import torch
 
+ORIGIN_PX = conventions.grid_origin(STEP_PX)  # centre of the first block
 LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
 front, that patch has the block of rows and columns 0...3 in its middle."""
@@ -105,7 +101,7 @@ class AffNet:
         else:
             logs, textured = self._mean_logs(image), _textured(image, self.options.min_deviation)
             logs[~textured] = 0.0
-        return ShapeGrid(tilts.metrics_from_log(logs), textured, grid_origin(STEP_PX), STEP_PX)
+        return ShapeGrid(tilts.metrics_from_log(logs), textured, ORIGIN_PX, STEP_PX)
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
@@ -126,8 +122,8 @@ class AffNet:
             normalised = (level - around) / (deviation + DEVIATION_FLOOR)
             clipped = np.clip(normalised, -MAX_NORMALISED, MAX_NORMALISED).astype(np.float32)
             logs = self._dense_logs(_with_reflected_border(clipped))
-            level_from_image = resized_from_original((size[0], size[1]), level.shape[::-1])
-            mean += _read_grid(logs, level_from_image, mean.shape[:2]) / len(levels)
+            matrix = conventions.resized_from_original((size[0], size[1]), level.shape[::-1])
+            mean += _read_grid(logs, matrix, mean.shape[:2]) / len(levels)
         return mean
 
     def _paper_logs(self, image: GrayImage) -> Singles:
@@ -166,7 +162,7 @@ class AffNet:
         from colmap_affrect.features.networks import PatchSampler, standardized
 
         wide = lafs.copy()
-        wide[:, :, :2] *= PATCH_SIGMAS / MEASUREMENT_SIGMAS
+        wide[:, :, :2] *= PATCH_SIGMAS / conventions.MEASUREMENT_SIGMAS
         patches = PatchSampler(image.astype(np.float32), self.device).sample(wide)
         with torch.inference_mode():
             batches = (batch for batch in torch.split(patches, BATCH_SIZE) if len(batch))
@@ -210,8 +206,8 @@ def _read_grid(values: Singles, level_from_image: Array, cells: tuple[int, int])
     weights = []
     for axis, (count, length) in enumerate(zip(cells, values.shape[:2], strict=True)):
         scale, shift = level_from_image[1 - axis, [1 - axis, 2]]
-        centers = grid_origin(STEP_PX) + STEP_PX * np.arange(count)
-        indices = (scale * centers + shift - grid_origin(STEP_PX)) / STEP_PX
+        centers = ORIGIN_PX + STEP_PX * np.arange(count)
+        indices = (scale * centers + shift - ORIGIN_PX) / STEP_PX
         distances = np.clip(indices, 0, length - 1)[:, None] - np.arange(length)
         weights.append(np.maximum(1.0 - np.abs(distances), 0.0).astype(np.float32))
     by_row, by_column = weights

@@ -91,9 +91,8 @@ class HomographyModel:
     def scaled(self, first: float, second: float) -> Self:
         """Return the same in px of images that are smaller by these factors."""
         matrix = np.diag([1 / second, 1 / second, 1.0]) @ self.matrix @ np.diag([first, first, 1.0])
-        return replace(
-            self, matrix=matrix, points=(self.points[0] / first, self.points[1] / second)
-        )
+        points = self.points[0] / first, self.points[1] / second
+        return replace(self, matrix=matrix, points=points)
 
 
 PairModel = EpipolarModel | HomographyModel

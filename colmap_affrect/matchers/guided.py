@@ -10,15 +10,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from colmap_affrect.geometry import epipolar
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles, rows_in
-from colmap_affrect.geometry.epipolar import (
-    EpipolarModel,
-    HomographyModel,
-    PairModel,
-    common_sign,
-    epipolar_lines,
-)
 from colmap_affrect.geometry.two_views import homogeneous
 from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
@@ -56,7 +50,7 @@ class GuidedOptions(Options):
 def guided_matches(
     descriptors: tuple[Singles, Singles],
     shapes: tuple[Array, Array] | None,
-    model: PairModel,
+    model: epipolar.PairModel,
     inliers: Indices,
     options: GuidedOptions,
 ) -> Indices:
@@ -74,9 +68,9 @@ def guided_matches(
     """
     sign = 1.0
     if shapes and model.has_sign:
-        sign = common_sign(model.cosines(inliers[:, 0], inliers[:, 1], shapes))
+        sign = epipolar.common_sign(model.cosines(inliers[:, 0], inliers[:, 1], shapes))
 
-    def matched(model: PairModel) -> Indices:
+    def matched(model: epipolar.PairModel) -> Indices:
         matches = nearest_allowed(descriptors, model, options)
         if not shapes:
             return matches
@@ -93,7 +87,7 @@ def guided_matches(
 
 
 def nearest_allowed(
-    descriptors: tuple[Singles, Singles], model: PairModel, options: GuidedOptions
+    descriptors: tuple[Singles, Singles], model: epipolar.PairModel, options: GuidedOptions
 ) -> Indices:
     """Return the (M, 2) mutual nearest neighbours among the features that may match.
 
@@ -130,7 +124,7 @@ def nearest_allowed(
     return np.stack([kept, forward[kept]], axis=1)
 
 
-def _beside(model: PairModel, band_px: float) -> list[PairModel]:
+def _beside(model: epipolar.PairModel, band_px: float) -> list[epipolar.PairModel]:
     """Return geometries that are moved away in image 2: in one of them nothing is right.
 
     Across most epipolar lines; of a homography along both axes, for what lies before or behind its
@@ -138,8 +132,8 @@ def _beside(model: PairModel, band_px: float) -> list[PairModel]:
     """
     points1, points2 = model.points
     across = np.eye(2)
-    if isinstance(model, EpipolarModel):
-        normals = epipolar_lines(model.fundamental, points1, points2)[1][:, :2]
+    if isinstance(model, epipolar.EpipolarModel):
+        normals = epipolar.epipolar_lines(model.fundamental, points1, points2)[1][:, :2]
         normals = normals[np.isfinite(normals).all(axis=1)]
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), TINY)
         across = np.linalg.eigh(normals.T @ normals)[1][:, 1:].T
@@ -147,13 +141,13 @@ def _beside(model: PairModel, band_px: float) -> list[PairModel]:
     return [replace(model, points=(points1, points2 + step)) for step in steps]
 
 
-def _allowed(model: PairModel, band_px: float) -> Iterator[tuple[Indices, Bools]]:
+def _allowed(model: epipolar.PairModel, band_px: float) -> Iterator[tuple[Indices, Bools]]:
     """Yield (R,) features of image 1, each once, and (R, N) which of image 2 they may match.
 
     Those of a group lie beside each other, so that they may match few.
     """
     points1, points2 = model.points
-    if isinstance(model, HomographyModel):
+    if isinstance(model, epipolar.HomographyModel):
         with np.errstate(divide="ignore", invalid="ignore"):
             places = project(model.matrix, points1)
         radius = BANDS_OF_HOMOGRAPHY * band_px
@@ -161,7 +155,7 @@ def _allowed(model: PairModel, band_px: float) -> Iterator[tuple[Indices, Bools]
             x, y = (places[rows, axis, None] - points2[:, axis] for axis in (0, 1))
             yield rows, x**2 + y**2 <= radius**2
         return
-    lines1, lines2 = epipolar_lines(model.fundamental, points1, points2)
+    lines1, lines2 = epipolar.epipolar_lines(model.fundamental, points1, points2)
     squares1, squares2 = ((lines[:, :2] ** 2).sum(axis=1) for lines in (lines1, lines2))
     homogeneous2 = homogeneous(points2)
     _, scales, axes = np.linalg.svd(model.fundamental)

@@ -13,18 +13,13 @@ import numpy as np
 
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within, without_duplicates
+from colmap_affrect.matchers import nearest_8bit
 from colmap_affrect.matchers.base import (
     ImageFeatures,
     MatcherContext,
     MatcherOptions,
     Matches,
     distance_ratios,
-)
-from colmap_affrect.matchers.nearest_8bit import (
-    CoarseDescriptors,
-    ShortList,
-    coarse_pays,
-    short_lists,
 )
 from colmap_affrect.options import within
 
@@ -55,7 +50,7 @@ class MatchableImage:
     descriptors: Singles  # (N, D) float32 rows of unit length
     keypoints: Floats  # (N, 2) pixel-centre px
     rivals: NeighborLists  # for each feature those too close to serve as its second neighbour
-    coarse: CoarseDescriptors | None = None  # the descriptors in few bits, where that pays
+    coarse: nearest_8bit.CoarseDescriptors | None = None  # those in few bits, where that pays
 
     @property
     def nbytes(self) -> int:
@@ -70,14 +65,14 @@ class NearestNeighbors:
     Options = NearestOptions
 
     def __init__(self, options: NearestOptions, context: MatcherContext) -> None:
-        self.options, self._is_coarse = options, coarse_pays(context.num_similarities)
+        self.options, self._is_coarse = options, nearest_8bit.coarse_pays(context.num_similarities)
 
     def prepare(self, image: ImageFeatures) -> MatchableImage:
         """Make the features of an image ready for matching."""
         descriptors = np.ascontiguousarray(image.features.descriptors, dtype=np.float32)
         keypoints = image.features.keypoints
         rivals = neighbors_within(keypoints, self.options.min_contrast_distance_px)
-        coarse = CoarseDescriptors.of(descriptors) if self._is_coarse else None
+        coarse = nearest_8bit.CoarseDescriptors.of(descriptors) if self._is_coarse else None
         return MatchableImage(descriptors, keypoints, rivals, coarse)
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
@@ -107,11 +102,12 @@ def _nearest(
 ) -> tuple[Indices, Singles]:
     """Return nearest features and ratios to non-rivals; perhaps -1 and infinite from the limit."""
     queries = image1.descriptors[rows]
-    if image1.coarse is None or image2.coarse is None:
+    first, second = image1.coarse, image2.coarse
+    if first is None or second is None:
         return _nearest_of_all(queries, image2)
     nearest, doubtful = np.full(len(rows), -1), np.zeros(len(rows), bool)
     ratios = np.full(len(rows), np.inf, np.float32)
-    for short in short_lists(image1.coarse, image2.coarse, rows, image2.rivals, max_ratio):
+    for short in nearest_8bit.short_lists(first, second, rows, image2.rivals, max_ratio):
         at = short.rows
         nearest[at], ratios[at], doubtful[at] = _nearest_of_listed(queries, image2, short)
     nearest[doubtful], ratios[doubtful] = _nearest_of_all(queries[doubtful], image2)
@@ -119,7 +115,7 @@ def _nearest(
 
 
 def _nearest_of_listed(
-    queries: Singles, image: MatchableImage, short: ShortList
+    queries: Singles, image: MatchableImage, short: nearest_8bit.ShortList
 ) -> tuple[Indices, Singles, Bools]:
     """Return nearest and ratio among the listed features, and where these are doubtful."""
     similarity = np.empty(len(short.entry_rows), np.float32)

@@ -12,12 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.errors import StoreError, damage, made_again
-from colmap_affrect.project.atomic_files import (
-    FileTransaction,
-    apply_journal,
-    cannot_write,
-    uninterrupted,
-)
+from colmap_affrect.project import atomic_files
 
 CHECKSUM = "crc32"  # of the values of a dataset, its attribute
 
@@ -42,19 +37,19 @@ class GroupStore:
             with self._opened(self.path, "r") as file:
                 yield file
             return
-        with uninterrupted(), FileTransaction(self.path) as changes:
+        with atomic_files.uninterrupted(), atomic_files.FileTransaction(self.path) as changes:
             with self._opened(changes, "r+" if self.path.exists() else "w") as file:
                 yield file
             try:
                 changes.commit()
             except OSError as error:
-                raise cannot_write(self.path, error) from error
+                raise atomic_files.cannot_write(self.path, error) from error
 
     @contextmanager
-    def _opened(self, where: Path | FileTransaction, mode: str) -> Iterator[h5py.File]:
+    def _opened(self, where: Path | atomic_files.FileTransaction, mode: str) -> Iterator[h5py.File]:
         mend = f"unless another program has it open, {made_again(self.stage, self.path.parent)}"
         with damage(self.path, mend):
-            apply_journal(self.path)
+            atomic_files.apply_journal(self.path)
             with h5py.File(where, mode) as file:
                 if mode == "w":
                     file.attrs.update(format=self.format, pixel_origin="center")

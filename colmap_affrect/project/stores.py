@@ -27,6 +27,8 @@ from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
 from colmap_affrect.project.record import Content, stamp_of
 
+Names = tuple[str, str]  # of a pair of images
+
 MAX_INT16 = 32767
 NOT_KNOWN = Content()
 # Notes of matches:
@@ -43,7 +45,7 @@ Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 class PairMatches:
     """Raw matches of one pair."""
 
-    names: tuple[str, str]  # the two image names, in the order of the columns
+    names: Names  # the two image names, in the order of the columns
     indices: Indices  # (M, 2) int64, strictly rising in column 0
     scores: Singles  # (M,) float32 in [0, 1], larger is better
     num_keypoints1: int  # number of features of the first image
@@ -76,8 +78,7 @@ def frame_datasets(lafs: Floats) -> dict[str, Singles]:
     stored = lafs.astype(np.float32)
     shapes = stored[:, :, :2].astype(np.float64)
     scales = np.sqrt(np.abs(np.linalg.det(shapes))) / MEASUREMENT_SIGMAS
-    angles = np.rad2deg(np.arctan2(shapes[:, 1, 0], shapes[:, 0, 0]))
-    oris = angles.astype(np.float32)
+    oris = np.rad2deg(np.arctan2(shapes[:, 1, 0], shapes[:, 0, 0])).astype(np.float32)
     return {"lafs": stored, "scales": scales.astype(np.float32), "oris": oris}
 
 
@@ -226,11 +227,8 @@ def hloc_matches(pair: PairMatches) -> dict[str, NDArray[Any]]:
     scores0 = np.zeros(pair.num_keypoints1, np.float16)
     matches0[pair.indices[:, 0]] = pair.indices[:, 1]
     scores0[pair.indices[:, 0]] = pair.scores
-    wide = matches0.max(initial=0) > MAX_INT16
-    return {
-        "matches0": matches0.astype(np.int32 if wide else np.int16),
-        "matching_scores0": scores0,
-    }
+    dtype = np.int32 if matches0.max(initial=0) > MAX_INT16 else np.int16
+    return {"matches0": matches0.astype(dtype), "matching_scores0": scores0}
 
 
 class MatchStore(GroupStore):
@@ -239,10 +237,7 @@ class MatchStore(GroupStore):
     format, stage = "colmap_affrect/matches", "match"
 
     def write(
-        self,
-        pairs: Iterable[PairMatches],
-        tried: Iterable[tuple[str, str]] = (),
-        tried_level: int = 0,
+        self, pairs: Iterable[PairMatches], tried: Iterable[Names] = (), tried_level: int = 0
     ) -> None:
         """Write a batch of pairs; record that a level was tried for others, which keep theirs."""
         with self._open("a") as file:
@@ -255,7 +250,7 @@ class MatchStore(GroupStore):
             for names in tried:
                 file[pair_key(*names)].attrs["tried"] |= 1 << tried_level
 
-    def remove(self, images: Iterable[str] = (), pairs: Iterable[tuple[str, str]] = ()) -> None:
+    def remove(self, images: Iterable[str] = (), pairs: Iterable[Names] = ()) -> None:
         """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
 
         Which pairs are escalated depends on all others.
@@ -272,7 +267,7 @@ class MatchStore(GroupStore):
                 if is_asked or group.attrs["tried"] > 1:
                     del file[key]
 
-    def has(self, pairs: Sequence[tuple[str, str]]) -> Bools:
+    def has(self, pairs: Sequence[Names]) -> Bools:
         """Return, as (N,) bools, which of N pairs are there and complete."""
         if not self.path.exists():
             return np.zeros(len(pairs), np.bool_)
@@ -280,9 +275,9 @@ class MatchStore(GroupStore):
             there = (is_complete(file, pair_key(*pair)) for pair in pairs)
             return np.fromiter(there, np.bool_, len(pairs))
 
-    def nums_of_some(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+    def nums_of_some(self, pairs: Iterable[Names]) -> dict[Names, int]:
         """Return the number of matches of the pairs for which some features were matched."""
-        found = dict[tuple[str, str], int]()
+        found = dict[Names, int]()
         with self._open("r") as file:
             for pair in pairs:
                 group = file[pair_key(*pair)]
@@ -295,14 +290,12 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             return sum(len(group) for group in file.values())
 
-    def levels(
-        self, pairs: Iterable[tuple[str, str]], attribute: str = "level"
-    ) -> dict[tuple[str, str], int]:
+    def levels(self, pairs: Iterable[Names], attribute: str = "level") -> dict[Names, int]:
         """Return the level that the matches of each pair are from, or its ``tried`` ones."""
         with self._open("r") as file:
             return {pair: int(file[pair_key(*pair)].attrs[attribute]) for pair in pairs}
 
-    def read(self, pairs: Sequence[tuple[str, str]]) -> Iterator[PairMatches]:
+    def read(self, pairs: Sequence[Names]) -> Iterator[PairMatches]:
         """Yield the matches of each pair; StoreError at a pair without matches."""
         with self._open("r") as file:
             for name1, name2 in pairs:
@@ -324,7 +317,7 @@ class MatchStore(GroupStore):
 class GuidedPair:
     """What guided matching found for a pair."""
 
-    names: tuple[str, str]  # of the two images, in the order of the columns
+    names: Names  # of the two images, in the order of the columns
     exact: Indices  # (M, 2) inliers before; what adjusts models most accurately
     num_inliers: int  # of the geometry that took the place of the one before; 0 where that stayed
 
@@ -348,12 +341,8 @@ class GuidedStore(GroupStore):
         if not self.path.exists():
             return []
         with self._open("r") as file:
-            return [
-                GuidedPair(
-                    (str(first), str(second)),
-                    checked(group, "exact"),
-                    int(group.attrs["num_inliers"]),
-                )
-                for _, group in sorted(complete_groups(file), key=lambda item: item[0])
-                for first, second in [group.attrs["names"]]
-            ]
+            found = []
+            for _, group in sorted(complete_groups(file), key=lambda item: item[0]):
+                (first, second), num = group.attrs["names"], int(group.attrs["num_inliers"])
+                found.append(GuidedPair((str(first), str(second)), checked(group, "exact"), num))
+        return found

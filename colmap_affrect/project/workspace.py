@@ -12,15 +12,8 @@ from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
 from colmap_affrect.errors import OptionError, StoreError, WorkspaceError
+from colmap_affrect.project import outputs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
-from colmap_affrect.project.outputs import (
-    LOCK,
-    OF_SYSTEMS,
-    database_files,
-    is_output_folder,
-    refuse_link,
-    remove_own,
-)
 from colmap_affrect.project.record import (
     MADE_FROM,
     STAGES,
@@ -104,10 +97,10 @@ class Workspace:
         with suppress(OSError):  # not there, or refused when it is to be used
             paths = list(self.path.iterdir())
             for path in paths:
-                if path.name.partition(".")[0] in OWN_STEMS or path.name == LOCK:
-                    refuse_link(path)
+                if path.name.partition(".")[0] in OWN_STEMS or path.name == outputs.LOCK:
+                    outputs.refuse_link(path)
             foreign = [path.name for path in paths if not _may_be_ours(path)]
-            if foreign and not is_output_folder(self.path):
+            if foreign and not outputs.is_output_folder(self.path):
                 raise OptionError(
                     f"{self.path}: is not empty ({min(foreign)}) and was not made by "
                     "colmap-affrect; give a new or an empty folder as --output-path"
@@ -118,7 +111,7 @@ class Workspace:
         self.require_own()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            if not is_output_folder(self.path):
+            if not outputs.is_output_folder(self.path):
                 with self.log.open("a", encoding="utf-8") as log:
                     log.write(f"colmap-affrect {__version__}: output folder\n")
         except OSError as error:
@@ -137,7 +130,7 @@ class Workspace:
         """
         self.begin()
         try:
-            lock = FileLock(self.path / LOCK).acquire(timeout=LOCK_WAIT_S)
+            lock = FileLock(self.path / outputs.LOCK).acquire(timeout=LOCK_WAIT_S)
         except Timeout as error:
             raise WorkspaceError(
                 f"{self.path}: another colmap-affrect is working in this folder; wait for it "
@@ -226,11 +219,11 @@ class Workspace:
         StoreError when other options made the results that are there.
         """
         self._refuse_foreign_results(stage)
-        remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
+        outputs.remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
         record, begun = self.recorded(), self.begun
         if overwrite:
             self.refuse_foreign_models()
-            remove_own(self._results(stage))
+            outputs.remove_own(self._results(stage))
             begun = self._begun_before(stage)
             record = record if begun else {}
         if stage in begun and (why := first_difference(record[stage], options)):
@@ -251,7 +244,7 @@ class Workspace:
         if self.users_database:
             raise StoreError(f"{self.users_database}: {why}; {self._remedy}")
         self.record_made_from(map="")
-        remove_own(path for path in self._results("verify") if path != self.sparse)
+        outputs.remove_own(path for path in self._results("verify") if path != self.sparse)
         self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
 
     @property
@@ -291,7 +284,7 @@ class Workspace:
         made = {
             "map": [self.sparse, self.snapshots, self.report, self.page, self.mapped_database],
             "guide": [self.guided],
-            "verify": [self.cameras, self.seal, *database_files(self.database)],
+            "verify": [self.cameras, self.seal, *outputs.database_files(self.database)],
             "match": [self.matches],
             "pairs": [self.pairs],
             "extract": [self.features],
@@ -302,6 +295,6 @@ class Workspace:
 
 def _may_be_ours(path: Path) -> bool:
     """Return whether a file may be in an empty folder, or that of a run that was killed early."""
-    name = path.name
-    is_empty_log = name == "run.log" and not path.stat().st_size
-    return name.startswith(".") or name in OF_SYSTEMS or name.endswith(NEW_SUFFIX) or is_empty_log
+    if path.name == "run.log":
+        return not path.stat().st_size
+    return path.name in outputs.OF_SYSTEMS or path.name.startswith(".") or path.suffix == NEW_SUFFIX

@@ -14,25 +14,20 @@ from colmap_affrect.geometry.affine import fit_canvas, image_corners, rectifying
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.tilts import asift_covering, near_optimal_covering
 from colmap_affrect.options import within
-from colmap_affrect.rectifiers.base import (
-    AffineWarpOptions,
-    CoverOptions,
-    RectifierOptions,
-    WithInputs,
-)
+from colmap_affrect.rectifiers import base
 from colmap_affrect.rectifiers.regions import Region
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
 GAP_BLOCKS = 5  # groups of blocks closer than this are warped together
 
 
-class IdentityOptions(RectifierOptions):
+class IdentityOptions(base.RectifierOptions):
     """No warps."""
 
     name: Literal["identity"] = "identity"
 
 
-class Identity(WithInputs):
+class Identity(base.WithInputs):
     """The photograph as it is."""
 
     Options = IdentityOptions
@@ -42,7 +37,7 @@ class Identity(WithInputs):
         return RectificationPlan(photograph.size)
 
 
-class AsiftOptions(AffineWarpOptions):
+class AsiftOptions(base.AffineWarpOptions):
     """The same warps of the whole image for every photograph."""
 
     name: Literal["asift"] = "asift"
@@ -51,7 +46,7 @@ class AsiftOptions(AffineWarpOptions):
     2018); ``asift``: the 60 of ASIFT with tilts to 8 (Morel & Yu 2009, the paper)."""
 
 
-class Asift(WithInputs):
+class Asift(base.WithInputs):
     """The same maps for every photograph (Morel & Yu 2009)."""
 
     Options = AsiftOptions
@@ -61,13 +56,13 @@ class Asift(WithInputs):
         return plan_whole_image(photograph.size, COVERINGS[self.options.covering](), self.options)
 
 
-class AffNetShapesOptions(CoverOptions):
+class AffNetShapesOptions(base.CoverOptions):
     """The whole photograph is warped by every covering map of its shapes."""
 
     name: Literal["affnet-shapes"] = "affnet-shapes"
 
 
-class AffNetShapes(WithInputs):
+class AffNetShapes(base.WithInputs):
     """A greedy cover of the photograph's own affine shapes (Rodriguez et al. 2018; Sec. 2.4)."""
 
     Options = AffNetShapesOptions
@@ -79,7 +74,7 @@ class AffNetShapes(WithInputs):
 
 
 def plan_whole_image(
-    image_size: tuple[int, int], centers: Floats, options: AffineWarpOptions
+    image_size: tuple[int, int], centers: Floats, options: base.AffineWarpOptions
 ) -> RectificationPlan:
     """Warp an image of (width, height) as a whole by (K, 2) classes (tilt, angle_rad)."""
     items = []
@@ -90,7 +85,7 @@ def plan_whole_image(
     return RectificationPlan(image_size, tuple(items))
 
 
-class DenseShapesOptions(CoverOptions):
+class DenseShapesOptions(base.CoverOptions):
     """Each block of the photograph is warped by the covering map nearest to its shape."""
 
     name: Literal["dense-shapes"] = "dense-shapes"
@@ -101,7 +96,7 @@ class DenseShapesOptions(CoverOptions):
     image are left out. 0: all of a region in one warp (the paper)."""
 
 
-class DenseShapes(WithInputs):
+class DenseShapes(base.WithInputs):
     """Regions of similar shape, one affine map for each (the paper's DenseAffNet)."""
 
     Options = DenseShapesOptions

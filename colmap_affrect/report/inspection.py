@@ -13,17 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from colmap_affrect.data import (
-    ColorImage,
-    GrayImage,
-    LocalFeatures,
-    Mask,
-    Photograph,
-    RectificationPlan,
-    View,
-)
+from colmap_affrect.data import ColorImage, LocalFeatures, Mask, Photograph, RectificationPlan, View
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.outputs import new_results
@@ -120,14 +113,14 @@ def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, 
 
 
 def panel_of(
-    image: GrayImage | ColorImage,
+    image: Bytes,
     per_row: int,
     features: LocalFeatures | None = None,
     colors: Sequence[Color] = (),
     max_num: int = 0,
     marks: Marks | None = None,
 ) -> ColorImage:
-    """Show an image as large as fits, with its strongest features as ellipses, and texts."""
+    """Show an (H, W[, 3]) image as large as fits, with its strongest features, and texts."""
     side, height, width = WIDTH_PX // per_row - MARGIN_PX, *image.shape[:2]
     scale = side / max(width, height)
     size = max(1, round(scale * width)), max(1, round(scale * height))
@@ -241,7 +234,7 @@ class _Recorder:
         return self.seen[-1][1]
 
     def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+        self, images: Sequence[Bytes], detected: Sequence[LocalFeatures]
     ) -> list[LocalFeatures]:
         return self.extractor.describe(images, detected)
 

@@ -16,7 +16,7 @@ from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, N
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.conventions import camera_matrix, resized_from_original
+from colmap_affrect.geometry.conventions import camera_matrix, is_inside, resized_from_original
 from colmap_affrect.images import reading
 from colmap_affrect.images.depth import DepthMaps
 from colmap_affrect.images.photographs import Photographs
@@ -107,15 +107,14 @@ class ImageExtractor:
         size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
-        has_networks = self.options.levels[level].uses_networks
-        with self.network_lock if has_networks else nullcontext():
+        with self.network_lock if self.options.levels[level].uses_networks else nullcontext():
             plan, warning = self.plan(photograph, level)
             features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
             resized = resized_from_original(original_size, photograph.size)
             frames = transform_frames(np.linalg.inv(resized), features.lafs)
             features = replace(features, lafs=frames)
-        keep = features.inside(original_size)
+        keep = is_inside(features.keypoints, original_size)
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
         kept = features.select(keep)

@@ -23,7 +23,7 @@ from colmap_affrect.data import (
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import lafs_from_keypoints, project, transform_frames
-from colmap_affrect.geometry.conventions import camera_matrix
+from colmap_affrect.geometry.conventions import camera_matrix, is_inside
 from colmap_affrect.matchers.base import ImageFeatures, Matcher
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.base import Rectifier
@@ -81,7 +81,7 @@ class ExtractorContract(Contract):
         assert (features.responses > 0).all()
         lengths = np.linalg.norm(features.descriptors, axis=1)
         assert_allclose(lengths, 1.0, atol=UNIT_LENGTH_ERROR)
-        assert features.inside((image.shape[1], image.shape[0])).all()
+        assert is_inside(features.keypoints, (image.shape[1], image.shape[0])).all()
         if kind == "textured":
             assert len(features) > 10
         if kind in ("flat", "black"):
@@ -180,7 +180,7 @@ class RectifierContract(Contract):
         features = extractor.execute(photograph, plan)
         assert len(features) or kind != "textured"
         assert features.descriptors.shape == (len(features), 128)
-        assert features.inside(plan.image_size).all()
+        assert is_inside(features.keypoints, plan.image_size).all()
         for number, item in enumerate(plan.items, 1):
             check_rectification(item, photograph.size)
             of_warp = features.select(features.rectification_ids == number)
