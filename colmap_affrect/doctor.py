@@ -29,7 +29,6 @@ Read = TypeVar("Read")
 Severity = Literal["error", "warning", "note"]
 """A program fails, or results are wrong; something is missing from results; worth knowing."""
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
-
 MAX_ITEMS_SHOWN = 5
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 

@@ -14,7 +14,6 @@ from colmap_affrect.errors import shown
 
 Advance = Callable[[int], None]  # report that so many more units are done
 NUM_PLAIN_LINES = 10
-
 COSTS = {"extract": 1.0, "match": 0.25, "verify": 0.15, "map": 0.7}
 """Of an image or a pair in a stage, in the time of an image in ``extract``: measured on runs
 of 8 to 1000 photographs, good for a factor of 2."""

@@ -28,7 +28,6 @@ COLUMNS = {
     "y": ("py", "y"),
 }
 """What a table of tie points may call its columns; x and y beside px and py are those of points."""
-
 Marks = Mapping[str, Mapping[str, Array]]
 """(2,) px from the upper left corner of the image, as COLMAP has them, by point and image name."""
 Indices = Mapping[str, Mapping[str, int]]  # numbers of keypoints, by point and image name

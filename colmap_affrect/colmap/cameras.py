@@ -24,10 +24,8 @@ from colmap_affrect.project.tables import read_table
 
 Source = Literal["given", "exif", "exif-rescaled", "guess"]
 """By the user; by EXIF as it is, or scaled to a photograph that was shrunk; or COLMAP's guess."""
-
 Given = Literal["focal", "principal-point", "distortion"]
 """Parts of intrinsics; a model without distortion counts as given once its focal length is."""
-
 TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
 """Sources whose focal lengths are priors before any pair has been verified."""
 
@@ -77,8 +75,7 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Replace the file as a whole."""
-    content = _RECORDS.dump_json(dict(sorted(records.items())), indent=1)
-    replace_text(path, content.decode())
+    replace_text(path, _RECORDS.dump_json(dict(sorted(records.items())), indent=1).decode())
 
 
 @cache

@@ -33,11 +33,9 @@ CHECKS: dict[str, dict[str, str]] = tomllib.loads(
 
 FATAL_FOR_IMAGES = frozenset({"bad-name", "no-parent", "bad-camera", "camera-panorama"})
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
-
 USELESS_KEYPOINTS = frozenset({"keypoints-not-finite", "keypoints-at-one-place"})
 FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "matrix-data"}
 """The same of keypoints and matches."""
-
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
 
 MATRICES = {  # columns that hold so many float64 or nothing, by table

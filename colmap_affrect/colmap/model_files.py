@@ -130,8 +130,7 @@ def _mend(folder: Path) -> str:
 
 def registered_names(model_path: Path) -> list[str]:
     """Return the sorted names of the images of a model; StoreError unless its files are whole."""
-    records = {name: _read_records(model_path / name) for name in RECORDS}
-    return sorted(records["images.bin"])
+    return sorted({name: _read_records(model_path / name) for name in RECORDS}["images.bin"])
 
 
 def require_intact(folder: Path) -> None:

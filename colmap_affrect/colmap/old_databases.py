@@ -21,7 +21,6 @@ MAPPER_OPTIONS = (
 
 # COLMAP 3.8 has camera models up to this number
 LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
-
 FILL = Path(__file__).with_name("colmap_3_8.sql")  # makes the tables, from an attached ``new``
 
 

@@ -128,7 +128,7 @@ class RecipeRun:
                     break
                 first, second = map(matcher.prepared, pair.images)
             with watch.step("match"):
-                rows1, rows2 = matcher.match(first, second).indices.T
+                rows1, rows2 = matcher.matcher.match(first.content, second.content).indices.T
                 frames = first.frames[rows1], second.frames[rows2]
                 count, decided = 0, ""
                 if len(matchers) > 1:

@@ -107,8 +107,7 @@ class AffNetHardNet:
         # kornia's angles are of the opposite sense to those of our rotation().
         shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))
         turned = sample(_frames(shapes, half_widths_px, found.keypoints))
-        descriptors = self._run(self.descriptor, turned)
-        return shapes, descriptors
+        return shapes, self._run(self.descriptor, turned)
 
     def _run(self, network: nn.Module, patches: Tensor) -> Singles:
         import torch

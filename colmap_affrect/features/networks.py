@@ -191,5 +191,4 @@ def _sampled(level: Tensor, frames: Tensor) -> Tensor:
     """Sample (N, 2, 3) frames in coordinates of -1...1 from border to border."""
     size = [len(frames), 1, PATCH_SIZE_PX, PATCH_SIZE_PX]
     positions = affine_grid(frames, size, align_corners=False).view(1, -1, PATCH_SIZE_PX, 2)
-    values = grid_sample(level, positions, padding_mode="border", align_corners=False)
-    return values.view(size)
+    return grid_sample(level, positions, padding_mode="border", align_corners=False).view(size)

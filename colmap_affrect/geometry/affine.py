@@ -39,8 +39,7 @@ def transform_frames(homography: Floats, lafs: Floats) -> Array:
     The (3, 3) map is target_from_source, with a finite and non-zero third coordinate at every
     centre. For an affine one, of last row (0, 0, 1) and linear part B, shapes A become B A.
     """
-    centers = lafs[:, :, 2]
-    mapped = centers @ homography[:, :2].T + homography[:, 2]
+    mapped = lafs[:, :, 2] @ homography[:, :2].T + homography[:, 2]
     target = mapped[:, :2] / mapped[:, 2:]
     jacobians = homography[None, :2, :2] - target[:, :, None] * homography[None, 2:, :2]
     jacobians = jacobians / mapped[:, 2, None, None]

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 HALF_PIXEL = 0.5
-
 MEASUREMENT_SIGMAS = 6.0  # radius of the measurement ellipse of a local affine frame, in sigmas
 
 

@@ -13,7 +13,6 @@ from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices
 
 NUM_NEIGHBORS = 8  # matches nearest to one in image 1, and in image 2, that may confirm it
 NUM_CONFIRMING = 2  # must do so, in both images: one does for some wrong matches, two hardly
-
 MAX_RELATIVE_ERROR = 0.5  # of a neighbour's place by the map, in distances of the two matches
 MIN_DISTANCE_PX = 4.0  # nearer matches are those of one place, in several orientations or warps
 ROWS_AT_ONCE = 512  # matches that are compared with all others at a time, which bounds memory

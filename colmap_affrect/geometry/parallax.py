@@ -13,7 +13,6 @@ Size = tuple[int, int]
 
 FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
 """Tried for a turned camera, in longer sides. From ten on a rotation is a shift."""
-
 MAX_NUM_POINTS = 500  # enough to measure a share to two per cent
 MIN_DEPTH = 1e-3  # of a turned ray of length 1; what is behind lands far outside of the image
 DISPLACEMENT_PX = np.array([13.0, 7.0])  # so moved, keypoints meet others by chance only

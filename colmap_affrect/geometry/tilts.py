@@ -24,11 +24,8 @@ from colmap_affrect.geometry.arrays import Array, Floats, Singles
 STEP_PX = 4  # dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
 MAX_TANH = 0.999  # where logarithms end: of a metric, tilt 45
 MIN_DISTINCT_SHARE = 0.5  # of frames that were measured one by one nearly all differ
-
 SHAPE_STEP = 1e-4  # shapes of unit area that are this close are one; rounding of 32 bits is less
-
 GRID_TILTS = np.geomspace(2.0, 6.21970, 6)  # of candidates for 1.7-balls up to tilt 5.8 (paper)
-
 GRID_NUM_ANGLES = 32
 IDENTITY_LABEL = -1
 UNCOVERED_LABEL = -2

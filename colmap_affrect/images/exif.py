@@ -25,7 +25,6 @@ MAX_CONTRADICTION = 1.15  # ratio of focal lengths that still agree: equivalents
 MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
 SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)  # photographs of another shape may have been cropped
 MAX_THUMBNAIL_PX = 160  # longer side of the thumbnails of cameras, often with black bars
-
 RESOLUTION, EQUIVALENT, SENSOR = "focal-plane resolution", "35 mm equivalent", "known sensor"
 
 

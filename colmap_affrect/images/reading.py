@@ -27,7 +27,6 @@ from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
 
 MAX_NUM_PX = 1 << 29  # of a photograph; those of the largest cameras have 400 megapixels
-
 PNG = b"\x89PNG\r\n\x1a\n"
 READERS = {
     b"\xff\xd8": jpeg_factory,
@@ -38,7 +37,6 @@ READERS = {
     b"P": PpmImageFile,
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
-
 NEW_SUBFILE_TYPE, REDUCED = 254, 1  # TIFF's tag, and its bit of a smaller copy of another page
 
 Found = TypeVar("Found")
@@ -134,14 +132,12 @@ FOREIGN_FORMATS = {
     "AVIF or HEIF": rb"....ftyp(avi|hei|hev|mif|msf)",
 }
 """First bytes of formats that OpenCV may read, whatever the suffix, and pycolmap's wheel not."""
-
 TONE_PERCENTILES = (0.5, 99.5)  # black and white of a stretched photograph but for dust and glints
 MIN_TONE_RANGE = 0.5  # a photograph whose tones fill less of the range of its file is stretched
 MAX_TONE_STEP = 16  # neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
 NUM_TONES = 250_000  # about so many pixels are looked at
 FRAME_FRAC = 0.1  # along each border is passed over: scans have frames and captions there
 BIG_TIFF = 43  # what files of more than 4 GiB have in the place of 42, with offsets of 64 bits
-
 GRAY_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION  # fast, of JPEG

@@ -13,7 +13,6 @@ from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.geometry.conventions import is_inside
 
 ANTI_ALIASING_SIGMA = 0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
-
 TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression
 SAMPLES_PER_TILE = 5  # points along a side of a tile at which its compression is measured
 MAX_DENSITY = 16  # samples per px of a warp along an axis; beyond, memory counts more than aliasing
@@ -41,8 +40,7 @@ def warp(image: GrayImage | ColorImage | Singles, rectification: Rectification) 
     source = np.asarray(image, dtype=np.float32)
     if rectification.is_affine:
         return _warp_affine(source, rectification)
-    shape = (*rectification.canvas_size[::-1], *source.shape[2:])
-    warped = np.empty(shape, dtype=np.uint8)
+    warped = np.empty((*rectification.canvas_size[::-1], *source.shape[2:]), dtype=np.uint8)
     for tile, image_from_tile in _tiles(warped, rectification):
         tile[:] = np.rint(_warp_tile(source, image_from_tile, tile.shape[1::-1]))
     return warped

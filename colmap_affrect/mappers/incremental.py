@@ -152,8 +152,7 @@ class _Call:
             start.write(folder)
             frames = {image.frame_id for image in existing.images}
             # COLMAP drops a model of which no pair ties some images to others.
-            found = self._map(token, folder)
-            models = [m for m in found if frames <= set(m.frames)] or [start]
+            models = [m for m in self._map(token, folder) if frames <= set(m.frames)] or [start]
         for model in models:
             existing.restore(model)
         return models

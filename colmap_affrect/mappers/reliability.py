@@ -60,7 +60,6 @@ images a tenth by chance."""
 MAX_PAIRS_FOR_COPIES = 1000  # looked at, all of 45 photographs; of more some copies are missed
 MIN_LOSS = 0.7  # of the log odds: what takes less from the odds is no reason to doubt
 NUM_REASONS = 2  # that are said of a photograph
-
 FOCAL_CONTRADICTED = "the given focal length does not fit"
 FOCAL_UNKNOWN = "any focal length fits"
 CONTRADICTIONS = (

@@ -176,8 +176,7 @@ class Search:
                 is_complete = len(images) == len(graph.keypoints)
                 if in_vain >= self.num_seeds or (is_complete and self.evidence.is_confirmed(model)):
                     break
-        ordered = sorted(models.values(), key=lambda found: -found[0])
-        return [model for _, model in ordered]
+        return [model for _, model in sorted(models.values(), key=lambda found: -found[0])]
 
 
 def _in_order(

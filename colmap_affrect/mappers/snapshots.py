@@ -34,8 +34,7 @@ def with_snapshots(
         yield task
         return
     given = {str(key): record.given for key, record in task.cameras.items()}
-    made_from = [rows_digest(task.database_path), options.to_mapping(), given]
-    own = folder / digest_of(made_from)
+    own = folder / digest_of([rows_digest(task.database_path), options.to_mapping(), given])
     remove_own(path for path in folder.glob("*") if path != own)
     own.mkdir(parents=True, exist_ok=True)
     try:

@@ -26,7 +26,6 @@ MOST = 2.5  # nats: of images that six tie points alone hold twelve of thirteen 
 NUM_FREE = 3  # tie points that any place of an image can agree with
 NEAR, NUM_NEAR = 0.1, 5
 """Depths of so many points near a mark, up to this part of the longer side, stand for its own."""
-
 Mark = tuple[str, int, float]  # of a point in an image, by its id, and its reprojection error in px
 
 

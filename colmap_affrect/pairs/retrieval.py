@@ -105,5 +105,4 @@ def retrieved_pairs(
 
 def _original_descriptors(features: LocalFeatures) -> Singles:
     """Return the (N, D) descriptors of the image itself; with those of warps recall is lower."""
-    descriptors = features.descriptors[features.rectification_ids == 0]
-    return np.asarray(descriptors, dtype=np.float32)
+    return np.asarray(features.descriptors[features.rectification_ids == 0], dtype=np.float32)

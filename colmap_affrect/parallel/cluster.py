@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 CONNECT_TIMEOUT_S = 10.0
 TASKS_PER_THREAD = 2  # one that is being worked on and one that waits, so that no worker has to
-
 PACKAGES = ("colmap-affrect", "distributed", "numpy", "opencv-python-headless", "torch", "kornia")
 """Packages whose versions must be the same everywhere."""
 

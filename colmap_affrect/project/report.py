@@ -24,7 +24,6 @@ OF_LARGEST = (  # what ``report.json`` has of the largest model under its own na
 )  # fmt: skip
 
 SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
-
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
 REPORTED_PACKAGES = (

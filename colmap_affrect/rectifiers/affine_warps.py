@@ -110,8 +110,7 @@ def plan_dense_shapes(
     grid: ShapeGrid, image_size: tuple[int, int], options: DenseShapesOptions
 ) -> RectificationPlan:
     """Turn a grid of shapes into disjoint regions of an image of (width, height), one warp each."""
-    votes = grid.textured.ravel().astype(np.float64)
-    cover = options.cover(grid.metrics.reshape(-1, 3), votes)
+    cover = options.cover(grid.metrics.reshape(-1, 3), grid.textured.ravel().astype(np.float64))
     labels = cover.labels.reshape(grid.textured.shape)
     items: list[Rectification] = []
     for label, (tilt, angle) in enumerate(cover.centers.tolist()):

@@ -118,8 +118,7 @@ def _connected_regions(mask: Mask, min_area_px: float) -> Iterator[Region]:
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     for label, (left, top, width, height, area) in enumerate(stats.tolist()):
         if label > 0 and area >= min_area_px:
-            crop = labels[top : top + height, left : left + width] == label
-            yield Region(crop, (left, top))
+            yield Region(labels[top : top + height, left : left + width] == label, (left, top))
 
 
 def _resampled(

@@ -17,13 +17,7 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
-from colmap_affrect.matchers.base import (
-    MATCHERS,
-    ImageFeatures,
-    MatcherContext,
-    MatcherOptions,
-    Matches,
-)
+from colmap_affrect.matchers.base import MATCHERS, ImageFeatures, MatcherContext, MatcherOptions
 from colmap_affrect.pairs.lists import Pair, PairList, ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
@@ -39,10 +33,8 @@ logger = logging.getLogger(__name__)
 
 PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
-
 MANY_MATCHES = 300  # of the features matched first: photographs of different things have up to 76
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
-
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
 IMAGES_IN_MEMORY = 40  # of 13,000 features
 BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
@@ -251,7 +243,7 @@ class CachedMatcher:
         if sent is not None:
             require_same_files(self._weights, sent)
         context = MatcherContext(self._weights, resources.device, matching.num_similarities)
-        self._matcher = MATCHERS.make(options, context)
+        self.matcher = MATCHERS.make(options, context)
         self._images, self._lock = lru_cache(matching.num_kept)(self._prepare), threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -260,16 +252,12 @@ class CachedMatcher:
     def __call__(self, names: Pair) -> PairMatches:
         """Match the stored features of two images."""
         first, second = map(self.prepared, names)
-        found = self.match(first, second)
+        found = self.matcher.match(first.content, second.content)
         rows, columns = found.indices.T
         indices = np.stack([first.indices[rows], second.indices[columns]], axis=1)
         is_of_some = first.is_part or second.is_part
         level = self._matching.level
         return PairMatches(names, indices, found.scores, first.end, level, is_of_some)
-
-    def match(self, first: PreparedImage, second: PreparedImage) -> Matches:
-        """Match two images; indices are those among the features that were prepared."""
-        return self._matcher.match(first.content, second.content)
 
     def prepared(self, name: str) -> PreparedImage:
         """Return an image ready for matching; made one at a time."""
@@ -286,5 +274,4 @@ class CachedMatcher:
             indices = np.sort(indices[order[:limit]])
         features = everything.select(indices)
         image = ImageFeatures(features, store.image_size(name), matching.extractor)
-        content = self._matcher.prepare(image)
-        return PreparedImage(content, features.lafs, indices, end, is_part)
+        return PreparedImage(self.matcher.prepare(image), features.lafs, indices, end, is_part)

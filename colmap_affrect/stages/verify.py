@@ -117,8 +117,7 @@ def verified_inliers(context: Context) -> dict[Pair, Indices]:
 
 def extracted_px(context: Context) -> ExtractedPx:
     """Return the longest side that photographs were shrunk to; by pair, where levels differ."""
-    levels = context.extraction.levels
-    sizes = [level.max_image_size_px for level in levels]
+    sizes = [level.max_image_size_px for level in context.extraction.levels]
     if len(set(sizes)) == 1:
         return sizes[0]
     ids = colmap_database.image_ids(context.workspace.database)
