@@ -143,13 +143,11 @@ def union(parts: list[LocalFeatures]) -> LocalFeatures:
 class Rectification:
     """One rectifying warp and the part of the image it is meant for."""
 
-    # (3, 3) float64 map of pixel-centre coordinates; a homography has a positive third coordinate
-    # all over the region
+    # (3, 3) float64 map of pixel-centre px; of a homography third coordinates are > 0 in the region
     rectified_from_image: Array
     canvas_size: tuple[int, int]  # (width, height) of the warp in px
     region: Mask | None  # (h, w) bool mask of the part of the image; None: all of it
-    # class of the map in the space of tilts; of a homography, that of its Jacobian at the middle
-    # of the region
+    # class of the map in the space of tilts; of a homography that of its Jacobian in the middle
     tilt: float
     tilt_angle_rad: float
     region_origin: tuple[int, int] = (0, 0)  # (x, y) image pixel of the mask's first pixel
@@ -190,14 +188,12 @@ def in_mask(mask: Mask, points: Floats, origin: tuple[int, int] = (0, 0)) -> Mas
 class RectificationPlan:
     """What to warp: data only, made by a rectifier, executed by ``rectifiers.execute``.
 
-    The image itself always has features and is not listed. Warp k of ``items`` has the
-    rectification id k + 1.
+    The image itself is not listed. Warp k of ``items`` has the rectification id k + 1.
     """
 
     image_size: tuple[int, int]  # (width, height) in px
     items: tuple[Rectification, ...] = ()  # the warps
-    # (H, W) bool, where features of the image itself are kept; None: everywhere
-    original_region: Mask | None = None
+    original_region: Mask | None = None  # (H, W) where features of the image stay; None: all
     # a feature of a warp takes the place of one of the image itself at the same place and scale:
     # for disjoint regions, each with the map that suits it best
     replaces_original: bool = False

@@ -12,8 +12,7 @@ DAMAGE = (
     OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError,
     OverflowError, EOFError,
 )  # fmt: skip
-"""What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or of another
-shape than ours."""
+"""What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or not ours."""
 MAX_REASON = 200  # characters of what a reader says
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "

@@ -57,8 +57,7 @@ class InputOptions(TakesPaths):
     verification: VerificationOptions = field(default_factory=VerificationOptions)
     mapping: MapperOptions = field(default_factory=SparseOptions)  # the mapper and its options
     image_list_path: Path | None = None  # the images to use; None: all below the folder
-    # COLMAP database whose images, cameras, rigs, frames and pose priors are used
-    from_database: Path | None = None
+    from_database: Path | None = None  # with the images, cameras, rigs, frames and pose priors used
     resources: Resources = field(default_factory=Resources)  # weights and device of networks
 
     def inputs(self, image_path: Path) -> Inputs:

@@ -17,10 +17,7 @@ def run_cancellable(
     call: Callable[[pycolmap.CancellationToken], Result],
     token: pycolmap.CancellationToken | None = None,
 ) -> Result:
-    """Run ``call`` with a token in a thread; on Ctrl-C cancel it, and leave it if it goes on.
-
-    First, memory that this process has freed goes back to the system.
-    """
+    """Run ``call`` with a token in a thread; on Ctrl-C cancel it, and leave it if it goes on."""
     return_freed_memory()
     known = token or pycolmap.CancellationToken()
     outcome: Future[Result] = Future()

@@ -164,8 +164,7 @@ def write_keypoints(
 ) -> None:
     """Write the (N, 2, 3) frames of an image.
 
-    Fewer that it has, as many as one of ``level_ends`` of escalation, are replaced; DatabaseError
-    for another number.
+    Fewer that it has, as many as one of ``level_ends``, are replaced; DatabaseError for others.
     """
     if has_keypoints(database, image_id, len(lafs)):
         return

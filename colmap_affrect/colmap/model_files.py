@@ -1,8 +1,7 @@
 """COLMAP models: files walked through, compared with their digests, read, written; their poses.
 
 pycolmap's reader never ends, takes all memory or ends the process where a count in a file is wrong.
-So every record is followed to the end of its file first. Models of ours have a digest of their
-files beside them.
+So every record is followed to its end first. Models of ours have digests of files beside them.
 """
 
 import hashlib
@@ -134,10 +133,7 @@ def registered_names(model_path: Path) -> list[str]:
 
 
 def require_intact(folder: Path) -> None:
-    """Refuse a model of ours that is not as it was written, or one of others that is damaged.
-
-    Text files are left to pycolmap.
-    """
+    """Refuse a model of ours that is not as it was written, or a binary one that is damaged."""
     known, now = kept_digests(folder), file_digests(folder)
     for name in RECORDS if not known and _is_binary(folder) else ():
         if name in OLD_RECORDS or (folder / name).exists():

@@ -43,8 +43,7 @@ def resolve(
     """Set values, which may be text, in ``options``; return them by full dotted key.
 
     Of keys sections may be left out where a name exists once. OptionError, which begins with
-    ``flag``, names a key that is unknown, ambiguous, or ``owned``, or whose value pycolmap does not
-    take.
+    ``flag``, names a key that is unknown, ambiguous, or ``owned``, or has a wrong value.
     """
     known, plain = flat_values(options), _plain_values(options)
     keys = {_full_key(text, known, flag): text for text in given}

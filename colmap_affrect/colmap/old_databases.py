@@ -19,8 +19,7 @@ MAPPER_OPTIONS = (
 )
 """Our preset for few photographs: by its defaults ``colmap mapper`` finds less, or nothing."""
 
-# COLMAP 3.8 has camera models up to this number
-LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
+LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)  # that COLMAP 3.8 has
 FILL = Path(__file__).with_name("colmap_3_8.sql")  # makes the tables, from an attached ``new``
 
 

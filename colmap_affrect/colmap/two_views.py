@@ -58,10 +58,7 @@ def pair_model(
 
 
 def undistorted(camera: pycolmap.Camera, points: Array) -> Array:
-    """Return (N, 2) pixels as a camera without distortion would have them.
-
-    Points that the camera model cannot undistort become NaN.
-    """
+    """Return (N, 2) pixels as a camera without distortion has them, NaN where it cannot be told."""
     if not len(points):
         return points
     matrix = np.asarray(camera.calibration_matrix(), np.float64)
@@ -70,10 +67,7 @@ def undistorted(camera: pycolmap.Camera, points: Array) -> Array:
 
 
 def decomposed_homography(homography: Array, cameras: Cameras) -> list[Pose]:
-    """Return the relative poses into which a homography of px can be decomposed.
-
-    Translations have length 1; a homography of a pure rotation has none.
-    """
+    """Return the relative poses, |t| = 1, that a homography of px allows; none of a rotation."""
     matrix1, matrix2 = (np.asarray(c.calibration_matrix(), np.float64) for c in cameras)
     normalized = np.linalg.inv(matrix2) @ homography @ matrix1
     _, rotations, translations, _ = cv2.decomposeHomographyMat(normalized, np.eye(3))

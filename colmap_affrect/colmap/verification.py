@@ -153,8 +153,7 @@ def max_error_px(
 
 
 ExtractedPx = int | Mapping[tuple[int, int], int] | None
-"""Longest side that photographs were shrunk to before extraction, if any; or of pairs of image ids,
-the lower one first."""
+"""Longest side that photographs were shrunk to, if any; or by pair of image ids, lower first."""
 
 
 def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
@@ -270,10 +269,7 @@ def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], In
 
 
 def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
-    """Return how many features of each image are in tracks through three images or more.
-
-    ``matches`` has (M, 2) features of the first and the second image of each pair.
-    """
+    """Return how many features of each image, of (M, 2) by pair, are in tracks of three or more."""
     images = sorted({image for pair in matches for image in pair})
     number = {image: index for index, image in enumerate(images)}
     ends: list[Indices] = [

@@ -76,8 +76,7 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     """Read ``sift-colmap``, ``sift`` or ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
 
     Commas inside of brackets belong to a value. The recipe is a name or the path of a TOML file;
-    one that uses depth gets the ``depth_settings`` too. Raises OptionError for an unknown method or
-    option.
+    one that uses depth gets the ``depth_settings`` too. OptionError for what is not known.
     """
     if text in SIFT_SUMMARIES:
         return Method(text, None)

@@ -1,7 +1,6 @@
 """A method of a comparison in a process of its own, which ends when this one ends.
 
-Started by the name of this module, not by ``multiprocessing``, which would run a user's script
-again.
+Started by the name of this module: ``multiprocessing`` would run a user's script again.
 """
 
 import logging

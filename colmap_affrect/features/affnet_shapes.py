@@ -1,8 +1,7 @@
 """Shape source ``affnet``: affine shapes from a network, on all blocks or on patches of keypoints.
 
 AffNet (Mishkin, Radenovic, Matas 2018) reads the shape of a feature off a 32 x 32 patch. Without
-the final pooling it is fully convolutional and gives a shape every 4 px: the paper's
-DenseAffNet (Sec. 3).
+the final pooling, fully convolutional, it gives one every 4 px: the paper's DenseAffNet (Sec. 3).
 
 The three outputs o of the network make a frame L; shapes are the unit metrics of L^-1.
 """

@@ -67,8 +67,7 @@ class OnPatches(nn.Sequential):
 def load_orinet(path: Path, device: str) -> feature.OriNet:
     """Build OriNet: (B, 1, 32, 32) patches to (B,) angles in radians.
 
-    kornia's convention: an orientation a is a frame turned by [[cos a, sin a], [-sin a, cos a]],
-    which is R(-a) here.
+    In kornia an orientation a is a frame turned by [[cos a, sin a], [-sin a, cos a]], here R(-a).
     """
     network = _with_state(feature.OriNet(pretrained=False), path, "OriNet")
     network.features = folded(network.features)

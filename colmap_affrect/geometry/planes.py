@@ -15,9 +15,7 @@ from colmap_affrect.geometry.conventions import grid_origin
 
 WINDOW_RADIUS = 2
 WINDOW_SIGMA_PX = 0.8  # Gaussian weights of the 5 x 5 window of a plane (the authors' values)
-
-# share of the window's weight that known neighbours need; a mere line of pixels has 0.499
-MIN_WEIGHT_FRAC = 0.5
+MIN_WEIGHT_FRAC = 0.5  # of the window's weight that known neighbours need; a mere line has 0.499
 MAX_SLANT_COS = np.cos(np.deg2rad(85.0))  # steeper neighbours are on another surface
 SPIRAL_STEP = 3.6  # of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars)
 
@@ -102,8 +100,7 @@ class PlaneClusters:
     """Directions that many normals share."""
 
     normals: Array  # (K, 3) unit normals in order of choice; K may be 0
-    # (h, w) int32, the nearest of them for each pixel, -1 where none is near
-    labels: NDArray[np.int32]
+    labels: NDArray[np.int32]  # (h, w) the nearest of them for each pixel, -1 where none is near
 
 
 def cluster_normals(

@@ -156,8 +156,7 @@ class Cover:
     """Covering centres of a set of shapes and the centre nearest to each shape."""
 
     centers: Array  # (K, 2) rows (tilt, angle_rad) in order of choice; K may be 0
-    # (N,) index of the nearest centre, or IDENTITY_LABEL, or UNCOVERED_LABEL outside every ball
-    labels: NDArray[np.int32]
+    labels: NDArray[np.int32]  # (N,) index of the nearest centre, IDENTITY_LABEL, UNCOVERED_LABEL
 
 
 def cover_shapes(

@@ -81,8 +81,7 @@ def scale_between(
     """Estimate the scale between depths in one image: (K, 2) px and (K,), and (N, 2) px and (N,).
 
     The ``known`` and the others, all positive, have no feature in common, so each is compared with
-    known ones within a radius; the scale is where most logarithms of ratios gather. None without
-    neighbours.
+    known ones within a radius; most logarithms of ratios gather at the scale. None without any.
     """
     rows, columns, distances = _nearest_known(known[0], places[0], radius_px, NUM_NEIGHBORS)
     ratios = np.log(known[1][columns] / places[1][rows])
@@ -95,8 +94,7 @@ def scale_by_planes(
     """Estimate the scale as :func:`scale_between`, where no known depth lies beside a place.
 
     The inverse depth of a plane is affine in the image: it is fitted to the ``NUM_ON_PLANE`` known
-    depths nearest to each place, within the radius, and taken where it is certain enough. None
-    where no place counts.
+    depths nearest to each place, within the radius, where these tell it well. None without any.
     """
     rows, columns, _ = _nearest_known(known[0], places[0], radius_px, NUM_ON_PLANE)
     full = np.flatnonzero(np.bincount(rows, minlength=len(places[0])) == NUM_ON_PLANE)

@@ -23,8 +23,7 @@ AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMA
 class ConversionReport:
     """What became of the files of a folder, by their names."""
 
-    # files that were converted, with those that were made of them
-    written: dict[str, list[str]] = field(default_factory=dict)
+    written: dict[str, list[str]] = field(default_factory=dict)  # files made, by the converted one
     copied: list[str] = field(default_factory=list)  # files that COLMAP can read as they are
     failures: dict[str, str] = field(default_factory=dict)  # why files cannot be read
 

@@ -1,7 +1,6 @@
 """What EXIF says of the camera of a photograph, and whether that can be true.
 
-Files that were shrunk or cropped often keep it as it was: statements are compared with each other
-and with the file.
+Shrunk or cropped files often keep it: statements are compared with each other and with the file.
 """
 
 import math

@@ -88,8 +88,7 @@ class Adjuster:
     ) -> float:
         """Adjust poses, points and cameras in place; return the cost, infinite if that fails.
 
-        Of some images only, the others stay, and so do the cameras that they share. The cost is in
-        nats.
+        Of some images only, the others stay, and the cameras that they share. The cost is in nats.
         """
         self.tie_points.observe(model)
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)

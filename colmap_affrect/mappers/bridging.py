@@ -31,8 +31,7 @@ from colmap_affrect.project.report import Bridge
 RADIUS_FRAC = 0.03  # of the longer side of an image: places of known depth so near are neighbours
 PLANE_RADIUS = 4.0  # known depths on a plane may be so many times farther away
 MIN_AGREEING, MIN_AGREEING_SHARE = 10, 0.5
-"""A scale needs so many places that agree, and this share of all: right pairs have 80 to 100 %, and
-chance a quarter."""
+"""A scale needs so many places that agree, and this share: right pairs have 80 %, chance 25 %."""
 FOCAL_STEP = 0.02  # change of a focal length from which on relative poses are estimated again
 
 

@@ -4,8 +4,7 @@ A pair whose images are both in the model says how many of its inliers agree wit
 alone leave scales and focal lengths open; so a feature that is matched in two other images says
 whether one point explains all three. The likelihood of such a count is a beta-binomial
 distribution, one for right models and one for wrong ones; their ratio, and the chance that the
-pair itself is wrong, make the evidence. What is not in the model adds nothing: more images that
-agree are more evidence.
+pair itself is wrong, make the evidence. More images that agree are more evidence; others, none.
 """
 
 import math

@@ -76,8 +76,7 @@ def map_database(
 
     ``next_image`` is called with the number of images registered since the last call, never more
     than there are, also when a mapper tries several models. AffrectError when COLMAP ends with an
-    error; KeyboardInterrupt after mapping has been stopped, and what it wrote, but snapshots, is
-    gone.
+    error; KeyboardInterrupt after mapping has been stopped, of which snapshots alone stay.
     """
     partial, snapshots = (
         sparse_path.with_name(sparse_path.name + end) for end in (".partial", ".snapshots")

@@ -31,8 +31,7 @@ MAX_ERROR_PX, MAX_ERROR = 4.0, 0.003
 more: COLMAP's limit for observations, and what features of a shrunk photograph allow."""
 MIN_ANGLE_DEG = 1.0  # rays closer to parallel tell no depth, nor which side of a camera a point is
 MAX_MATCHES, MAX_TRIALS = 500, 1000
-"""What agreement is measured with and relative poses are estimated from: inliers already, so that
-few are enough."""
+"""What agreement is measured with and relative poses estimated from: of inliers few are enough."""
 MAX_PAIRS_OF_IMAGE = 15
 """An image's pairs with fewer inliers have no say, unless they are among those of the other one."""
 MIN_NUM_MATCHES = 15  # pairs with fewer inliers are left out, as by COLMAP's mappers

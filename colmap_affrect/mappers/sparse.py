@@ -39,10 +39,7 @@ class SparseOptions(PipelineOptions):
 
 
 class SparseMapper(IncrementalMapper):
-    """Maps small sets as one estimate; COLMAP maps large ones, and registers into a model.
-
-    What that leaves out comes in by bridges here, too.
-    """
+    """Maps small sets as one estimate; large ones, and into a model, as COLMAP, and by bridges."""
 
     Options = SparseOptions
     options: SparseOptions
@@ -193,10 +190,7 @@ def _with_own_cameras(
 
 
 def _of_some_tracks(search: Search, reduced: PairGraph, graph: PairGraph) -> list[MappedModel]:
-    """Return a model of all images if some tracks of a reduced graph make one that is certain.
-
-    It has the points of all tracks.
-    """
+    """Return a model, with all points, if some tracks of a reduced graph make a certain one."""
     thin = reduced.thinned()
     if thin is reduced:
         return []

@@ -32,8 +32,7 @@ class TieJoiner:
     def join(self, models: Sequence[MappedModel]) -> list[MappedModel]:
         """Return models with all that joins them, and all tie points observed; large ones first.
 
-        Bridges go on from what tie points have joined. Images that their tie points contradict are
-        placed anew.
+        Bridges go on from there. Images that their tie points contradict are placed anew.
         """
         if not self.points.keypoints:
             return list(models)

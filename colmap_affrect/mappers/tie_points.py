@@ -1,7 +1,6 @@
 """Tie points: what a person has marked in several photographs, as observations of a model.
 
-All models that have two of their images observe them, in all adjustments; no filter takes them away
-for good.
+Models that have two of their images observe them, in all adjustments; filters never take them away.
 """
 
 import math

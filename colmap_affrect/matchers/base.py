@@ -1,7 +1,6 @@
 """What a matcher is: it finds which features of two images may show the same.
 
-Entry points are in the group ``colmap_affrect.matchers``. Several threads may call an object at
-once.
+Entry points are in the group ``colmap_affrect.matchers``. Several threads may call an object.
 """
 
 from dataclasses import dataclass

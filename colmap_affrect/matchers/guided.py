@@ -89,10 +89,7 @@ def guided_matches(
 def nearest_allowed(
     descriptors: tuple[Singles, Singles], model: epipolar.PairModel, options: GuidedOptions
 ) -> Indices:
-    """Return the (M, 2) mutual nearest neighbours among the features that may match.
-
-    Arguments are as in :func:`guided_matches`.
-    """
+    """Return the (M, 2) mutual nearest neighbours that may match; see :func:`guided_matches`."""
     (descriptors1, descriptors2), points2 = descriptors, model.points[1]
     count1 = len(descriptors1)
     forward, accepted = np.full(count1, -1), np.zeros(count1, bool)

@@ -91,8 +91,7 @@ class PreparedViews:
 class LightGlue:
     """Matches with one network, a pair of views at a time.
 
-    On a CPU each thread uses one core, so that results do not depend on their number; a GPU takes
-    one pair at a time.
+    On a CPU each thread uses one core, so that results do not depend on their number.
     """
 
     Options = LightGlueOptions

@@ -2,8 +2,7 @@
 
 Coarse similarities say which features may pass the test and what their neighbours may be; only
 these are compared exactly. Six standard deviations of the rounding error are allowed for, so that
-matches are those of exact similarities. torch is loaded where there is enough to match to pay for
-that.
+matches are those of exact similarities. torch is loaded where there is enough to match.
 """
 
 import math

@@ -94,8 +94,7 @@ def _work(pickled: bytes, expected: tuple[tuple[str, str], ...], task: bytes) ->
 def connected(address: str) -> Iterator[Cluster]:
     """Use the cluster of a scheduler, such as ``tcp://10.0.0.1:8786``, and leave it running.
 
-    Raises AffrectError when distributed is not installed, the scheduler does not answer, or there
-    are no workers.
+    AffrectError when distributed is not installed, no scheduler answers, or there are no workers.
     """
     try:
         from dask import config

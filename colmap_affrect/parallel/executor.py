@@ -108,8 +108,7 @@ def map_ordered(
     Meanwhile numpy's linear algebra keeps to the calling thread, and OpenCV to its share of the
     cores: thread pools of their own in every task would only wait for each other. An exception of
     the function is raised at the place of its task. Work that has not begun is dropped when the
-    iteration ends early; KeyboardInterrupt does not wait for what has begun either, which may take
-    long.
+    iteration ends early; KeyboardInterrupt does not wait for what has begun either.
     """
     pool, is_waited_for, num_before = ThreadPoolExecutor(num_threads), True, cv2.getNumThreads()
     cv2.setNumThreads(max(1, num_before // num_threads))

@@ -21,8 +21,7 @@ LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works t
 MARKS = {"config.toml": b"format_version", "run.log": b"colmap-affrect"}  # files of ours begin so
 SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
 BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
-# what file managers and file systems put, beside hidden files, into folders that look empty
-OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}
+OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}  # in folders that look empty
 
 
 def is_output_folder(path: Path) -> bool:
@@ -56,8 +55,7 @@ def refuse_link(path: Path) -> None:
 def refuse_photographs(target: Path, names: Collection[str]) -> None:
     """Refuse to write among photographs of these names: results would be taken for some.
 
-    Work folders of ours are allowed there: the search for photographs skips them. Raises
-    OptionError.
+    Work folders of ours are allowed: the search for photographs skips them. Raises OptionError.
     """
     inner = [name for name in names if not leads_outside(name)]
     for folder in target.parent.resolve(), *target.parent.resolve().parents:

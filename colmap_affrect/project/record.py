@@ -1,7 +1,6 @@
 """What is on record of a run, ``config.toml``: the options of its stages, and what they were given.
 
-The record is read once, when a command begins; what is made of photographs and pairs is in the
-stores.
+It is read once, when a command begins; what is made of photographs and pairs is in the stores.
 
 What files hold is known by SHA-256 digests, with sizes and times so that an idle run reads none.
 """

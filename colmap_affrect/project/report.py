@@ -76,8 +76,7 @@ class StageReport:
     num_done: int  # images, pairs, cameras or models made now
     num_kept: int = 0  # those found done already
     failures: dict[str, str] = field(default_factory=dict)  # image name to reason
-    # image name to what went less well than asked for
-    warnings: dict[str, str] = field(default_factory=dict)
+    warnings: dict[str, str] = field(default_factory=dict)  # to what went less well than asked
 
     def summary(self) -> str:
         """Return one line."""
@@ -129,8 +128,7 @@ class ModelSummary:
     num_points3D: int
     mean_track_length: float
     mean_reprojection_error_px: float  # over observations
-    # how probable it is that an image stands right, within 5 degrees
-    probabilities: dict[str, float] = field(default_factory=dict)
+    probabilities: dict[str, float] = field(default_factory=dict)  # to be right within 5 degrees
     gains: dict[str, float] = field(default_factory=dict)  # what more matches may add to these
     doubtful: dict[str, str] = field(default_factory=dict)  # rather wrong than right: why
     bridges: dict[str, Bridge] = field(default_factory=dict)  # in no track through three images

@@ -87,8 +87,7 @@ class Workspace:
     def require_own(self, photographs: Path | None = None) -> None:
         """Refuse a folder that is not empty and not ours, and links that would be followed.
 
-        The folder of the photographs is refused, too; a folder inside it is allowed. Raises
-        OptionError.
+        That of the photographs is refused, too; one inside it is allowed. Raises OptionError.
         """
         if photographs and self.path.resolve() == photographs.resolve():
             raise OptionError(

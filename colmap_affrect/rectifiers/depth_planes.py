@@ -88,8 +88,7 @@ def planar_segments(
     A pixel belongs to the plane whose normal is nearest, if near enough, and if it sees it at no
     more than ``max_angle_deg``, the angle between normal and ray. (The authors take the optical
     axis, and keep a plane as a whole.) From the front an area grows by 1 / cos^3 of it, so far ends
-    are left out. ``depth`` is (h, w) z-depth of the whole photograph, of any resolution; NaN where
-    unknown.
+    are left out. ``depth`` is (h, w) z-depth of the whole photograph, of any size; NaN: unknown.
     """
     size_of_depth = (depth.shape[1], depth.shape[0])
     depth, shrunk_from_depth = planes.shrink_depth(depth, MAX_DEPTH_SIZE_PX)

@@ -40,8 +40,7 @@ def extract_rectified(
 
     Of the features in warps the ``max_num_rectified`` strongest are kept, and those of the image
     itself only ``with_original``. Only what stays is described, and all of it in one call. The
-    image is (H, W) uint8, or (H, W, 3) for extractors that ask for colour; the mask (H, W) bool,
-    where features may be.
+    image is (H, W[, 3]) uint8, as the extractor asks; the mask (H, W) bool, where features may be.
     """
     rectifications: list[Rectification | None] = [None] if with_original else []
     rectifications += plan.items
@@ -113,8 +112,7 @@ def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
     """Return which features of the image itself a warp shows at the same place and scale.
 
     Centres are within half a sigma and scales within ``SAME_SCALE_RATIO``, whatever the
-    orientation. Of the two the residual tilt of the rectified one is smaller, in its region, and
-    that stays.
+    orientation. The rectified one stays: in its region its residual tilt is smaller.
     """
     scales1, scales2 = original.scales, rectified.scales
     radius = DUPLICATE_RADIUS_SIGMAS / MEASUREMENT_SIGMAS * scales1

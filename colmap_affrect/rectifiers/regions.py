@@ -11,9 +11,7 @@ from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 
 MARGIN_PX = 16.0  # surroundings of a region that its descriptors may see, in warp px
-CANVAS_RATIO = 2.0
-"""Area of a homography's canvas, its margin left out, in units of the region's area in the image.
-As the authors chose it."""
+CANVAS_RATIO = 2.0  # area of a homography's canvas, without margin, by the region's (the authors')
 
 
 @dataclass(frozen=True)

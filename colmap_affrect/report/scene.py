@@ -27,10 +27,8 @@ class View3D:
     """A model ready for the page; lengths in units of the view's radius."""
 
     num_points: int = 0
-    # (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64
-    points: str = ""
-    # name and (5, 3) centre and corners of the pyramid of each camera
-    cameras: tuple[tuple[str, Array], ...] = ()
+    points: str = ""  # base64: (N, 3) uint16 positions from -1 to 1, then (N, 3) uint8 colours
+    cameras: tuple[tuple[str, Array], ...] = ()  # names; (5, 3) centre and corners of pyramids
     note: str = ""  # why there is nothing to draw; empty if there is
 
     def script_data(self, index: Mapping[str, int], kinds: Mapping[str, str]) -> dict[str, Any]:

@@ -86,10 +86,7 @@ class Inputs(Options):
     def contents(
         self, names: Iterable[str], options: ExtractionOptions, known: Mapping[str, Content]
     ) -> dict[str, Content]:
-        """Return what the files hold that the features of images depend on.
-
-        They are read only where they have changed since they held what is ``known``.
-        """
+        """Return what the files of images hold, read where it may not be what is ``known``."""
         found = {}
         for name in names:
             files = self.photographs.files(name)

@@ -174,8 +174,7 @@ class Escalation:
     def next_work(self) -> tuple[int, list[Pair]] | None:
         """Return a level, and the pairs to match at it now; None when nothing is left to do.
 
-        There are no pairs where a killed run has matched all of a step, and only the database lacks
-        them.
+        No pairs are left where a killed run has matched all of a step, but for the database.
         """
         if step := self.matches.note(STEP):
             level, pairs = step

@@ -65,8 +65,7 @@ def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, 
 def current(context: Context) -> list[GuidedPair]:
     """Return the guided pairs whose geometry is still the one on record.
 
-    It is not where a run was killed just before it was written, and where the pair has got other
-    raw matches since.
+    It is not where a run was killed before it was written, or the pair has other raw matches now.
     """
     path = context.workspace.database
     if not (context.workspace.guided.exists() and path.exists()):

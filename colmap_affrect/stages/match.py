@@ -115,8 +115,7 @@ def match_pairs(
 def not_well_tied(matches: MatchStore, pairs: Sequence[Pair]) -> list[Pair]:
     """Return the pairs whose remaining features are wanted, where some were matched.
 
-    That is, all but those with many matches already, and those of two images that each have several
-    such pairs.
+    All but those with many matches, and those of two images that each have several such pairs.
     """
     nums = matches.nums_of_some(pairs)
     many = {pair for pair, num in nums.items() if num >= MANY_MATCHES}
@@ -146,10 +145,7 @@ def write_batches(
 def matched_at_level(
     context: Context, pairs: Sequence[Pair], options: MatcherOptions, level: int, max_num: int = 0
 ) -> Generator[PairMatches, None, None]:
-    """Match pairs by the features of a level, and leave out what never moves.
-
-    ``options`` count where the level has none of its own.
-    """
+    """Match by the features of a level and its matcher, or ``options``, but what never moves."""
     features, chosen = context.features, context.extraction.levels[level]
     options, extractor = chosen.matching or options, chosen.features.name
     resources = context.resources
@@ -203,8 +199,7 @@ def iterate_matches(
 ) -> Generator[PairMatches, None, None]:
     """Match pairs, in an order in which an image, once read, stays in memory for most of its pairs.
 
-    By default there is a thread for each core. AffrectError when workers do not see the file of
-    features.
+    By default by a thread for each core. AffrectError when workers do not see the features.
     """
     if not pairs:
         return

@@ -39,8 +39,7 @@ def watched(
 
     ``follows``: bring it up to the last stage that was run; else the command does that. A command
     that only ``maps`` takes a changed one as it is, with a warning; one that ``discards`` all there
-    is needs nothing mended. A database of the user is never mended, but refused where COLMAP could
-    not use it.
+    is needs nothing mended. A database of the user is refused where COLMAP could not use it.
     """
     workspace, path = context.workspace, context.workspace.database
     if workspace.users_database:

@@ -47,8 +47,7 @@ class ImageTask:
     photographs: Photographs  # where it and its masks are
     name: str  # of the photograph
     level: int = 0  # of escalation: above 0 only the features that its rectifier adds
-    # (3, 3) camera matrix in pixel-centre px of the stored image; by default COLMAP's guess
-    intrinsics: Array | None = None
+    intrinsics: Array | None = None  # (3, 3) in pixel-centre px as stored; None: COLMAP's guess
     camera_size: tuple[int, int] | None = None  # (width, height) of its camera, if any
 
 
@@ -103,8 +102,7 @@ class ImageExtractor:
 
         ``name`` is the key of its depth map, the file's name by default; for ``intrinsics`` and
         ``level`` see :class:`ImageTask`; ``mask`` is (H, W) bool of the stored image, where
-        features may be. Raises ImageError when the file cannot be read, or its mask has another
-        size.
+        features may be. ImageError when the file cannot be read, or its mask has another size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
         with self.network_lock if self.options.levels[level].uses_networks else nullcontext():
