@@ -72,10 +72,7 @@ def write_scene(
 
 
 def _write_method(
-    folder: Path,
-    method: str,
-    truth: pycolmap.Reconstruction,
-    names: Sequence[str],
+    folder: Path, method: str, truth: pycolmap.Reconstruction, names: Sequence[str]
 ) -> pycolmap.Reconstruction:
     """Write the database and the model of a method, which registers some of the images."""
     model = pycolmap.Reconstruction(truth)

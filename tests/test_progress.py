@@ -4,13 +4,7 @@ from __future__ import annotations
 
 import io
 
-from colmap_affrect.progress import (
-    COSTS,
-    NUM_PLAIN_LINES,
-    SILENT,
-    Forecast,
-    Progress,
-)
+from colmap_affrect.progress import COSTS, NUM_PLAIN_LINES, SILENT, Forecast, Progress
 
 
 class Terminal(io.StringIO):

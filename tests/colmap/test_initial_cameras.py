@@ -9,17 +9,9 @@ from numpy.testing import assert_allclose
 from photographs_with_exif import BODY, LENS_50, write_photograph
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cameras import (
-    CameraRecord,
-    read_camera_records,
-    write_camera_records,
-)
+from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records, write_camera_records
 from colmap_affrect.colmap.database import camera_matrix, open_database, read_cameras
-from colmap_affrect.colmap.initial_cameras import (
-    InitialCameras,
-    import_images,
-    record_cameras,
-)
+from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 

@@ -82,9 +82,7 @@ def weak_pair(
 
 
 def num_inliers(
-    frames: tuple[NDArray[np.float64], NDArray[np.float64]],
-    columns: int = 6,
-    **options: float,
+    frames: tuple[NDArray[np.float64], NDArray[np.float64]], columns: int = 6, **options: float
 ) -> int:
     sides = tuple(Side(camera(i), rows(lafs, columns)) for i, lafs in enumerate(frames, 1))
     matches = np.stack([np.arange(len(frames[0]))] * 2, axis=1)

@@ -11,11 +11,7 @@ from mapping_tasks import ALL_GIVEN, NOTHING_KNOWN
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.native_options import differences, flat_values
-from colmap_affrect.colmap.verification import (
-    VerificationOptions,
-    two_view_options,
-    verify,
-)
+from colmap_affrect.colmap.verification import VerificationOptions, two_view_options, verify
 from colmap_affrect.comparison.results import pair_errors
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -62,9 +58,7 @@ def max_rotation_error_deg(model: pycolmap.Reconstruction, truth: pycolmap.Recon
     return max(degrees for degrees, _ in pair_errors(*poses).values())
 
 
-def test_two_images_register_with_our_preset_and_not_with_colmaps_default(
-    tmp_path: Path,
-) -> None:
+def test_two_images_register_with_our_preset_and_not_with_colmaps_default(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     pycolmap.set_random_seed(SEED)
     scene = pycolmap.SyntheticDatasetOptions(num_frames_per_rig=2, num_rigs=1, num_points3D=400)

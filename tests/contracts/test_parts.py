@@ -36,8 +36,7 @@ LONG = ["aliked"]  # takes seconds
 
 
 @pytest.mark.parametrize(
-    "case",
-    [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in FEATURES],
+    "case", [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in FEATURES]
 )
 class TestExtractors(ExtractorContract):
     @pytest.fixture(autouse=True)

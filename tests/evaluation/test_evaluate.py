@@ -17,12 +17,7 @@ from posed_photographs import TRUTH, write_extreme_views, write_imc
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.evaluation.datasets import load_evd
-from colmap_affrect.evaluation.evaluate import (
-    PROTOCOLS,
-    EvaluateOptions,
-    RecipeRun,
-    evaluate,
-)
+from colmap_affrect.evaluation.evaluate import PROTOCOLS, EvaluateOptions, RecipeRun, evaluate
 from colmap_affrect.evaluation.results import Evaluation, RecipeResult
 from colmap_affrect.evaluation.truths import ScoreOptions, TrueHomography
 from colmap_affrect.stages.one_image import ImageExtractor

@@ -7,15 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from strategies import (
-    Array,
-    affine_shapes,
-    classes,
-    compose_affine,
-    scales,
-    tilt_distance,
-    turns,
-)
+from strategies import Array, affine_shapes, classes, compose_affine, scales, tilt_distance, turns
 
 from colmap_affrect.geometry.tilts import (
     IDENTITY_LABEL,

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from depth_photographs import (
-    FLOAT32_RTOL,
-    photograph,
-    slanted_plane,
-)
+from depth_photographs import FLOAT32_RTOL, photograph, slanted_plane
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import write_image
 
@@ -133,14 +129,7 @@ def test_file_of_another_format_or_with_pickled_objects_is_unreadable(tmp_path, 
             source(tmp_path).depth(photograph())
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        np.ones((1, 4, 6)),
-        np.ones((0, 6)),
-        np.ones((4, 6), complex),
-    ],
-)
+@pytest.mark.parametrize("values", [np.ones((1, 4, 6)), np.ones((0, 6)), np.ones((4, 6), complex)])
 def test_array_that_is_no_map_of_numbers_is_refused(tmp_path, values):
     write_map(tmp_path / "a.npy", values)
     with pytest.raises(DepthError, match=r"expected numbers of shape \(height, width\), found"):

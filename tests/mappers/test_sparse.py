@@ -50,11 +50,7 @@ def wall(random: np.random.Generator, count: int) -> NDArray[np.float64]:
     return np.stack([x, y, 7.0 + 0.35 * np.abs(x - 3.0) + 0.1 * y], axis=1)
 
 
-def write_scene(
-    path: Path,
-    poses: Poses,
-    pairs: Iterable[tuple[int, int]],
-) -> None:
+def write_scene(path: Path, poses: Poses, pairs: Iterable[tuple[int, int]]) -> None:
     """Write a verified database in which each pair of images has features of its own."""
     random = np.random.default_rng(5)
     names = list(poses)

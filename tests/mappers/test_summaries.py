@@ -20,9 +20,7 @@ MODEL = ModelSummary(
     mean_reprojection_error_px=0.512,
     doubtful={"č.jpg": "held by only 9 points"},
     probabilities={"a.jpg": 0.98, "č.jpg": 0.4},
-    bridges={
-        "č.jpg": Bridge("a.jpg", 32, 36, 0.031),
-    },
+    bridges={"č.jpg": Bridge("a.jpg", 32, 36, 0.031)},
     taken_out={"d.jpg": "held by only 3 points"},
     focals_px={"a.jpg": 812.5, "č.jpg": 900.0},
 )

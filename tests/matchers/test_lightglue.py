@@ -16,10 +16,7 @@ from strategies import compose_affine
 
 from colmap_affrect.data import LocalFeatures, union
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.geometry.affine import (
-    lafs_from_keypoints,
-    transform_frames,
-)
+from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
 from colmap_affrect.matchers.lightglue import (
     LightGlue,

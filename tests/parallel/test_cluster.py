@@ -56,11 +56,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_stages(
-    out: Path,
-    photos: Path,
-    executor: Executor | None,
-    *,
-    progress: Progress = SILENT,
+    out: Path, photos: Path, executor: Executor | None, *, progress: Progress = SILENT
 ) -> StageReport:
     inputs = Inputs.of(photos, cameras=CAMERAS)
     with Workspace(out).locked() as workspace:

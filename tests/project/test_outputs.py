@@ -10,11 +10,7 @@ import pytest
 
 import colmap_affrect
 from colmap_affrect.errors import OptionError
-from colmap_affrect.project.outputs import (
-    new_results,
-    refuse_photographs,
-    temporary_folder,
-)
+from colmap_affrect.project.outputs import new_results, refuse_photographs, temporary_folder
 from colmap_affrect.project.workspace import Workspace
 
 PACKAGE = Path(colmap_affrect.__file__).parent

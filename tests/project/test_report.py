@@ -16,13 +16,7 @@ from colmap_affrect.project.report import (
 )
 
 LARGE = ModelSummary(
-    ("a.png", "č d.png"),
-    120,
-    2.25,
-    0.512,
-    bridges={
-        "č d.png": Bridge("a.png", 32, 36, 0.031),
-    },
+    ("a.png", "č d.png"), 120, 2.25, 0.512, bridges={"č d.png": Bridge("a.png", 32, 36, 0.031)}
 )
 SMALL = ModelSummary(("e.png", "f.png"), 50, 2.0, 0.25)
 

@@ -115,10 +115,7 @@ def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) 
 @pytest.mark.parametrize("access", ["read", "write"])
 @pytest.mark.parametrize(
     ("attributes", "found"),
-    [
-        ({}, "found None"),
-        ({"format": "colmap_affrect/matches"}, "found colmap_affrect/matches"),
-    ],
+    [({}, "found None"), ({"format": "colmap_affrect/matches"}, "found colmap_affrect/matches")],
     ids=["foreign", "other kind"],
 )
 def test_foreign_file_is_refused_and_left_as_it_is(

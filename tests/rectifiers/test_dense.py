@@ -9,10 +9,7 @@ from numpy.testing import assert_allclose
 
 from colmap_affrect.data import Mask, Rectification, RectificationPlan, ShapeGrid
 from colmap_affrect.geometry.affine import rectifying_affine
-from colmap_affrect.geometry.tilts import (
-    metrics_from_tilts,
-    nearest_centers,
-)
+from colmap_affrect.geometry.tilts import metrics_from_tilts, nearest_centers
 from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions, plan_dense_shapes
 
 STEP_PX = 4

@@ -10,18 +10,9 @@ from numpy.testing import assert_allclose
 from strategies import Array
 from synthetic import blobs, texture
 
-from colmap_affrect.data import (
-    LocalFeatures,
-    Mask,
-    Rectification,
-    RectificationPlan,
-)
+from colmap_affrect.data import LocalFeatures, Mask, Rectification, RectificationPlan
 from colmap_affrect.features.sift import RootSift, SiftOptions
-from colmap_affrect.geometry.affine import (
-    ellipse_extents,
-    fit_canvas,
-    rectifying_affine,
-)
+from colmap_affrect.geometry.affine import ellipse_extents, fit_canvas, rectifying_affine
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.rectifiers.execute import extract_rectified
 

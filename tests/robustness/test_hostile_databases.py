@@ -125,8 +125,7 @@ CAMERA_SIZE = (1600, 1200)
 
 @pytest.mark.parametrize("prior", [False, True], ids=["no prior", "prior"])
 @pytest.mark.parametrize(
-    ("count", "num_pairs"),
-    [(200, 1), (1000, 1), pytest.param(1000, 50, marks=pytest.mark.slow)],
+    ("count", "num_pairs"), [(200, 1), (1000, 1), pytest.param(1000, 50, marks=pytest.mark.slow)]
 )
 def test_random_matches_are_rejected(
     tmp_path: Path, count: int, num_pairs: int, prior: bool
