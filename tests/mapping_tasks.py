@@ -1,13 +1,16 @@
-"""Tasks of mappers whose cameras are given or not."""
+"""Tasks of mappers whose cameras are given or not, and databases to map."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
-from colmap_affrect.colmap.database import read_cameras
-from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.colmap.database import open_database, read_cameras
+from colmap_affrect.mappers.base import MAPPERS, MappingTask
+
+SEED = 3
 
 WHOLE = CameraRecord(("a",), "given", 1300.0, size=(1024, 768), given=("focal", "distortion"))
 """All of a camera is given."""
@@ -20,3 +23,24 @@ def task_with_given_cameras(database_path: Path, **values: Any) -> MappingTask:
     """Return a task for a database whose cameras are all given."""
     cameras = {camera.camera_id: WHOLE for camera in read_cameras(database_path).values()}
     return MappingTask(database_path, database_path.parent, cameras=cameras, **values)
+
+
+def mapper_of(name: str, **options: Any) -> Any:
+    return MAPPERS.make(MAPPERS.options({"name": name, "random_seed": SEED, **options}))
+
+
+def synthesize(
+    path: Path, *, seed: int = SEED, noise_px: float = 0.0, **options: Any
+) -> pycolmap.Reconstruction:
+    """Let COLMAP make a verified database, with options of its own; return the truth.
+
+    There is one frame a rig unless another number is asked for.
+    """
+    given = pycolmap.SyntheticDatasetOptions(**{"num_frames_per_rig": 1, **options})
+    pycolmap.set_random_seed(seed)
+    with open_database(path) as database:
+        truth = pycolmap.synthesize_dataset(given, database)
+        if noise_px:
+            noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=noise_px)
+            pycolmap.synthesize_noise(noise, truth, database)
+    return truth

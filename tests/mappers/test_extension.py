@@ -8,46 +8,31 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
+from mapping_tasks import NOTHING_KNOWN, SEED, mapper_of, synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.mappers import incremental, mapping, snapshots
-from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
 
-SEED = 3
 NUM_IMAGES, NUM_OLD = 10, 5
-
-
-def mapper_of(name: str = "incremental", **options: Any) -> Any:
-    return MAPPERS.make(MAPPERS.options({"name": name, "random_seed": SEED, **options}))
-
-
-def synthesize(path: Path, **options: Any) -> pycolmap.Reconstruction:
-    """Let COLMAP make a verified database with noise and two cameras; return the truth."""
-    pycolmap.set_random_seed(SEED)
-    given = {"num_rigs": 2, "num_frames_per_rig": NUM_IMAGES // 2, "num_points3D": 200, **options}
-    with open_database(path) as database:
-        truth = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(**given), database)
-        noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5)
-        pycolmap.synthesize_noise(noise, truth, database)
-    return truth
+SCENE = {"num_rigs": 2, "num_frames_per_rig": 5, "num_points3D": 200, "noise_px": 0.5}
 
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("extension") / "database.db"
-    synthesize(path)
+    synthesize(path, **SCENE)
     return path
 
 
 @pytest.fixture(scope="module")
 def old(database: Path) -> pycolmap.Reconstruction:
     """A model of half of the images, moved, and of other ids than the database's."""
-    native = mapper_of().native(NOTHING_KNOWN, SEED)
+    native = mapper_of("incremental").native(NOTHING_KNOWN, SEED)
     with open_database(database) as opened:
         names = [image.name for image in opened.read_all_images()]
     native.image_names, native.extract_colors = names[1::2], False
@@ -105,7 +90,7 @@ def extended(
 ) -> tuple[pycolmap.Reconstruction, list[int]]:
     shown: list[int] = []
     task = MappingTask(database, None, extend=existing)
-    (model,) = map_database(mapper_of(), task, folder / "sparse", shown.append)
+    (model,) = map_database(mapper_of("incremental"), task, folder / "sparse", shown.append)
     assert len(model.registered_names) == NUM_IMAGES
     return pycolmap.Reconstruction(folder / "sparse" / "0"), shown
 
@@ -159,7 +144,7 @@ def test_new_images_are_where_they_were_taken(
     old.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
     path = written(old, tmp_path / "old")
     model, _ = extended(database, read_existing(Extension(path), database), tmp_path)
-    native = mapper_of().native(NOTHING_KNOWN, SEED)
+    native = mapper_of("incremental").native(NOTHING_KNOWN, SEED)
     native.extract_colors = False
     (tmp_path / "all").mkdir()
     whole = pycolmap.incremental_mapping(database, tmp_path, tmp_path / "all", options=native)[0]
@@ -192,7 +177,7 @@ def test_images_without_matches_stay_in_the_model(
 
 def test_rigs_get_the_poses_of_their_cameras(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
-    truth = synthesize(path, num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=5)
+    truth = synthesize(path, **SCENE | {"num_rigs": 1, "num_cameras_per_rig": 2})
     single = with_other_ids(truth)
     existing = read_existing(Extension(written(single, tmp_path / "old")), path)
     for name, pose in poses(existing.reconstruction).items():
@@ -275,13 +260,13 @@ def test_mapping_that_was_stopped_goes_on_from_its_snapshot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "database.db"
-    synthesize(path)
+    synthesize(path, **SCENE)
     for module in (incremental, snapshots):
         monkeypatch.setattr(module, "SNAPSHOT_FRAMES", 2)
     token = pycolmap.CancellationToken()
     task = MappingTask(path, None, cancellation=token)
     with pytest.raises(KeyboardInterrupt):
-        map_database(mapper_of(), task, tmp_path / "sparse", stop_after(8, token))
+        map_database(mapper_of("incremental"), task, tmp_path / "sparse", stop_after(8, token))
     (folder,) = (tmp_path / "sparse.snapshots").iterdir()
     left = snapshots.largest_snapshot(folder)
     names = set(snapshots.registered_names(left))
@@ -291,7 +276,9 @@ def test_mapping_that_was_stopped_goes_on_from_its_snapshot(
     half.mkdir()
     (half / "images.bin").write_bytes((left / "images.bin").read_bytes()[:-5])
     shown: list[int] = []
-    (model,) = map_database(mapper_of(), MappingTask(path, None), tmp_path / "sparse", shown.append)
+    (model,) = map_database(
+        mapper_of("incremental"), MappingTask(path, None), tmp_path / "sparse", shown.append
+    )
     assert shown[0] == len(names)
     assert sum(shown) == len(model.registered_names) == NUM_IMAGES
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db", "sparse"]
@@ -301,11 +288,13 @@ def test_snapshots_of_other_options_are_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "database.db"
-    synthesize(path)
+    synthesize(path, **SCENE)
     task, folder = MappingTask(path, None), tmp_path / "sparse.snapshots"
 
     def fail(num_images: int, **options: Any) -> None:
-        with snapshots.with_snapshots(task, mapper_of(**options).options, folder, num_images) as it:
+        with snapshots.with_snapshots(
+            task, mapper_of("incremental", **options).options, folder, num_images
+        ) as it:
             assert (it.snapshot_path is None) == (num_images == 1)
             if it.snapshot_path and not options:
                 (it.snapshot_path / "1").mkdir()
@@ -316,7 +305,7 @@ def test_snapshots_of_other_options_are_dropped(
         assert not folder.exists()
         with pytest.raises(OSError, match="full"):
             fail(num_images)
-    with snapshots.with_snapshots(task, mapper_of().options, folder, 10) as it:
+    with snapshots.with_snapshots(task, mapper_of("incremental").options, folder, 10) as it:
         assert (it.snapshot_path / "1").exists()
     assert not folder.exists()
     with pytest.raises(OSError, match="full"):
@@ -331,8 +320,8 @@ def test_snapshots_of_other_cameras_are_dropped(
 ) -> None:
     """They are of the same pairs, with as many inliers."""
     path, folder = tmp_path / "database.db", tmp_path / "sparse.snapshots"
-    synthesize(path)
-    task, options = MappingTask(path, None), mapper_of().options
+    synthesize(path, **SCENE)
+    task, options = MappingTask(path, None), mapper_of("incremental").options
     monkeypatch.setattr(snapshots, "SNAPSHOT_FRAMES", 2)
 
     def is_gone_on_with(task: MappingTask) -> bool:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
-from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
+from mapping_tasks import (
+    NOTHING_KNOWN,
+    SEED,
+    mapper_of,
+    synthesize,
+    task_with_given_cameras,
+)
 from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper
@@ -28,12 +32,6 @@ from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
-
-SEED = 3
-TIMEOUT_S = 60
-
-ROTATION_ERROR_DEG = 0.05
-"""Keypoints are exact; what is left are float32 coordinates and the optimiser's tolerance."""
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -53,20 +51,6 @@ def test_values_that_colmap_does_not_accept_are_named() -> None:
         mapper_of("incremental", mapper_options=given)
 
 
-def synthesize(path: Path, num_images: int, num_points: int = 150) -> pycolmap.Reconstruction:
-    """Let COLMAP make a verified database; return the truth."""
-    pycolmap.set_random_seed(SEED)
-    options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=1, num_frames_per_rig=num_images, num_points3D=num_points
-    )
-    with open_database(path) as database:
-        return pycolmap.synthesize_dataset(options, database)
-
-
-def mapper_of(name: str, **options: Any) -> Any:
-    return MAPPERS.make(MAPPERS.options({"name": name, "random_seed": SEED, **options}))
-
-
 def reconstruct(path: Path, mapper: Mapper) -> tuple[list[ModelSummary], int]:
     """Map into path/../sparse; return the models and the number of images shown."""
     shown: list[int] = []
@@ -79,7 +63,7 @@ def reconstruct(path: Path, mapper: Mapper) -> tuple[list[ModelSummary], int]:
 
 def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
-    synthesize(path, 3)
+    synthesize(path, num_rigs=3, num_points3D=150)
     wrong = mapper_of("incremental", mapper_options={"ba_global_function_tolerance": -1})
     with pytest.raises(AffrectError, match=r"incremental mapper failed: .*tolerance") as error:
         reconstruct(path, wrong)
@@ -92,7 +76,7 @@ def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
 ) -> None:
     path = tmp_path / "database.db"
-    synthesize(path, 3)
+    synthesize(path, num_rigs=3, num_points3D=150)
 
     def fail(_: Path, __: Path, output_path: Path, **___: object) -> None:
         (output_path / "0").mkdir()

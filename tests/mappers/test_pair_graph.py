@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_tasks import task_with_given_cameras
+from mapping_tasks import synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers.pair_graph import PairGraph
@@ -23,12 +22,7 @@ NUM_IMAGES = 5
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A verified database of five images with a camera each, and with many tracks."""
     path = tmp_path_factory.mktemp("scene") / "database.db"
-    options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=NUM_IMAGES, num_frames_per_rig=1, num_points3D=2500
-    )
-    pycolmap.set_random_seed(3)
-    with open_database(path) as database:
-        pycolmap.synthesize_dataset(options, database)
+    synthesize(path, num_rigs=NUM_IMAGES, num_points3D=2500)
     return path
 
 

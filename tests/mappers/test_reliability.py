@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mapping_tasks import synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
@@ -19,13 +20,8 @@ from colmap_affrect.project.report import DOUBTFUL, SURE, Bridge
 
 def scene(tmp_path: Path, num_images: int = 5) -> tuple[MappedModel, MappingTask]:
     """A right model of images with a camera each that somebody knows, and its database."""
-    pycolmap.set_random_seed(5)
-    options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=num_images, num_frames_per_rig=1, num_points3D=250
-    )
     path = tmp_path / "database.db"
-    with open_database(path) as database:
-        model = pycolmap.synthesize_dataset(options, database)
+    model = synthesize(path, seed=5, num_rigs=num_images, num_points3D=250)
     records = {
         image.camera_id: CameraRecord((image.name,), "exif", image.camera.mean_focal_length())
         for image in model.images.values()

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapping_tasks import WHOLE, task_with_given_cameras
+from mapping_tasks import WHOLE, mapper_of, synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
@@ -26,7 +26,7 @@ from colmap_affrect.mappers.adjustment import (
     Adjuster,
     FocalPrior,
 )
-from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence, pair_evidence
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
@@ -42,15 +42,7 @@ Scene = tuple[Path, pycolmap.Reconstruction]
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """A verified database of images with a camera each, and the truth."""
     path = tmp_path_factory.mktemp("scene") / "database.db"
-    options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=NUM_IMAGES, num_frames_per_rig=1, num_points3D=150
-    )
-    pycolmap.set_random_seed(3)
-    with open_database(path) as database:
-        truth = pycolmap.synthesize_dataset(options, database)
-        noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=NOISE_PX)
-        pycolmap.synthesize_noise(noise, truth, database)
-    return path, truth
+    return path, synthesize(path, num_rigs=NUM_IMAGES, num_points3D=150, noise_px=NOISE_PX)
 
 
 @pytest.fixture
@@ -63,12 +55,14 @@ def task_of(scene: Scene, record: CameraRecord) -> MappingTask:
     return MappingTask(scene[0], None, cameras=cameras)
 
 
-def mapper_of(**options: Any) -> Any:
-    return MAPPERS.make(MAPPERS.options({"name": "sparse", **options}))
-
-
 def focals(model: pycolmap.Reconstruction) -> list[float]:
     return [camera.mean_focal_length() for camera in model.cameras.values()]
+
+
+def widen(model: pycolmap.Reconstruction, factor: float) -> None:
+    """Multiply the focal lengths."""
+    for camera in model.cameras.values():
+        camera.params = [factor * camera.params[0], *camera.params[1:]]
 
 
 def adjuster(
@@ -103,8 +97,7 @@ def test_a_prior_costs_by_its_deviation_and_nothing_where_it_is_held() -> None:
 
 
 def test_adjustment_finds_focal_lengths_that_points_know(model: pycolmap.Reconstruction) -> None:
-    for camera in model.cameras.values():
-        camera.params = camera.params * np.where(np.arange(len(camera.params)) == 0, 1.1, 1.0)
+    widen(model, 1.1)
     adjuster(model, FocalPrior(USUAL_FOCAL * SIZE[0], USUAL_SIGMA)).adjust(model, FINAL)
     assert focals(model) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.02)
 
@@ -113,15 +106,14 @@ def test_noisier_keypoints_leave_focal_lengths_nearer_to_the_prior(
     model: pycolmap.Reconstruction,
 ) -> None:
     prior = FocalPrior(0.8 * TRUE_FOCAL, 0.05)
-    exact, noisy = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    exact, noisy = (pycolmap.Reconstruction(model) for _ in range(2))
     adjuster(exact, prior, 0.4).adjust(exact, FINAL)
     adjuster(noisy, prior, 3.0).adjust(noisy, FINAL)
     assert np.mean(focals(noisy)) < np.mean(focals(exact)) - 0.01 * TRUE_FOCAL
 
 
 def test_given_focal_lengths_stay_to_the_bit(model: pycolmap.Reconstruction) -> None:
-    for camera in model.cameras.values():
-        camera.params = camera.params * np.where(np.arange(len(camera.params)) == 0, 1.1, 1.0)
+    widen(model, 1.1)
     before = [camera.params[:3].tolist() for camera in model.cameras.values()]
     adjuster(model, FocalPrior(1.1 * TRUE_FOCAL, 0.0)).adjust(model, FINAL)
     assert [camera.params[:3].tolist() for camera in model.cameras.values()] == before
@@ -163,7 +155,9 @@ def test_a_wrong_pose_and_an_unlikely_lens_have_less_evidence(
 @pytest.fixture
 def found(scene: Scene, tmp_path: Path) -> list[Any]:
     """Summaries of the models of cameras that nobody knows."""
-    return map_database(mapper_of(), task_of(scene, UNKNOWN), tmp_path / "sparse", lambda _: None)
+    return map_database(
+        mapper_of("sparse"), task_of(scene, UNKNOWN), tmp_path / "sparse", lambda _: None
+    )
 
 
 def test_cameras_that_nobody_knows_come_out_right_and_the_same_each_time(
@@ -171,7 +165,9 @@ def test_cameras_that_nobody_knows_come_out_right_and_the_same_each_time(
 ) -> None:
     assert [len(model.registered_names) for model in found] == [NUM_IMAGES]
     assert list(found[0].focals_px.values()) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.05)
-    again = map_database(mapper_of(), task_of(scene, UNKNOWN), tmp_path / "again", lambda _: None)
+    again = map_database(
+        mapper_of("sparse"), task_of(scene, UNKNOWN), tmp_path / "again", lambda _: None
+    )
     assert again[0].focals_px == found[0].focals_px
 
 
@@ -187,50 +183,29 @@ def test_given_focal_lengths_are_refined_where_that_is_asked_for(
         return adjust(self, *given)
 
     monkeypatch.setattr(adjustment.Adjuster, "adjust", recorded)
-    mapper = mapper_of(keep_given_intrinsics=keep)
+    mapper = mapper_of("sparse", keep_given_intrinsics=keep)
     task = task_with_given_cameras(scene[0])
     (found,) = mapper.map(task, tmp_path, 0, lambda _: None)
     assert set().union(*held) == (set(task.cameras) if keep else set())
     assert (set(focals(found.reconstruction)) == {TRUE_FOCAL}) is keep
 
 
-def test_an_adjustment_of_some_images_holds_cameras_that_others_share() -> None:
-    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=4, num_points3D=150)
-    pycolmap.set_random_seed(3)
-    model = pycolmap.synthesize_dataset(options)
+def test_an_adjustment_of_some_images_holds_cameras_that_others_share(tmp_path: Path) -> None:
+    model = write_shared(tmp_path / "database.db", TRUE_FOCAL, 150)
     (camera,) = model.cameras.values()
-    camera.params = camera.params * np.where(np.arange(len(camera.params)) == 0, 1.05, 1.0)
+    widen(model, 1.05)
     before, some = camera.params.tolist(), sorted(model.reg_image_ids())[:3]
     adjuster(model, FocalPrior(TRUE_FOCAL, USUAL_SIGMA)).adjust(model, FINAL, some)
     assert camera.params.tolist() == before
 
 
-def test_mapping_that_is_interrupted_leaves_nothing(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(adjustment.Adjuster, "adjust", stop)
-    with pytest.raises(KeyboardInterrupt):
-        map_database(mapper_of(), task_of(scene, UNKNOWN), tmp_path / "sparse", lambda _: None)
-    assert not list(tmp_path.iterdir())
-
-
 def write_shared(path: Path, focal_px: float, num_points: int) -> pycolmap.Reconstruction:
     """Write verified pairs of four images that share a camera; return the truth."""
-    options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=1,
-        num_frames_per_rig=4,
-        num_points3D=num_points,
-        camera_params=[focal_px, SIZE[0] / 2, SIZE[1] / 2, 0.0],
-    )
-    pycolmap.set_random_seed(3)
-    with open_database(path) as database:
-        truth = pycolmap.synthesize_dataset(options, database)
-        noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=NOISE_PX)
-        pycolmap.synthesize_noise(noise, truth, database)
-    return truth
+    params = [focal_px, SIZE[0] / 2, SIZE[1] / 2, 0.0]
+    return synthesize(
+        path, num_rigs=1, num_frames_per_rig=4, num_points3D=num_points, camera_params=params,
+        noise_px=NOISE_PX,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("focal_px", [700.0, 2600.0])
@@ -240,7 +215,7 @@ def test_a_camera_that_images_share_is_found_from_wide_to_long(
     truth = write_shared(tmp_path / "database.db", focal_px, 600)
     (camera,) = truth.cameras
     task = MappingTask(tmp_path / "database.db", None, cameras={camera: UNKNOWN})
-    model, *_ = map_database(mapper_of(), task, tmp_path / "sparse", lambda _: None)
+    model, *_ = map_database(mapper_of("sparse"), task, tmp_path / "sparse", lambda _: None)
     assert len(model.registered_names) == 4
     assert list(model.focals_px.values()) == pytest.approx([focal_px] * 4, rel=0.03)
 
@@ -254,7 +229,7 @@ def test_a_narrow_lens_makes_a_model_unless_that_is_forbidden(
     task = MappingTask(
         tmp_path / "database.db", None, cameras={1: replace(WHOLE, focal_px=focal_px)}
     )
-    found = map_database(mapper_of(**options), task, tmp_path / "sparse", lambda _: None)
+    found = map_database(mapper_of("sparse", **options), task, tmp_path / "sparse", lambda _: None)
     assert sum(len(model.registered_names) for model in found) == num_images
 
 
@@ -281,8 +256,9 @@ def test_a_token_stops_the_search(scene: Scene, tmp_path: Path) -> None:
         token.cancel()
 
     with pytest.raises(KeyboardInterrupt):
-        map_database(mapper_of(), task, tmp_path / "sparse", show)
+        map_database(mapper_of("sparse"), task, tmp_path / "sparse", show)
     assert shown == [2]
+    assert not list(tmp_path.iterdir())
 
 
 def two_places(path: Path) -> dict[int, CameraRecord]:
@@ -290,14 +266,7 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
     parts = []
     for seed, count in ((3, 4), (8, 2)):
         parts.append(path.with_name(f"{count}.db"))
-        options = pycolmap.SyntheticDatasetOptions(
-            num_rigs=count, num_frames_per_rig=1, num_points3D=200
-        )
-        pycolmap.set_random_seed(seed)
-        with open_database(parts[-1]) as database:
-            truth = pycolmap.synthesize_dataset(options, database)
-            noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=NOISE_PX)
-            pycolmap.synthesize_noise(noise, truth, database)
+        synthesize(parts[-1], seed=seed, num_rigs=count, num_points3D=200, noise_px=NOISE_PX)
         with closing(sqlite3.connect(parts[-1])) as connection, connection:
             connection.execute("UPDATE images SET name = ? || name", (f"{count}/",))
     with open_database(path) as both:
@@ -318,7 +287,7 @@ def test_photographs_get_cameras_of_their_own_and_models_of_other_places_stay(
 ) -> None:
     path = tmp_path / "database.db"
     task = MappingTask(path, None, cameras=two_places(path), may_share=True)
-    large, small = mapper_of().map(task, tmp_path, 0, lambda _: None)
+    large, small = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
     assert (large.moves[-1], small.moves) == (OWN_CAMERAS, ("with all pairs",))
     found = sorted(
         camera.mean_focal_length() for camera in cameras_of(large.reconstruction).values()
