@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -44,3 +45,19 @@ def synthesize(
             noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=noise_px)
             pycolmap.synthesize_noise(noise, truth, database)
     return truth
+
+
+def write_images(
+    database: pycolmap.Database, camera: pycolmap.Camera, names: Iterable[str]
+) -> None:
+    """Write a camera, and images of it with ids from 1 on, each a frame of one rig."""
+    database.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(camera.sensor_id)
+    rig_id = database.write_rig(rig)
+    for image_id, name in enumerate(names, 1):
+        image = pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=image_id)
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame(rig_id=rig_id, frame_id=image_id)
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame, use_frame_id=True)

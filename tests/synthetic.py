@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from colmap_affrect.data import GrayImage
+from colmap_affrect.data import GrayImage, LocalFeatures
+from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 
 Array = NDArray[np.float64]
 
@@ -63,6 +65,21 @@ def texture(size: tuple[int, int], seed: int, finest_sigma_px: float = 1.2) -> G
         )
         image += layer / max(layer.std(), 1e-9)
     return np.clip(np.rint(128 + 32 * image / max(image.std(), 1e-9)), 0, 255).astype(np.uint8)
+
+
+def circles(centers: ArrayLike, sigmas_px: ArrayLike) -> LocalFeatures:
+    """Upright features in order of falling response, as a detector returns them."""
+    points, sigmas = np.asarray(centers, float), np.asarray(sigmas_px, float)
+    lafs = lafs_from_keypoints(points, MEASUREMENT_SIGMAS * sigmas, np.zeros(len(points)))
+    responses = np.linspace(1.0, 0.5, len(points), dtype=np.float32)
+    ids = np.arange(len(points), dtype=np.int32)
+    return LocalFeatures(lafs, responses, np.zeros((len(points), 0), np.float32), ids)
+
+
+def unit_rows(rows: ArrayLike) -> NDArray[np.float32]:
+    """Rows of unit length."""
+    rows = np.asarray(rows)
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
 
 
 def write_image(path: Path, image: NDArray[np.generic]) -> Path:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -107,15 +105,3 @@ def test_convention_pycolmap_sift_reports_corner_origin() -> None:
     keypoints, _ = extractor.extract(pycolmap.Bitmap.from_array(image))
     places = np.array([[keypoint.x, keypoint.y] for keypoint in keypoints])
     assert np.linalg.norm(places - [40.5, 30.5], axis=1).min() < 0.1
-
-
-def test_convention_database_swaps_the_columns_of_a_reversed_pair(tmp_path: Path) -> None:
-    matches = np.array([[0, 5], [3, 2]], dtype=np.uint32)
-    with pycolmap.Database.open(tmp_path / "raw.db") as database:
-        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1000.0, 640, 480)
-        camera_id = database.write_camera(camera)
-        for name in ("a.png", "b.png"):
-            database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
-        database.write_matches(2, 1, matches)
-        assert database.read_matches(2, 1).tolist() == matches.tolist()
-        assert database.read_matches(1, 2).tolist() == matches[:, ::-1].tolist()

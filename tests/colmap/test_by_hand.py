@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mapping_tasks import write_images
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, read_marks, triangulated
@@ -22,16 +23,13 @@ def marked(path: Path, text: str) -> dict[str, dict[str, list[float]]]:
     return {p: {name: xy.tolist() for name, xy in seen.items()} for p, seen in found.items()}
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        ROWS,
-        "point,photograph,x,y\n" + ROWS,
-        "Marker,Camera,X,Y\n" + ROWS,
-        "y,image,x,point\n20,a,10.5,p\n40.25,b.jpg,30,p\n2,c,1,q\n",
-        "point,image,px,py,x,y,z\np,a.jpg,10.5,20,7,8,9\np,b.jpg,30,40.25,,,\nq,c.png,1,2,,,\n",
-    ],
-)
+@pytest.mark.parametrize("text", [
+    ROWS,
+    "point,photograph,x,y\n" + ROWS,
+    "Marker,Camera,X,Y\n" + ROWS,
+    "y,image,x,point\n20,a,10.5,p\n40.25,b.jpg,30,p\n2,c,1,q\n",
+    "point,image,px,py,x,y,z\np,a.jpg,10.5,20,7,8,9\np,b.jpg,30,40.25,,,\nq,c.png,1,2,,,\n",
+])  # fmt: skip
 def test_tables_may_have_any_order_of_columns_and_short_names(tmp_path: Path, text: str) -> None:
     expected = {
         "p": {"old/a.jpg": [10.5, 20.0], "b.jpg": [30.0, 40.25]},
@@ -40,16 +38,13 @@ def test_tables_may_have_any_order_of_columns_and_short_names(tmp_path: Path, te
     assert marked(tmp_path / "marks.csv", text) == expected
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("p,d.jpg,1,2\n", "line 1: no such photograph, d.jpg"),
-        ("p,a.jpg,1,two\n", "line 1: x and y must be numbers"),
-        ("point,photograph,x,y\n,a.jpg,1,2\n", "line 2: must name a point and a photograph"),
-        ("p,a.jpg,1,2\n", "no point is marked in two photographs"),
-        ("point,photograph,x,y,colour\np,a,1,2,red\n", "unknown column 'colour'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    ("p,d.jpg,1,2\n", "line 1: no such photograph, d.jpg"),
+    ("p,a.jpg,1,two\n", "line 1: x and y must be numbers"),
+    ("point,photograph,x,y\n,a.jpg,1,2\n", "line 2: must name a point and a photograph"),
+    ("p,a.jpg,1,2\n", "no point is marked in two photographs"),
+    ("point,photograph,x,y,colour\np,a,1,2,red\n", "unknown column 'colour'"),
+])  # fmt: skip
 def test_what_cannot_be_used_is_refused_in_one_line(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(OptionError, match=words):
         marked(tmp_path / "marks.csv", text)
@@ -91,11 +86,9 @@ def database(tmp_path: Path) -> Path:
     path = tmp_path / "database.db"
     with open_database(path) as made:
         camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
-        camera_id = made.write_camera(camera)
-        for number, name in enumerate(NAMES):
-            image_id = made.write_image(pycolmap.Image(name=name, camera_id=camera_id))
-            if number < 2:
-                made.write_keypoints(image_id, np.full((4, [6, 4][number]), 7.0, np.float32))
+        write_images(made, camera, NAMES)
+        for image_id, columns in ((1, 6), (2, 4)):
+            made.write_keypoints(image_id, np.full((4, columns), 7.0, np.float32))
         for pair in [(1, 2), (1, 3), (2, 3)]:
             geometry = pycolmap.TwoViewGeometry(inlier_matches=np.zeros((1, 2), np.uint32))
             made.write_two_view_geometry(*pair, geometry)

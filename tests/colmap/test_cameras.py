@@ -54,31 +54,25 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
     assert found["f.jpg"].where.endswith("plates.csv, line 8")
 
 
-@pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        (["name,focal_cm", "a,3"], "plates.csv: unknown column 'focal_cm' .did you mean 'focal_"),
-        ([], "must have the column 'name'"),
-        (["name,focal_px", "a,3", "a,4"], "line 3: a is there twice"),
-        (
-            ["name,focal_px", "a,3,4"],
-            "line 2: has 3 cells and the first line 2; values with commas",
-        ),
-        (["name,focal_px", "a,long"], "line 2: focal_px='long': should be a valid number"),
-        (["name,focal_px", "a,0"], "line 2: focal_px='0': should be greater than 0"),
-        (["name,focal_px", "a,1e999"], "a finite number"),
-        (["name,focal_mm", "a,50"], "line 2: focal_mm needs plate_width_mm"),
-        (["name,focal_px,focal_mm", "a,5,5"], "line 2: focal_px and focal_mm say the same twice"),
-        (["name,cx", "a," + "5" * 200_000], "field larger than field limit"),
-        (["name,cx", "a,5"], "line 2: give both cx and cy, or none"),
-        (["name,model", "a,PINHOL"], "line 2: model: PINHOL is not one of SIMPLE_PINHOLE"),
-        (["name,model,params", "a,PINHOLE,1 2 3"], r"line 2: params: PINHOLE needs 4 values \(fx"),
-        (
-            ["name,focal_px,camera", "a,3,X", "b,,Y", "c,4,X"],
-            "line 4: says something else of camera 'X' than line 2; give them two labels",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("lines", "message"), [
+    (["name,focal_cm", "a,3"], "plates.csv: unknown column 'focal_cm' .did you mean 'focal_"),
+    ([], "must have the column 'name'"),
+    (["name,focal_px", "a,3", "a,4"], "line 3: a is there twice"),
+    (["name,focal_px", "a,3,4"], "line 2: has 3 cells and the first line 2; values with commas"),
+    (["name,focal_px", "a,long"], "line 2: focal_px='long': should be a valid number"),
+    (["name,focal_px", "a,0"], "line 2: focal_px='0': should be greater than 0"),
+    (["name,focal_px", "a,1e999"], "a finite number"),
+    (["name,focal_mm", "a,50"], "line 2: focal_mm needs plate_width_mm"),
+    (["name,focal_px,focal_mm", "a,5,5"], "line 2: focal_px and focal_mm say the same twice"),
+    (["name,cx", "a," + "5" * 200_000], "field larger than field limit"),
+    (["name,cx", "a,5"], "line 2: give both cx and cy, or none"),
+    (["name,model", "a,PINHOL"], "line 2: model: PINHOL is not one of SIMPLE_PINHOLE"),
+    (["name,model,params", "a,PINHOLE,1 2 3"], r"line 2: params: PINHOLE needs 4 values \(fx"),
+    (
+        ["name,focal_px,camera", "a,3,X", "b,,Y", "c,4,X"],
+        "line 4: says something else of camera 'X' than line 2; give them two labels",
+    ),
+])  # fmt: skip
 def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], message: str) -> None:
     with pytest.raises(OptionError, match=message) as error:
         given(table(tmp_path, *lines))
@@ -86,21 +80,18 @@ def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], messa
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"focal_length_px": -1.0}, "greater than or equal"),
-        ({"focal_mm": 50.0}, "--focal-mm, --film-width-mm: one without the other; give both"),
-        (
-            {"params": "900,450,300,0", "focal_length_px": 5.0},
-            "--camera-params, .*: params have focal length",
-        ),
-        ({"model": "PINHOL"}, "--camera-model, .* model: PINHOL is not one of"),
-        ({"params": "0,450,300,0"}, "params: a focal length of 0 px cannot be"),
-        ({"principal_point": "1"}, "--principal-point: cy='': should be a valid number"),
-        ({"cameras_path": "nowhere.csv"}, "--cameras-path nowhere.csv: cannot be read .No such"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"focal_length_px": -1.0}, "greater than or equal"),
+    ({"focal_mm": 50.0}, "--focal-mm, --film-width-mm: one without the other; give both"),
+    (
+        {"params": "900,450,300,0", "focal_length_px": 5.0},
+        "--camera-params, .*: params have focal length",
+    ),
+    ({"model": "PINHOL"}, "--camera-model, .* model: PINHOL is not one of"),
+    ({"params": "0,450,300,0"}, "params: a focal length of 0 px cannot be"),
+    ({"principal_point": "1"}, "--principal-point: cy='': should be a valid number"),
+    ({"cameras_path": "nowhere.csv"}, "--cameras-path nowhere.csv: cannot be read .No such"),
+])  # fmt: skip
 def test_wrong_options_are_one_clear_line(options: dict[str, object], message: str) -> None:
     with pytest.raises(OptionError, match=message) as error:
         read_given_cameras(CameraOptions(**options))

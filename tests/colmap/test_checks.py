@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from damaged import Statement, execute
+from mapping_tasks import write_images
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import check_database
@@ -26,18 +27,10 @@ def write_database(path: Path) -> Path:
     with open_database(path) as database:
         camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, *SIZE)
         camera.has_prior_focal_length = True
-        camera.camera_id = database.write_camera(camera)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(camera.sensor_id)
-        rig_id = database.write_rig(rig)
-        for name, count in zip(NAMES, NUM_KEYPOINTS, strict=True):
-            image = pycolmap.Image(name=name, camera_id=camera.camera_id)
-            image.image_id = database.write_image(image)
-            frame = pycolmap.Frame(rig_id=rig_id)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame)
+        write_images(database, camera, NAMES)
+        for image_id, count in enumerate(NUM_KEYPOINTS, 1):
             keypoints = rng.uniform(0, 1, (count, 6)).astype(np.float32) * [*SIZE, 1, 1, 1, 1]
-            database.write_keypoints(image.image_id, keypoints.astype(np.float32))
+            database.write_keypoints(image_id, keypoints.astype(np.float32))
         for first, second in [(1, 2), (1, 3), (2, 3)]:
             indices = np.array([[0, 1], [4, 6]], np.uint32)
             database.write_matches(first, second, indices)
@@ -137,18 +130,15 @@ def test_what_is_broken_is_found_and_nothing_else(
     assert check_database(database_path)[1] == {kind: items}
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "DELETE FROM frames",  # none has one: as in databases of old
-        at_one_place(11, 9),
-        replace_data("keypoints", 2, np.full((7, 4), 3, np.float32)),
-        replace_data("matches", pair_id(1, 2), np.array([[4, 6]], np.uint32)),  # the last ones
-        f"UPDATE two_view_geometries SET rows = 0, data = NULL, config = 0 "
-        f"WHERE pair_id = {pair_id(1, 2)}",  # tried without success
-        f"DELETE FROM matches WHERE pair_id = {pair_id(1, 2)}",  # inliers alone were imported
-    ],
-)
+@pytest.mark.parametrize("statement", [
+    "DELETE FROM frames",  # none has one: as in databases of old
+    at_one_place(11, 9),
+    replace_data("keypoints", 2, np.full((7, 4), 3, np.float32)),
+    replace_data("matches", pair_id(1, 2), np.array([[4, 6]], np.uint32)),  # the last ones
+    f"UPDATE two_view_geometries SET rows = 0, data = NULL, config = 0 "
+    f"WHERE pair_id = {pair_id(1, 2)}",  # tried without success
+    f"DELETE FROM matches WHERE pair_id = {pair_id(1, 2)}",  # inliers alone were imported
+])  # fmt: skip
 def test_what_is_allowed_is_no_problem(database_path: Path, statement: Statement) -> None:
     path = database_path
     execute(path, "DELETE FROM frame_data" if "frames" in statement else "SELECT 1", statement)

@@ -178,21 +178,18 @@ def test_write_matches_round_trips_in_the_order_of_the_pair(matchable_path: Path
             assert database.exists_matches(1, 3)
 
 
-@pytest.mark.parametrize(
-    ("pair", "matches"),
-    [
-        ((1, 2), np.array([[0.0, 1.0]])),
-        ((1, 2), np.array([[0, 1, 2]])),
-        ((1, 2), np.array([[-1, 0]])),
-        ((1, 2), np.array([[0, 7]])),
-        ((2, 1), np.array([[0, 5]])),
-        ((1, 3), np.array([[0, 0]])),
-        ((4, 2), np.array([[40_000, 1]])),
-        ((1, 2), np.array([[1 << 32, 0]])),
-        ((1, 1), np.array([[0, 1]])),
-        ((1, 99), np.array([[0, 1]])),
-    ],
-)
+@pytest.mark.parametrize(("pair", "matches"), [
+    ((1, 2), np.array([[0.0, 1.0]])),
+    ((1, 2), np.array([[0, 1, 2]])),
+    ((1, 2), np.array([[-1, 0]])),
+    ((1, 2), np.array([[0, 7]])),
+    ((2, 1), np.array([[0, 5]])),
+    ((1, 3), np.array([[0, 0]])),
+    ((4, 2), np.array([[40_000, 1]])),
+    ((1, 2), np.array([[1 << 32, 0]])),
+    ((1, 1), np.array([[0, 1]])),
+    ((1, 99), np.array([[0, 1]])),
+])  # fmt: skip
 def test_write_matches_refuses_what_would_crash_colmap(
     matchable_path: Path, pair: tuple[int, int], matches: np.ndarray
 ) -> None:

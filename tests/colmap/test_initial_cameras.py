@@ -103,18 +103,15 @@ def test_wrong_exif_of_a_shrunk_photograph_is_rescaled_in_the_database(tmp_path:
     assert read_camera_records(tmp_path / "cameras.json")[1].source == "exif-rescaled"
 
 
-@pytest.mark.parametrize(
-    ("options", "params", "given"),
-    [
-        ({"focal_length_px": 70.0}, [70, 45, 30, 0], ("focal",)),
-        ({"principal_point": "40,33"}, [WIDE_PX, 40, 33, 0], ("principal-point",)),
-        (
-            {"model": "PINHOLE", "focal_length_px": 70.0, "principal_point": "40 33"},
-            [70, 70, 40, 33],
-            ("focal", "principal-point", "distortion"),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("options", "params", "given"), [
+    ({"focal_length_px": 70.0}, [70, 45, 30, 0], ("focal",)),
+    ({"principal_point": "40,33"}, [WIDE_PX, 40, 33, 0], ("principal-point",)),
+    (
+        {"model": "PINHOLE", "focal_length_px": 70.0, "principal_point": "40 33"},
+        [70, 70, 40, 33],
+        ("focal", "principal-point", "distortion"),
+    ),
+])  # fmt: skip
 def test_what_is_given_stays_and_the_rest_is_as_it_would_be(
     photos: Path, tmp_path: Path, options: dict[str, object], params: list[float], given: object
 ) -> None:
@@ -159,19 +156,16 @@ def test_table_decides_who_shares_a_camera_and_the_rest_is_as_without(
     assert camera_of(path, "side/f.png").has_prior_focal_length
 
 
-@pytest.mark.parametrize(
-    ("rows", "options", "message"),
-    [
-        (["z.jpg,70,"], {}, r"plates\.csv, line 2: z\.jpg is not in .*photos$"),
-        (["a.jpg,70,X", "side/d.jpg,70,X"], {}, r"line 3: a\.jpg is 90 x 60 px, side/d\.jpg is 60"),
-        (
-            ["a.jpg,70,", "b.jpg,80,"],
-            {"mode": "per-folder"},
-            r"line 3: says something else than line 2, and --camera-mode per-folder lets",
-        ),
-        ([], {"mode": "single"}, "^--camera-mode single: a.jpg is 90 x 60 px, side/d.jpg is 60 x"),
-    ],
-)
+@pytest.mark.parametrize(("rows", "options", "message"), [
+    (["z.jpg,70,"], {}, r"plates\.csv, line 2: z\.jpg is not in .*photos$"),
+    (["a.jpg,70,X", "side/d.jpg,70,X"], {}, r"line 3: a\.jpg is 90 x 60 px, side/d\.jpg is 60"),
+    (
+        ["a.jpg,70,", "b.jpg,80,"],
+        {"mode": "per-folder"},
+        r"line 3: says something else than line 2, and --camera-mode per-folder lets",
+    ),
+    ([], {"mode": "single"}, "^--camera-mode single: a.jpg is 90 x 60 px, side/d.jpg is 60 x"),
+])  # fmt: skip
 def test_cameras_that_cannot_be_are_one_clear_line(
     photos: Path, tmp_path: Path, rows: list[str], options: dict[str, object], message: str
 ) -> None:

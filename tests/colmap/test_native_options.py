@@ -19,18 +19,15 @@ def options_of(mapper: str) -> object:
     return pycolmap.IncrementalPipelineOptions()
 
 
-@pytest.mark.parametrize(
-    ("mapper", "key", "value", "full_key", "resolved"),
-    [
-        ("incremental", "mapper.init_max_error", "3", "mapper.init_max_error", 3.0),
-        ("incremental", "mapper.num_threads", 4, "mapper.num_threads", 4),
-        ("incremental", "ba_refine_principal_point", "True", "ba_refine_principal_point", True),
-        ("incremental", "ba_local_backend", "ceres", "ba_local_backend", "CERES"),
-        ("incremental", "snapshot_path", Path("a b"), "snapshot_path", "a b"),
-        ("global", "max_num_l1_iterations", "7",
-         "mapper.rotation_averaging.max_num_l1_iterations", 7),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("mapper", "key", "value", "full_key", "resolved"), [
+    ("incremental", "mapper.init_max_error", "3", "mapper.init_max_error", 3.0),
+    ("incremental", "mapper.num_threads", 4, "mapper.num_threads", 4),
+    ("incremental", "ba_refine_principal_point", "True", "ba_refine_principal_point", True),
+    ("incremental", "ba_local_backend", "ceres", "ba_local_backend", "CERES"),
+    ("incremental", "snapshot_path", Path("a b"), "snapshot_path", "a b"),
+    ("global", "max_num_l1_iterations", "7",
+     "mapper.rotation_averaging.max_num_l1_iterations", 7),
+])  # fmt: skip
 def test_option_is_converted_to_pycolmaps_type_and_taken_by_pycolmap(
     mapper: str, key: str, value: object, full_key: str, resolved: object
 ) -> None:
@@ -46,21 +43,18 @@ def test_option_is_converted_to_pycolmaps_type_and_taken_by_pycolmap(
     assert taken == resolved
 
 
-@pytest.mark.parametrize(
-    ("mapper", "key", "value", "message"),
-    [
-        ("incremental", "init_max_eror", "3", "did you mean 'init_max_error'"),
-        ("global", "gpu_index", "0", "several sections; give mapper.global_positioning.gpu_index"),
-        ("incremental", "min_model_size", "2.5", "min_model_size=2.5: expected int"),
-        ("incremental", "min_model_size", "9" * 11, ": expected int"),
-        ("incremental", "init_max_error", "nan", "=nan: expected float"),
-        ("incremental", "multiple_models", "maybe", "expected one of true, false"),
-        ("incremental", "ba_local_backend", "GPU", "expected one of CERES, CASPAR"),
-        ("global", "gravity_dir", "1", "of type ndarray"),
-        ("incremental", "image_path", "x", "it is the one that extract was given"),
-        ("global", "mapper.retriangulation.random_seed", "1", "use --random-seed"),
-    ],
-)
+@pytest.mark.parametrize(("mapper", "key", "value", "message"), [
+    ("incremental", "init_max_eror", "3", "did you mean 'init_max_error'"),
+    ("global", "gpu_index", "0", "several sections; give mapper.global_positioning.gpu_index"),
+    ("incremental", "min_model_size", "2.5", "min_model_size=2.5: expected int"),
+    ("incremental", "min_model_size", "9" * 11, ": expected int"),
+    ("incremental", "init_max_error", "nan", "=nan: expected float"),
+    ("incremental", "multiple_models", "maybe", "expected one of true, false"),
+    ("incremental", "ba_local_backend", "GPU", "expected one of CERES, CASPAR"),
+    ("global", "gravity_dir", "1", "of type ndarray"),
+    ("incremental", "image_path", "x", "it is the one that extract was given"),
+    ("global", "mapper.retriangulation.random_seed", "1", "use --random-seed"),
+])  # fmt: skip
 def test_option_that_pycolmap_does_not_take_is_one_clear_line(
     mapper: str, key: str, value: object, message: str
 ) -> None:

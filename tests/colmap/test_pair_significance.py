@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mapping_tasks import write_images
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
@@ -20,6 +21,10 @@ from colmap_affrect.colmap.verification import (
     verify,
 )
 from colmap_affrect.geometry.affine import project, rotation, transform_frames
+
+Array = NDArray[np.float64]
+Frames = tuple[Array, Array]
+"""(N, 2, 3) local affine frames of both images."""
 
 SIZE = (640, 480)
 K = np.array([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
@@ -42,9 +47,7 @@ def plane_homography(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     return K @ (motion - np.outer((-1.2, 0.3, 0.2), normal)) @ np.linalg.inv(K)
 
 
-def frames_of(
-    homographies: list[NDArray[np.float64]], num: int, seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def frames_of(homographies: list[Array], num: int, seed: int) -> Frames:
     """Frames of image 1 at random, and those of image 2 that truly belong to them."""
     rng = np.random.default_rng(seed)
     lafs = np.zeros((num, 2, 3))
@@ -66,9 +69,7 @@ def rows(lafs: NDArray[np.float64], columns: int = 6) -> NDArray[np.float32]:
     return np.concatenate([lafs[:, :, 2], shapes[:, : columns - 2]], axis=1).astype(np.float32)
 
 
-def weak_pair(
-    *, frames_agree: bool, planar: bool = False
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def weak_pair(*, frames_agree: bool, planar: bool = False) -> Frames:
     """28 right matches among 130; their positions alone are too few."""
     normals = [(0.05, 0.02, 0.2)] if planar else [(0.05, 0.02, 0.2), (-0.1, 0.1, 0.3)]
     homographies = [HOMOGRAPHY] if planar else [plane_homography(np.array(n)) for n in normals]
@@ -81,9 +82,7 @@ def weak_pair(
     return np.concatenate([first, other1]), np.concatenate([second, other2])
 
 
-def num_inliers(
-    frames: tuple[NDArray[np.float64], NDArray[np.float64]], columns: int = 6, **options: float
-) -> int:
+def num_inliers(frames: Frames, columns: int = 6, **options: float) -> int:
     sides = tuple(Side(camera(i), rows(lafs, columns)) for i, lafs in enumerate(frames, 1))
     matches = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
     geometry = estimate_geometry(sides, matches, VerificationOptions(**options))
@@ -153,10 +152,8 @@ def write_pairs(path: Path) -> None:
     """Write images 1 to 4: a right pair (1, 2) and a wrong one (3, 4)."""
     pairs = [weak_pair(frames_agree=agree) for agree in (True, False)]
     with open_database(path) as database:
-        database.write_camera(camera(1), use_camera_id=True)
+        write_images(database, camera(1), "1234")
         for image_id, lafs in enumerate((*pairs[0], *pairs[1]), 1):
-            image = pycolmap.Image(name=f"{image_id}.png", image_id=image_id, camera_id=1)
-            database.write_image(image, use_image_id=True)
             database.write_keypoints(image_id, rows(lafs))
         same = np.stack([np.arange(len(pairs[0][0]))] * 2, axis=1)
         for pair in ((1, 2), (3, 4)):

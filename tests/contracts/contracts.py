@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from synthetic import texture
+from synthetic import texture, unit_rows
 
 from colmap_affrect.data import (
     GrayImage,
@@ -112,8 +112,7 @@ class ExtractorContract(Contract):
 def image_of(things: np.ndarray, seed: int) -> ImageFeatures:
     """Features that show some things, their descriptors a bit otherwise in every image."""
     random = np.random.default_rng(seed)
-    rows = things + 0.02 * random.random(things.shape)
-    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    rows = unit_rows(things + 0.02 * random.random(things.shape))
     count = len(things)
     centers = random.uniform((10.0, 20.0), (400.0, 280.0), (count, 2))
     lafs = lafs_from_keypoints(centers, random.uniform(3, 9, count), np.zeros(count))

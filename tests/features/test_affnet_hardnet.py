@@ -10,10 +10,10 @@ import torch
 from kornia import feature
 from numpy.testing import assert_allclose
 from random_weights import write_random_weights
-from synthetic import texture
+from synthetic import circles, texture
 from torch import nn
 
-from colmap_affrect.data import GrayImage, LocalFeatures
+from colmap_affrect.data import GrayImage
 from colmap_affrect.features.affnet_hardnet import (
     MAX_TILT,
     PATCH_SIGMAS,
@@ -21,7 +21,7 @@ from colmap_affrect.features.affnet_hardnet import (
     AffNetHardNetOptions,
 )
 from colmap_affrect.features.base import NetworkContext
-from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation
+from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 
@@ -49,29 +49,13 @@ def image() -> GrayImage:
     return texture((210, 140), seed=7)
 
 
-def circles(centers: object, sigmas_px: object) -> LocalFeatures:
-    """Upright features as a detector returns them."""
-    points, sigmas = np.asarray(centers, float), np.asarray(sigmas_px, float)
-    lafs = lafs_from_keypoints(points, MEASUREMENT_SIGMAS * sigmas, np.zeros(len(points)))
-    responses = np.linspace(1.0, 0.5, len(points), dtype=np.float32)
-    ids = np.arange(len(points), dtype=np.int32)
-    return LocalFeatures(lafs, responses, np.zeros((len(points), 0), np.float32), ids)
-
-
-def describe_one(
-    profile: AffNetHardNet, image: GrayImage, features: LocalFeatures
-) -> LocalFeatures:
-    (described,) = profile.describe([image], [features])
-    return described
-
-
 # Frames and patches.
 
 
 def test_describe_computes_what_kornia_does(weights: dict[str, Path], image: GrayImage) -> None:
     detected = circles([[60.2, 50.9], [151.3, 77.0], [90.0, 90.0]], [1.5, 2.2, 4.0])
     profile = make(weights)
-    described = describe_one(profile, image, detected)
+    (described,) = profile.describe([image], [detected])
 
     def reference(network: nn.Module, name: str) -> nn.Module:
         network.load_state_dict(torch.load(weights[name], weights_only=True)["state_dict"])
@@ -114,23 +98,20 @@ def test_orientation_points_along_the_gradient_of_a_turned_pattern(
     profile = make(weights)
     profile.affnet = lambda patches: torch.zeros(len(patches), 3)
     profile.orinet = feature.PatchDominantGradientOrientation(32)
-    described = describe_one(profile, edge, circles([[62.0, 48.0]], [2.5]))
+    (described,) = profile.describe([edge], [circles([[62.0, 48.0]], [2.5])])
     first = described.lafs[0, :, 0] / described.scales[0]
     assert_allclose(first @ direction, 1.0, atol=1.0 - np.cos(np.deg2rad(ANGLE_DEG)))
     # A rotation: the second column is a quarter turn on, x towards y.
     assert_allclose(described.lafs[0, :, 1], rotation(np.pi / 2) @ described.lafs[0, :, 0])
 
 
-@pytest.mark.parametrize(
-    ("outputs", "kept"),
-    [
-        ([-1.0, 0.2, 0.1], False),
-        ([0.1, 0.2, -1.0], False),
-        ([np.nan, 0.0, 0.0], False),
-        ([1.0, 0.0, 2.0 / (MAX_TILT + 1.0) - 1.0], False),
-        ([1.0, 0.0, 2.0 / (MAX_TILT - 1.0) - 1.0], True),
-    ],
-)
+@pytest.mark.parametrize(("outputs", "kept"), [
+    ([-1.0, 0.2, 0.1], False),
+    ([0.1, 0.2, -1.0], False),
+    ([np.nan, 0.0, 0.0], False),
+    ([1.0, 0.0, 2.0 / (MAX_TILT + 1.0) - 1.0], False),
+    ([1.0, 0.0, 2.0 / (MAX_TILT - 1.0) - 1.0], True),
+])  # fmt: skip
 def test_describe_leaves_out_degenerate_shapes(
     weights: dict[str, Path], image: GrayImage, outputs: list[float], kept: bool
 ) -> None:
@@ -143,6 +124,6 @@ def test_describe_leaves_out_degenerate_shapes(
 
     profile.affnet = every_second_is_bad
     detected = circles([[60.0, 50.0], [70.0, 60.0], [80.0, 70.0]], [2.0, 2.0, 2.0])
-    described = describe_one(profile, image, detected)
+    (described,) = profile.describe([image], [detected])
     assert described.rectification_ids.tolist() == ([0, 1, 2] if kept else [0, 2])
     assert_allclose(described.keypoints, detected.keypoints[described.rectification_ids])

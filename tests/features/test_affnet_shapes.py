@@ -13,7 +13,7 @@ from kornia.feature import LAFAffNetShapeEstimator
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import Array
-from synthetic import texture
+from synthetic import circles, texture
 from torch import nn
 
 from colmap_affrect.data import GrayImage, LocalFeatures
@@ -211,15 +211,6 @@ def test_textured_blocks_are_those_whose_surroundings_deviate() -> None:
     assert grid.textured[:, :40].all()
     assert not grid.textured[:, 44:].any()
     assert np.isfinite(grid.metrics).all()
-
-
-def circles(centers: list[tuple[float, float]], sigmas: list[float]) -> LocalFeatures:
-    """Keypoints in order of falling response."""
-    lafs = np.zeros((len(centers), 2, 3))
-    lafs[:, :, :2] = 6.0 * np.array(sigmas)[:, None, None] * np.eye(2)
-    lafs[:, :, 2] = np.reshape(centers, (-1, 2))
-    responses = np.linspace(1.0, 0.5, len(centers), dtype=np.float32)
-    return LocalFeatures(lafs, responses, np.zeros((len(centers), 0), np.float32))
 
 
 WINDOW_SIGMA = 16.0 / 12.0

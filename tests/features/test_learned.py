@@ -21,6 +21,7 @@ COURTYARD = Path(__file__).resolve().parents[2] / "sample_scenes" / "courtyard"
 SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
 
 ALL = 1_000_000
+KEY = "aliked-n16"
 
 MOST_OFFSET_PX = 0.45
 """By what the photographs show; half a pixel too much or too little is more."""
@@ -29,13 +30,9 @@ SAME_DESCRIPTOR = 1e-3
 """Sums in another order, where kornia's layout in memory is another."""
 
 
-def options_of(key: str) -> dict[str, object]:
-    name, _, model = key.partition("-")
-    return {"name": name, **({"model": model} if model else {})}
-
-
-def make(options: dict[str, object], weights: dict[str, Path]) -> Aliked:
-    return EXTRACTORS.make(EXTRACTORS.options(options), NetworkContext(weights))
+def make(weights: dict[str, Path], **options: object) -> Aliked:
+    given = {"name": "aliked", "model": "n16", **options}
+    return EXTRACTORS.make(EXTRACTORS.options(given), NetworkContext(weights))
 
 
 @pytest.fixture(scope="module")
@@ -51,55 +48,46 @@ def photograph() -> np.ndarray:
 
 
 @pytest.fixture
-def published(key: str) -> dict[str, Path]:
+def published() -> dict[str, Path]:
     folder = SHARED_WEIGHTS if SHARED_WEIGHTS.is_dir() else None
-    path = find(key, folder)
+    path = find(KEY, folder)
     if path is None:
-        pytest.skip(f"{WEIGHT_FILES[key].file_name} is not here: see colmap-affrect weights")
-    return {key: path}
+        pytest.skip(f"{WEIGHT_FILES[KEY].file_name} is not here: see colmap-affrect weights")
+    return {KEY: path}
 
 
-def by_kornia(key: str, path: Path, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def by_kornia(path: Path, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points and descriptors as kornia's own classes compute them."""
     pixels = torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32))[None] / 255
     state = torch.load(path, map_location="cpu", weights_only=True)
     state = state.get("state_dict", state)
     with torch.inference_mode():
-        network = feature.ALIKED(key).eval()
+        network = feature.ALIKED(KEY).eval()
         network.load_state_dict(state, strict=False)
         found = network(pixels)[0]
     return found.keypoints.numpy(), found.descriptors.numpy()
 
 
-def assert_as_kornia(
-    key: str, weights: dict[str, Path], image: np.ndarray, tolerance_px: float
-) -> None:
-    """Compare up to rounding, which may decide whether a pixel is a maximum."""
-    options = {**options_of(key), "max_num_features": ALL}
-    features = make(options, weights).detect((image, None))
-    points, descriptors = by_kornia(key, weights[key], image)
+def test_features_are_those_of_kornia(weights, photograph) -> None:
+    """Up to rounding, which may decide whether a pixel is a maximum."""
+    image = photograph[:150, :221]
+    features = make(weights, max_num_features=ALL).detect((image, None))
+    points, descriptors = by_kornia(weights[KEY], image)
     assert len(features) > 100
     assert abs(len(features) - len(points)) <= 0.01 * len(points)
     shift = np.linalg.norm(features.keypoints[:, None] - points[None], axis=2)
     same = features.descriptors @ descriptors.T
     nearest = np.where(shift < 2, same, -1.0).argmax(axis=1)
     offsets = features.keypoints - points[nearest]
-    as_kornia = np.abs(offsets - np.median(offsets, axis=0)).max(axis=1) < tolerance_px
+    as_kornia = np.abs(offsets - np.median(offsets, axis=0)).max(axis=1) < 0.01
     as_kornia &= np.abs(features.descriptors - descriptors[nearest]).max(axis=1) < SAME_DESCRIPTOR
     assert as_kornia.mean() > 0.99
 
 
-@pytest.mark.parametrize("key", ["aliked-n16"])
-def test_features_are_those_of_kornia(key, weights, photograph) -> None:
-    part = photograph[:150, :221]
-    assert_as_kornia(key, weights, part, 0.01)
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("key", ["aliked-n16"])
-def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> None:
+def test_points_are_where_they_are_in_a_shrunk_photograph(published) -> None:
     """A constant offset in px of the view is another place in the photograph when it is shrunk."""
-    extractor = make(options_of(key), published)
+    extractor = make(published)
     offsets = []
     for path in sorted((COURTYARD / "images").iterdir())[:3]:
         image = np.ascontiguousarray(cv2.imread(str(path))[:480, :640, ::-1])
@@ -116,14 +104,12 @@ def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> Non
     assert np.linalg.norm(np.concatenate(offsets).mean(axis=0)) < MOST_OFFSET_PX
 
 
-@pytest.mark.parametrize("key", ["aliked-n16"])
-def test_mask_chooses_among_what_is_found_without_it(key, weights, photograph) -> None:
+def test_mask_chooses_among_what_is_found_without_it(weights, photograph) -> None:
     part = photograph[:150, :221]
     mask = np.zeros(part.shape[:2], np.uint8)
     mask[:, 60:] = 255
-    options = {**options_of(key), "score_threshold": 0.001}
-    whole = make({**options, "max_num_features": ALL}, weights).detect((part, None))
-    few = make({**options, "max_num_features": 30}, weights).detect((part, mask))
+    whole = make(weights, score_threshold=0.001, max_num_features=ALL).detect((part, None))
+    few = make(weights, score_threshold=0.001, max_num_features=30).detect((part, mask))
     inside = whole.select(np.rint(whole.keypoints[:, 0]) >= 60)
     assert len(inside) < len(whole)
     assert_array_equal(few.keypoints, inside.keypoints[:30])
@@ -134,10 +120,10 @@ def test_mask_chooses_among_what_is_found_without_it(key, weights, photograph) -
 
 def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:
     broken = tmp_path / "broken"
-    broken.write_bytes(weights["aliked-n16"].read_bytes()[:4000])
-    for key, path, message in (
-        ("aliked-n16", weights["hardnet"], "not the weights of aliked-n16"),
-        ("aliked-n16", broken, "broken: "),
+    broken.write_bytes(weights[KEY].read_bytes()[:4000])
+    for path, message in (
+        (weights["hardnet"], "not the weights of aliked-n16"),
+        (broken, "broken: "),
     ):
         with pytest.raises(AffrectError, match=message):
-            make(options_of(key), {key: path})
+            make({KEY: path})

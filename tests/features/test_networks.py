@@ -106,14 +106,11 @@ def test_loaders_refuse_the_file_of_another_network(folder: Path) -> None:
         load_descriptor("hardnet", folder / "hardtfeat.pth", "cpu")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"features.0.weight": None}, r"Missing key.* \"features\.0\.weight\""),
-        ({"surplus": torch.zeros(2)}, r"Unexpected key.* \"surplus\""),
-        ({"features.0.weight": torch.zeros(16, 1, 3, 4)}, r"size mismatch for features\.0\.weight"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"features.0.weight": None}, r"Missing key.* \"features\.0\.weight\""),
+    ({"surplus": torch.zeros(2)}, r"Unexpected key.* \"surplus\""),
+    ({"features.0.weight": torch.zeros(16, 1, 3, 4)}, r"size mismatch for features\.0\.weight"),
+])  # fmt: skip
 def test_load_affnet_refuses_a_file_that_differs_in_one_place(
     folder: Path, tmp_path: Path, change: dict[str, object], message: str
 ) -> None:

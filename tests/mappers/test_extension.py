@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.mappers import incremental, mapping, snapshots
 from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
+from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
 
 NUM_IMAGES, NUM_OLD = 10, 5
@@ -86,9 +87,11 @@ def cameras(model: pycolmap.Reconstruction) -> dict[str, list[float]]:
 
 
 def extended(
-    database: Path, existing: ExistingModel, folder: Path
+    database: Path, old: pycolmap.Reconstruction, folder: Path, at: str = "old", **options: bool
 ) -> tuple[pycolmap.Reconstruction, list[int]]:
+    """Write a model into a folder and extend it; return the result and what progress showed."""
     shown: list[int] = []
+    existing = read_existing(Extension(written(old, folder / at), **options), database)
     task = MappingTask(database, None, extend=existing)
     (model,) = map_database(mapper_of("incremental"), task, folder / "sparse", shown.append)
     assert len(model.registered_names) == NUM_IMAGES
@@ -99,9 +102,7 @@ def extended(
 def test_old_poses_and_cameras_stay_to_the_bit(
     database: Path, old: pycolmap.Reconstruction, tmp_path: Path, pixels: float
 ) -> None:
-    path = written(with_other_ids(old, pixels), tmp_path / "old")
-    existing = read_existing(Extension(path), database)
-    model, shown = extended(database, existing, tmp_path)
+    model, shown = extended(database, with_other_ids(old, pixels), tmp_path)
     assert shown == [NUM_OLD, *[1] * (NUM_IMAGES - NUM_OLD)]
     now, before = poses(model), poses(old)
     for name, pose in before.items():
@@ -114,14 +115,10 @@ def test_old_poses_and_cameras_stay_to_the_bit(
 def test_the_model_that_is_extended_stays_until_all_is_judged(
     database: Path, old: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
     (tmp_path / "sparse").mkdir()
-    existing = read_existing(Extension(written(old, tmp_path / "sparse" / "0")), database)
-    monkeypatch.setattr(mapping, "judge", stop)
+    monkeypatch.setattr(mapping, "judge", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        extended(database, existing, tmp_path)
+        extended(database, old, tmp_path, "sparse/0")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]
     assert poses(pycolmap.Reconstruction(tmp_path / "sparse" / "0")).keys() == poses(old).keys()
 
@@ -129,8 +126,7 @@ def test_the_model_that_is_extended_stays_until_all_is_judged(
 def test_old_poses_may_move_and_stay_in_their_frame(
     database: Path, old: pycolmap.Reconstruction, tmp_path: Path
 ) -> None:
-    path = written(old, tmp_path / "old")
-    model, _ = extended(database, read_existing(Extension(path, True), database), tmp_path)
+    model, _ = extended(database, old, tmp_path, refine_existing=True)
     moved = [np.abs(poses(model)[name] - pose).max() for name, pose in poses(old).items()]
     assert 1e-6 < max(moved) < 0.3  # the cameras are some 20 units apart, 50 from the origin
     assert cameras(model) != {**cameras(model), **cameras(old)}
@@ -142,8 +138,7 @@ def test_new_images_are_where_they_were_taken(
 ) -> None:
     old = pycolmap.Reconstruction(old)
     old.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
-    path = written(old, tmp_path / "old")
-    model, _ = extended(database, read_existing(Extension(path), database), tmp_path)
+    model, _ = extended(database, old, tmp_path)
     native = mapper_of("incremental").native(NOTHING_KNOWN, SEED)
     native.extract_colors = False
     (tmp_path / "all").mkdir()
@@ -170,8 +165,7 @@ def test_images_without_matches_stay_in_the_model(
         for other in set(ids.values()) - {ids[lonely]}:
             opened.delete_matches(ids[lonely], other)
             opened.delete_two_view_geometry(ids[lonely], other)
-    existing = read_existing(Extension(written(with_other_ids(old, 0.3), tmp_path / "old")), path)
-    model, _ = extended(path, existing, tmp_path)
+    model, _ = extended(path, with_other_ids(old, 0.3), tmp_path)
     assert poses(model)[lonely].tobytes() == poses(old)[lonely].tobytes()
 
 
@@ -198,8 +192,7 @@ def test_cameras_may_have_another_model_than_in_the_database(
         f, cx, cy, k = camera.params
         camera.model, camera.params = pycolmap.CameraModelId.RADIAL, [f, cx, cy, k, 0.0]
     before = database_cameras(database)
-    existing = read_existing(Extension(written(other, tmp_path / "old")), database)
-    model, _ = extended(database, existing, tmp_path)
+    model, _ = extended(database, other, tmp_path)
     for name, pose in poses(old).items():
         assert poses(model)[name].tobytes() == pose.tobytes()
         assert cameras(model)[name] == cameras(other)[name]
@@ -223,16 +216,13 @@ def broken(old: pycolmap.Reconstruction, kind: str, folder: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("name", "1 of its 5 images, such as unknown.png, are not among the photographs"),
-        ("size", r"is \d+ x \d+ px there and \d+ x \d+ px here"),
-        ("camera", "have different cameras there and share one here"),
-        ("empty", "has no images with poses"),
-        ("damaged", r"damaged \(it ends within a record"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "message"), [
+    ("name", "1 of its 5 images, such as unknown.png, are not among the photographs"),
+    ("size", r"is \d+ x \d+ px there and \d+ x \d+ px here"),
+    ("camera", "have different cameras there and share one here"),
+    ("empty", "has no images with poses"),
+    ("damaged", r"damaged \(it ends within a record"),
+])  # fmt: skip
 def test_model_that_does_not_fit_is_one_clear_line(
     database: Path, old: pycolmap.Reconstruction, tmp_path: Path, kind: str, message: str
 ) -> None:

@@ -12,11 +12,11 @@ from mapping_tasks import (
     synthesize,
     task_with_given_cameras,
 )
-from small_scene import INTRINSICS, NAMES, write_photographs
+from small_scene import NAMES, write_photographs
+from verified import verified
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
@@ -25,13 +25,8 @@ from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import map_and_report
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.context import Context, Inputs
-from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.match import match
-from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import verify_matches
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -98,15 +93,8 @@ def two_places(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     photos = tmp_path_factory.mktemp("photos")
     write_photographs(photos / "here", 2)
     write_photographs(photos / "there", 3, first_seed=10)
-    cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
-    workspace = Workspace(tmp_path_factory.mktemp("places") / "out")
-    context = Context(workspace)
-    with workspace.locked():
-        extract(context, Inputs.of(photos, cameras=cameras), load_recipe("unrectified-rootsift"))
-        choose_pairs(context)
-        match(context)
-        verify_matches(context)
-        guide(context, GuidedOptions(enabled="never"))
+    workspace = verified(photos, tmp_path_factory.mktemp("places") / "out")
+    guide(Context(workspace), GuidedOptions(enabled="never"))
     return workspace
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_tasks import synthesize
+from mapping_tasks import synthesize, write_images
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
@@ -156,13 +156,14 @@ def ring(folder: Path, views_per_point: int) -> tuple[MappedModel, MappingTask]:
     camera = pycolmap.Camera(
         camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=[1500, 320, 240, 0]
     )
+    record = CameraRecord(tuple(f"{number}.jpg" for number in range(NUM_IMAGES)), "guess", 1500.0)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
     places = random.uniform(-0.7, 0.7, (600, 3))
     first = random.integers(0, NUM_IMAGES - views_per_point + 1, len(places))
     tracks = [pycolmap.Track() for _ in places]
     with open_database(folder / "database.db") as database:
-        database.write_camera(camera, use_camera_id=True)
+        write_images(database, camera, record.names)
         for number in range(NUM_IMAGES):
             turn = pycolmap.Rotation3d(np.array([0.0, np.deg2rad(STEP_DEG * number), 0.0]))
             pose = pycolmap.Rigid3d(turn, np.array([0.0, 0.0, DISTANCE]))
@@ -171,12 +172,10 @@ def ring(folder: Path, views_per_point: int) -> tuple[MappedModel, MappingTask]:
             pixels += random.normal(0.0, NOISE_PX, pixels.shape)
             image = pycolmap.Image(f"{number}.jpg", pixels, camera_id=1, image_id=number + 1)
             model.add_image_with_trivial_frame(image, pose)
-            database.write_image(image, use_image_id=True)
             for index, row in enumerate(rows):
                 tracks[row].add_element(number + 1, index)
     for place, track in zip(places, tracks, strict=True):
         model.add_point3D(place, track)
-    record = CameraRecord(tuple(f"{number}.jpg" for number in range(NUM_IMAGES)), "guess", 1500.0)
     return MappedModel(model), MappingTask(folder / "database.db", None, cameras={1: record})
 
 

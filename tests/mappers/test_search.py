@@ -72,15 +72,12 @@ def adjuster(
     return Adjuster(priors, noise_px, pycolmap.BundleAdjustmentOptions())
 
 
-@pytest.mark.parametrize(
-    ("record", "focal_px", "sigma"),
-    [
-        (WHOLE, TRUE_FOCAL, 0.0),
-        (replace(UNKNOWN, source="exif"), TRUE_FOCAL, EXIF_SIGMA),
-        (UNKNOWN, USUAL_FOCAL * SIZE[0], USUAL_SIGMA),
-        (None, USUAL_FOCAL * SIZE[0], USUAL_SIGMA),
-    ],
-)
+@pytest.mark.parametrize(("record", "focal_px", "sigma"), [
+    (WHOLE, TRUE_FOCAL, 0.0),
+    (replace(UNKNOWN, source="exif"), TRUE_FOCAL, EXIF_SIGMA),
+    (UNKNOWN, USUAL_FOCAL * SIZE[0], USUAL_SIGMA),
+    (None, USUAL_FOCAL * SIZE[0], USUAL_SIGMA),
+])  # fmt: skip
 def test_what_is_known_of_a_focal_length(
     record: CameraRecord | None, focal_px: float, sigma: float
 ) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_tasks import task_with_given_cameras
+from mapping_tasks import task_with_given_cameras, write_images
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
@@ -66,20 +66,11 @@ def write_scene(path: Path, poses: Poses, pairs: Iterable[tuple[int, int]]) -> N
         rows = np.arange(inside.sum())
         matches[first, second] = np.stack([starts[0] + rows, starts[1] + rows], axis=1)
     with closing(pycolmap.Database.open(path)) as database:
-        camera = pycolmap.Camera(
-            model="PINHOLE", width=WIDTH, height=HEIGHT, params=MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]]
-        )
-        camera.camera_id = database.write_camera(camera)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(camera.sensor_id)
-        rig_id = database.write_rig(rig)
-        for i, name in enumerate(names):
-            image = pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=i + 1)
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(rig_id=rig_id, frame_id=i + 1)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(i + 1, np.concatenate(keypoints[i]).astype(np.float32))
+        camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT)
+        camera.params = MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]]
+        write_images(database, camera, names)
+        for i, parts in keypoints.items():
+            database.write_keypoints(i + 1, np.concatenate(parts).astype(np.float32))
         for (first, second), indices in matches.items():
             database.write_matches(first + 1, second + 1, indices.astype(np.uint32))
     verify(path, VerificationOptions())
@@ -101,6 +92,14 @@ def mapped(path: Path, output_path: Path) -> list[MappedModel]:
     return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None)
 
 
+def relative_errors(
+    model: MappedModel, truth: Poses, first: str, second: str
+) -> tuple[float, float]:
+    """Errors in degrees of rotation and direction between two images."""
+    found = model_poses(model.reconstruction)
+    return pose_errors(*(relative_pose(poses[first], poses[second]) for poses in (found, truth)))
+
+
 def centers(poses: Poses) -> NDArray[np.float64]:
     return np.array([-poses[name][0].T @ poses[name][1] for name in sorted(poses)])
 
@@ -119,10 +118,7 @@ def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path
     ratios = (steps / true_steps) / (steps[0] / true_steps[0])
     np.testing.assert_allclose(ratios, 1.0, atol=MAX_SCALE_ERROR)
     for first, second in zip(sorted(truth), sorted(truth)[1:], strict=False):
-        errors = pose_errors(
-            relative_pose(found[first], found[second]), relative_pose(truth[first], truth[second])
-        )
-        assert max(errors) < 1.0
+        assert max(relative_errors(model, truth, first, second)) < 1.0
     assert len(model.bridges) == 4
     for name, bridge in model.bridges.items():
         assert bridge.by != name
@@ -156,14 +152,9 @@ def test_wrong_pair_in_a_loop_of_four_is_outvoted(tmp_path: Path) -> None:
     graph = PairGraph.read(path, 15)
     assert len(graph.pairs) == len(right_graph.pairs) + 1
     model, *_ = mapped(path, tmp_path / "models")
-    found = model_poses(model.reconstruction)
-    assert sorted(found) == sorted(truth)
-    for first, second_name in (("0.jpg", "3.jpg"), ("1.jpg", "2.jpg")):
-        errors = pose_errors(
-            relative_pose(found[first], found[second_name]),
-            relative_pose(truth[first], truth[second_name]),
-        )
-        assert max(errors) < 1.0
+    assert sorted(model_poses(model.reconstruction)) == sorted(truth)
+    for pair in (("0.jpg", "3.jpg"), ("1.jpg", "2.jpg")):
+        assert max(relative_errors(model, truth, *pair)) < 1.0
 
 
 @pytest.mark.parametrize("count", [2, 3])
@@ -175,13 +166,24 @@ def test_what_incremental_mapping_registers_is_left_as_it_is(tmp_path: Path, cou
     assert model.reconstruction.num_reg_images() == 2
 
 
-def tied(
-    path: Path, truth: Poses, marked: dict[str, int], moved: tuple[str, str] | None = None
-) -> tuple[list[MappedModel], MappingTask]:
-    """Map with tie points of the wall: of each image so many, with a noise of 2 px.
+TRIANGLE = [(0, 1), (1, 2), (0, 2)]
 
-    The mark of one point in one image, ``moved``, is 100 px off.
+
+def tied(
+    folder: Path,
+    truth: Poses,
+    pairs: Iterable[tuple[int, int]],
+    marked: dict[str, int],
+    *,
+    moved: tuple[str, str] | None = None,
+    scene: Poses | None = None,
+) -> tuple[list[MappedModel], MappingTask]:
+    """Map pairs with tie points of the wall: of each image so many, with a noise of 2 px.
+
+    The mark of one point in one image, ``moved``, is 100 px off. Features may be of another scene.
     """
+    path = folder / "database.db"
+    write_scene(path, scene or truth, pairs)
     random = np.random.default_rng(3)
     points = wall(random, 4000)
     seen = {name: project(points, truth[name]) for name in marked}
@@ -203,20 +205,12 @@ def tied(
     return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None), task
 
 
-def rotation_error_deg(model: MappedModel, truth: Poses, first: str, second: str) -> float:
-    found = model_poses(model.reconstruction)
-    pairs = [relative_pose(poses[first], poses[second]) for poses in (found, truth)]
-    return pose_errors(*pairs)[0]
-
-
 def test_lost_photograph_comes_back_by_six_points_in_two_others(tmp_path: Path) -> None:
     truth = views(4)
-    path = tmp_path / "database.db"
-    write_scene(path, truth, [(0, 1), (1, 2), (0, 2)])
-    (model,), task = tied(path, truth, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6})
+    (model,), task = tied(tmp_path, truth, TRIANGLE, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6})
     assert model.moves[-1] == BY_HAND
     assert model.reconstruction.num_reg_images() == 4
-    assert rotation_error_deg(model, truth, "0.jpg", "3.jpg") < 2.0
+    assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 2.0
     residuals = tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)
     assert len(residuals) == 18
     assert residuals[0].error_px < 10.0
@@ -225,43 +219,38 @@ def test_lost_photograph_comes_back_by_six_points_in_two_others(tmp_path: Path) 
 
 def test_a_mark_that_is_far_off_is_named_as_the_worst(tmp_path: Path) -> None:
     truth = views(4)
-    path = tmp_path / "database.db"
-    write_scene(path, truth, [(0, 1), (1, 2), (0, 2)])
     marked = {"1.jpg": 8, "2.jpg": 8, "3.jpg": 8}
-    (model,), task = tied(path, truth, marked, moved=("p5", "3.jpg"))
+    (model,), task = tied(tmp_path, truth, TRIANGLE, marked, moved=("p5", "3.jpg"))
     worst = tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)[0]
     assert (worst.point, worst.image) == ("p5", "3.jpg")
     assert worst.error_px > 50.0
-    assert rotation_error_deg(model, truth, "0.jpg", "3.jpg") < 3.0
+    assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 3.0
 
 
 def test_photograph_in_a_wrong_place_is_placed_by_its_tie_points(tmp_path: Path) -> None:
     truth = views(4)
     wrong = {**truth, "3.jpg": (turned(0, 25, 40) @ truth["3.jpg"][0], truth["3.jpg"][1])}
-    path = tmp_path / "database.db"
-    write_scene(path, wrong, [(0, 1), (1, 2), (0, 2), (2, 3)])
-    (before,) = mapped(path, tmp_path / "before")
-    assert rotation_error_deg(before, truth, "0.jpg", "3.jpg") > 20.0
-    (model,), _ = tied(path, truth, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6})
+    pairs = [*TRIANGLE, (2, 3)]
+    write_scene(tmp_path / "before.db", wrong, pairs)
+    (before,) = mapped(tmp_path / "before.db", tmp_path / "before")
+    assert relative_errors(before, truth, "0.jpg", "3.jpg")[0] > 20.0
+    (model,), _ = tied(tmp_path, truth, pairs, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6}, scene=wrong)
     assert model.reconstruction.num_reg_images() == 4
-    assert rotation_error_deg(model, truth, "0.jpg", "3.jpg") < 3.0
+    assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 3.0
 
 
 def test_two_models_are_joined_by_seven_points(tmp_path: Path) -> None:
     truth = views(6)
-    path = tmp_path / "database.db"
-    write_scene(path, truth, [(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5)])
-    models, _ = tied(path, truth, {f"{i}.jpg": 7 for i in (1, 2, 3, 4)})
+    pairs = [*TRIANGLE, (3, 4), (4, 5), (3, 5)]
+    models, _ = tied(tmp_path, truth, pairs, {f"{i}.jpg": 7 for i in (1, 2, 3, 4)})
     assert [model.reconstruction.num_reg_images() for model in models] == [6]
     for name in ("3.jpg", "5.jpg"):
-        assert rotation_error_deg(models[0], truth, "0.jpg", name) < 3.0
+        assert relative_errors(models[0], truth, "0.jpg", name)[0] < 3.0
 
 
 def test_tie_points_of_too_few_photographs_join_nothing(tmp_path: Path) -> None:
     truth = views(4)
-    path = tmp_path / "database.db"
-    write_scene(path, truth, [(0, 1), (1, 2), (0, 2)])
-    (model,), task = tied(path, truth, {"1.jpg": 3, "2.jpg": 3, "3.jpg": 3})
+    (model,), task = tied(tmp_path, truth, TRIANGLE, {"1.jpg": 3, "2.jpg": 3, "3.jpg": 3})
     assert model.reconstruction.num_reg_images() == 3
     assert len(tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)) == 6
 

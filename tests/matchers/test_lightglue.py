@@ -13,6 +13,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from random_weights import write_comparing_lightglue
 from strategies import compose_affine
+from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures, union
 from colmap_affrect.errors import AffrectError, OptionError
@@ -36,8 +37,7 @@ def features(
     """Circles of one radius at random places, with random descriptors or those of things."""
     random = np.random.default_rng(seed)
     rows = random.normal(size=(count, dimension)) if things is None else things
-    rows = rows + 0.02 * random.normal(size=rows.shape)
-    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    rows = unit_rows(rows + 0.02 * random.normal(size=rows.shape))
     centers = random.uniform((0.0, 0.0), SIZE, (count, 2))
     lafs = lafs_from_keypoints(centers, np.full(count, 12.0), np.zeros(count))
     return LocalFeatures(lafs, random.random(count).astype(np.float32) + np.float32(0.1), rows)

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
+from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
@@ -17,11 +18,6 @@ RATIO_ERROR = 2e-3
 """Ratios are roots of differences of float32 cosines near 1: sqrt(1e-7) where a distance is 0."""
 
 Features = tuple[NDArray[np.float32], NDArray[np.float64]]
-
-
-def unit_rows(rows: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Rows of unit length."""
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
 
 
 def two_views(

@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.matchers import nearest_8bit as coarse
@@ -27,10 +28,6 @@ def similarity_codes(
 ) -> NDArray[np.uint8]:
     products = codes1.astype(np.int32) @ codes2.astype(np.int32).T
     return np.clip(np.rint(unit / coarse.CODE_STEP * products), 0, 255).astype(np.uint8)
-
-
-def unit_rows(rows: NDArray[np.float64]) -> NDArray[np.float32]:
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArray, NDArray]]:

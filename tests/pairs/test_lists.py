@@ -95,17 +95,14 @@ def test_most_similar_pairs_are_asked_for_on_average_and_half_of_it_for_each() -
     assert all(second < "08" for _, second in chosen)
 
 
-@pytest.mark.parametrize(
-    ("text", "pairs"),
-    [
-        ("a.png\tb.png\n", [("a.png", "b.png")]),
-        ("a.png, b.png\n", [("a.png", "b.png")]),
-        ("\ufeff  a.png b.png  \r\n", [("a.png", "b.png")]),
-        ("# a.png b.png\n\n   \n  # more\na.png new wing/b.png\n", [("a.png", "new wing/b.png")]),
-        ("new wing/b.png new wing/a 1.png\n", [("new wing/a 1.png", "new wing/b.png")]),
-        ("a.png, č, d.png\n", [("a.png", "č, d.png")]),
-    ],
-)
+@pytest.mark.parametrize(("text", "pairs"), [
+    ("a.png\tb.png\n", [("a.png", "b.png")]),
+    ("a.png, b.png\n", [("a.png", "b.png")]),
+    ("\ufeff  a.png b.png  \r\n", [("a.png", "b.png")]),
+    ("# a.png b.png\n\n   \n  # more\na.png new wing/b.png\n", [("a.png", "new wing/b.png")]),
+    ("new wing/b.png new wing/a 1.png\n", [("new wing/a 1.png", "new wing/b.png")]),
+    ("a.png, č, d.png\n", [("a.png", "č, d.png")]),
+])  # fmt: skip
 def test_read_pairs_takes_what_others_write(pair_list: Path, text: str, pairs: list[Pair]) -> None:
     pair_list.write_bytes(text.encode())
     assert list(read_pairs(pair_list, NAMES)) == pairs
@@ -121,15 +118,12 @@ def test_read_pairs_lists_unknown_names_with_line_and_suggestion(pair_list: Path
     )
 
 
-@pytest.mark.parametrize(
-    ("content", "error", "message"),
-    [
-        (b"# nothing\n", AffrectError, "holds no pair of two different images"),
-        (b"a.png a.png\n", AffrectError, "holds no pair of two different images"),
-        (b"\xff\xfe\x00a", AffrectError, r"list of pairs\.txt: cannot be read"),
-        (None, OptionError, r"list of pairs\.txt: cannot be read"),
-    ],
-)
+@pytest.mark.parametrize(("content", "error", "message"), [
+    (b"# nothing\n", AffrectError, "holds no pair of two different images"),
+    (b"a.png a.png\n", AffrectError, "holds no pair of two different images"),
+    (b"\xff\xfe\x00a", AffrectError, r"list of pairs\.txt: cannot be read"),
+    (None, OptionError, r"list of pairs\.txt: cannot be read"),
+])  # fmt: skip
 def test_read_pairs_refuses_other_files(
     pair_list: Path, content: bytes | None, error: type[Exception], message: str
 ) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
+from synthetic import unit_rows
 
 from colmap_affrect.pairs import retrieval
 from colmap_affrect.pairs.lists import most_similar_pairs
@@ -19,11 +20,6 @@ from colmap_affrect.pairs.retrieval import (
 SIZE = 32
 
 
-def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Rows of unit length."""
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
-
-
 def images_of_places(counts: list[int], seed: int) -> tuple[list[NDArray[np.float32]], list[int]]:
     """Descriptors of so many images of each place: half of an image is what the place has."""
     random = np.random.default_rng(seed)
@@ -32,7 +28,7 @@ def images_of_places(counts: list[int], seed: int) -> tuple[list[NDArray[np.floa
         structure = random.random((200, SIZE))
         for _ in range(count):
             seen = random.choice(structure, 100, replace=False) + random.normal(0, 0.1, (100, SIZE))
-            images.append(unit(np.concatenate([seen, random.random((100, SIZE))])))
+            images.append(unit_rows(np.concatenate([seen, random.random((100, SIZE))])))
             places.append(place)
     return images, places
 
@@ -59,7 +55,7 @@ def test_images_of_one_place_find_each_other(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_vector_is_that_of_a_plain_loop() -> None:
     random = np.random.default_rng(1)
-    vocabulary, descriptors = unit(random.random((5, 8))), unit(random.random((40, 8)))
+    vocabulary, descriptors = unit_rows(random.random((5, 8))), unit_rows(random.random((40, 8)))
     words = [
         int(np.argmin([np.linalg.norm(row - word) for word in vocabulary])) for row in descriptors
     ]
@@ -79,6 +75,6 @@ def test_similarities_are_cosines_about_the_mean_however_many_at_once(
     at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retrieval, "VECTORS_AT_ONCE", at_once)
-    vectors = unit(np.random.default_rng(7).random((7, 24)) + 0.5).astype(np.float16)
-    centered = unit(vectors.astype(np.float64) - vectors.astype(np.float64).mean(axis=0))
+    vectors = unit_rows(np.random.default_rng(7).random((7, 24)) + 0.5).astype(np.float16)
+    centered = unit_rows(vectors.astype(np.float64) - vectors.astype(np.float64).mean(axis=0))
     assert_allclose(np.stack(list(similarities(vectors))), centered @ centered.T, atol=2e-3)

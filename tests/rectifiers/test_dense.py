@@ -85,23 +85,20 @@ def test_plan_dense_shapes_skips_regions_below_the_smallest_share() -> None:
     labels = np.zeros((10, 20), int)
     labels[:2, :5] = 1  # 5 % of the blocks
     grid = shape_grid([(1.0, 0.0), (4.0, 0.9)], labels)
-    kept = plan_dense_shapes(
-        grid, (80, 40), DenseShapesOptions(min_region_frac=0.04, covered_frac=1.0)
-    )
-    skipped = plan_dense_shapes(
-        grid, (80, 40), DenseShapesOptions(min_region_frac=0.06, covered_frac=1.0)
-    )
-    assert (len(kept.items), len(skipped.items)) == (1, 0)
+    counts = []
+    for share in (0.04, 0.06):
+        options = DenseShapesOptions(min_region_frac=share, covered_frac=1.0)
+        counts.append(len(plan_dense_shapes(grid, (80, 40), options).items))
+    assert counts == [1, 0]
 
 
 def test_region_in_two_places_is_one_warp_if_pieces_of_any_size_count() -> None:
     labels = np.zeros((40, 60), int)
     labels[5:12, 4:14] = labels[30:36, 45:50] = 1
     grid = shape_grid([(1.0, 0.0), (3.0, 0.7)], labels)
-    split = plan_dense_shapes(grid, (240, 160), DenseShapesOptions(covered_frac=1.0))
-    whole = plan_dense_shapes(
-        grid, (240, 160), DenseShapesOptions(covered_frac=1.0, min_part_frac=0.0)
-    )
+    options = DenseShapesOptions(covered_frac=1.0)
+    split = plan_dense_shapes(grid, (240, 160), options)
+    whole = plan_dense_shapes(grid, (240, 160), options.changed(min_part_frac=0.0))
     assert (len(split.items), {item.segment_id for item in split.items}) == (2, {0})
     assert (len(whole.items), {item.segment_id for item in whole.items}) == (1, {0})
     both = sum(image_region(item, (240, 160)) for item in split.items)

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -210,11 +211,8 @@ def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
     repaint(tmp_path / "photos" / FIRST)
     (tmp_path / "photos" / SECOND).unlink()
 
-    def killed(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(f"colmap_affrect.project.stores.{step}", killed)
+        patch.setattr(f"colmap_affrect.project.stores.{step}", Mock(side_effect=KeyboardInterrupt))
         assert stage("extract")[-1].startswith("interrupted")
     assert stage("extract")[0] == "extract: 1 done, 1 already there, 1 with a warning"
     folders = tmp_path / "out", tmp_path / "fresh"

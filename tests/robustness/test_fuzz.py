@@ -56,16 +56,13 @@ RECIPES = [(recipe_folder() / f"{name}.toml").read_bytes() for name in recipe_na
 
 
 @pytest.mark.usefixtures("capfd")  # what decoders have to say
-@pytest.mark.parametrize(
-    ("name", "read", "valid", "count"),
-    [
-        ("pairs.txt", pairs, [PAIRS.encode()], 1000),
-        ("recipe.toml", recipe, RECIPES, 600),
-        ("a.npy", depth_map, [npy(DEPTH)], 130),
-        ("a.png", depth_map, [encoded(".png", DEPTH.astype(np.uint16))], 130),
-        ("a.tif", depth_map, [encoded(".tif", DEPTH.astype(np.float32))], 130),
-    ],
-)
+@pytest.mark.parametrize(("name", "read", "valid", "count"), [
+    ("pairs.txt", pairs, [PAIRS.encode()], 1000),
+    ("recipe.toml", recipe, RECIPES, 600),
+    ("a.npy", depth_map, [npy(DEPTH)], 130),
+    ("a.png", depth_map, [encoded(".png", DEPTH.astype(np.uint16))], 130),
+    ("a.tif", depth_map, [encoded(".tif", DEPTH.astype(np.float32))], 130),
+])  # fmt: skip
 def test_damaged_files_are_taken_or_refused(
     tmp_path: Path, name: str, read: Callable[[Path], None], valid: list[bytes], count: int
 ) -> None:

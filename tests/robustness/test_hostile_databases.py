@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command import FAST, Call
 from damaged import execute
+from mapping_tasks import write_images
 from small_scene import write_photographs
 
 from colmap_affrect.colmap import pycolmap
@@ -137,10 +138,9 @@ def test_random_matches_are_rejected(
     camera.has_prior_focal_length = prior
     lafs, same = np.zeros((count, 2, 3)), np.stack([np.arange(count)] * 2, axis=1)
     with open_database(path) as database:
-        database.write_camera(camera, use_camera_id=True)
-        for image_id in range(1, 2 * num_pairs + 1):
-            image = pycolmap.Image(name=f"{image_id}.png", image_id=image_id, camera_id=1)
-            database.write_image(image, use_image_id=True)
+        image_ids = range(1, 2 * num_pairs + 1)
+        write_images(database, camera, map(str, image_ids))
+        for image_id in image_ids:
             lafs[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, count)) * rng.uniform(6, 30, 2)
             lafs[:, :, 2] = rng.uniform(0, np.subtract(CAMERA_SIZE, 1), (count, 2))
             write_keypoints(database, image_id, lafs)

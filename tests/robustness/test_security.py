@@ -92,13 +92,10 @@ def test_any_name_of_a_file_comes_through_or_is_left_out_with_a_line(
     assert not any(c in shown + ended.stdout for c in "\x1b\u202e\u200d")
 
 
-@pytest.mark.parametrize(
-    ("name", "code", "said"),
-    [
-        (b"\x1b[31m\nred", 2, "\\u001b[31m\\u000ared: no such folder"),
-        (b"\xff", 1, "which is not UTF-8; rename that file or folder"),
-    ],
-)
+@pytest.mark.parametrize(("name", "code", "said"), [
+    (b"\x1b[31m\nred", 2, "\\u001b[31m\\u000ared: no such folder"),
+    (b"\xff", 1, "which is not UTF-8; rename that file or folder"),
+])  # fmt: skip
 def test_name_of_a_folder_cannot_steer_the_terminal(
     tmp_path: Path, call: Call, name: bytes, code: int, said: str
 ) -> None:

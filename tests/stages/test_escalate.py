@@ -12,6 +12,7 @@ from command import Call
 from numpy.testing import assert_array_equal
 from PIL import Image
 from results import database_content
+from verified import copy_of, verified
 
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
@@ -22,15 +23,12 @@ from colmap_affrect.project.atomic_files import FileTransaction
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import EscalateOptions, load_recipe
+from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages import escalate as escalation
-from colmap_affrect.stages.context import Context, Inputs, Resources
+from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import Escalation
 from colmap_affrect.stages.expected_gain import weakly_connected_images
-from colmap_affrect.stages.extract import extract
-from colmap_affrect.stages.match import match
-from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import extracted_px, verify_matches
+from colmap_affrect.stages.verify import extracted_px
 
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images"
 NAMES = ["view_1_tilt00.jpg", "view_2_tilt30.jpg", "view_6_tilt75.jpg"]
@@ -48,16 +46,8 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def verified(photos: Path, output: Path, recipe: str) -> Workspace:
-    """A workspace after the stages that every recipe has."""
-    workspace = Workspace(output)
-    with workspace.locked():
-        context = Context(workspace)
-        extract(context, Inputs.of(photos, cameras=CAMERAS), load_recipe(recipe, SMALL))
-        choose_pairs(context)
-        match(context)
-        verify_matches(context)
-    return workspace
+def facade_run(photos: Path, output: Path, recipe: str) -> Workspace:
+    return verified(photos, output, recipe, SMALL, CAMERAS)
 
 
 def escalate(workspace: Workspace, options: EscalateOptions | None = None) -> StageReport:
@@ -67,25 +57,19 @@ def escalate(workspace: Workspace, options: EscalateOptions | None = None) -> St
 
 @pytest.fixture(scope="module")
 def before(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    return verified(photos, tmp_path_factory.mktemp("before"), "on-demand")
+    return facade_run(photos, tmp_path_factory.mktemp("before"), "on-demand")
 
 
 @pytest.fixture(scope="module")
 def plain(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    return verified(photos, tmp_path_factory.mktemp("plain"), "unrectified-rootsift")
+    return facade_run(photos, tmp_path_factory.mktemp("plain"), "unrectified-rootsift")
 
 
 @pytest.fixture(scope="module")
-def escalated(
-    before: Workspace, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Workspace, StageReport]:
-    workspace = copy(before, tmp_path_factory.mktemp("escalated"))
-    return workspace, escalate(workspace)
-
-
-def copy(workspace: Workspace, folder: Path) -> Workspace:
-    shutil.copytree(workspace.path, folder, dirs_exist_ok=True)
-    return Workspace(folder)
+def escalated(before: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    workspace = copy_of(before, tmp_path_factory.mktemp("escalated"))
+    assert escalate(workspace).num_done >= 1
+    return workspace
 
 
 def geometry(workspace: Workspace, pair: tuple[str, str]) -> np.ndarray:
@@ -119,10 +103,8 @@ def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path) -> 
     assert not Workspace(tmp_path).config.exists()
 
 
-def test_other_thresholds_than_before_are_refused(
-    escalated: tuple[Workspace, StageReport], tmp_path: Path
-) -> None:
-    workspace = copy(escalated[0], tmp_path)
+def test_other_thresholds_than_before_are_refused(escalated: Workspace, tmp_path: Path) -> None:
+    workspace = copy_of(escalated, tmp_path)
     before = workspace.config.read_bytes()
     with pytest.raises(StoreError, match="with strong_num_inliers=100, and it is 5 now"):
         escalate(workspace, EscalateOptions(strong_num_inliers=5))
@@ -130,9 +112,9 @@ def test_other_thresholds_than_before_are_refused(
 
 
 def test_device_that_is_not_there_discards_nothing(
-    escalated: tuple[Workspace, StageReport], tmp_path: Path, call: Call
+    escalated: Workspace, tmp_path: Path, call: Call
 ) -> None:
-    workspace = copy(escalated[0], tmp_path)
+    workspace = copy_of(escalated, tmp_path)
     before = database_content(workspace.database)
     ended = call("match", "--output-path", tmp_path, "--device", "cuda:99", "--overwrite")
     assert (ended.code, len(ended.errors)) == (1, 1)
@@ -152,27 +134,24 @@ def test_first_level_is_the_unrectified_recipe(before: Workspace, plain: Workspa
     assert len(geometry(before, HARD)) < VerificationOptions().min_num_inliers
 
 
-def test_hard_pair_escalates_and_succeeds(escalated: tuple[Workspace, StageReport]) -> None:
-    workspace, report = escalated
-    assert len(geometry(workspace, HARD)) >= VerificationOptions().min_num_inliers
-    store = MatchStore(workspace.matches)
+def test_hard_pair_escalates_and_succeeds(escalated: Workspace) -> None:
+    assert len(geometry(escalated, HARD)) >= VerificationOptions().min_num_inliers
+    store = MatchStore(escalated.matches)
     level = store.levels([HARD])[HARD]
     assert store.levels([HARD], "tried")[HARD].bit_length() - 1 == level > 0
-    assert report.num_done >= 1
 
 
 def test_trial_of_a_pair_is_what_the_database_then_holds(
-    escalated: tuple[Workspace, StageReport],
+    escalated: Workspace,
 ) -> None:
-    workspace = escalated[0]
-    size_px = Context(workspace).extraction.max_image_size_px
-    verifier = PairVerifier(workspace.database, VerificationOptions(), size_px)
-    store = FeatureStore(workspace.features)
+    size_px = Context(escalated).extraction.max_image_size_px
+    verifier = PairVerifier(escalated.database, VerificationOptions(), size_px)
+    store = FeatureStore(escalated.features)
     for pair in (EASY, HARD, HARD[::-1]):
         frames = [store.read_frames(name) for name in pair]
-        indices = matches(workspace, pair).astype(np.int64)
+        indices = matches(escalated, pair).astype(np.int64)
         count = len(verifier.inliers(pair, tuple(frames), indices))
-        assert count == len(geometry(workspace, pair))
+        assert count == len(geometry(escalated, pair))
 
 
 OTHER_FEATURES = """
@@ -197,7 +176,7 @@ def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: 
     """The first of them looks at the photographs again; others add warps to what it found."""
     recipe = tmp_path / "recipe.toml"
     recipe.write_text(OTHER_FEATURES)
-    workspace = verified(photos, tmp_path / "out", str(recipe))
+    workspace = facade_run(photos, tmp_path / "out", str(recipe))
     escalate(workspace)
     features, store = FeatureStore(workspace.features), MatchStore(workspace.matches)
     ids, tried = image_ids(workspace.database), store.levels([EASY, HARD], "tried")
@@ -228,29 +207,26 @@ def numbered(*rows: tuple[int, int]) -> np.ndarray:
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
-@pytest.mark.parametrize(
-    ("matches", "tracks"),
-    [
-        # Features 5 and 6 of b lead from a to c; feature 7 of b does not.
-        (
-            {("a", "b"): numbered((1, 5), (2, 6), (3, 7)), ("b", "c"): numbered((5, 8), (6, 9))},
-            {"a": 2, "b": 2, "c": 2},
-        ),
-        # The same numbers in another image are other features.
-        (
-            {("a", "b"): numbered((1, 5), (2, 6)), ("b", "c"): numbered((1, 5), (2, 6))},
-            {"a": 0, "b": 0, "c": 0},
-        ),
-        # d is matched with a feature of c that leads on, by one of its two matches.
-        (
-            {("c", "a"): numbered((4, 1), (5, 2)), ("c", "d"): numbered((6, 2), (4, 3))},
-            {"a": 1, "c": 1, "d": 1},
-        ),
-        ({("a", "b"): numbered((1, 1), (2, 2), (3, 3))}, {"a": 0, "b": 0}),
-        ({("b", "a"): numbered()}, {"a": 0, "b": 0}),
-        ({}, {}),
-    ],
-)
+@pytest.mark.parametrize(("matches", "tracks"), [
+    # Features 5 and 6 of b lead from a to c; feature 7 of b does not.
+    (
+        {("a", "b"): numbered((1, 5), (2, 6), (3, 7)), ("b", "c"): numbered((5, 8), (6, 9))},
+        {"a": 2, "b": 2, "c": 2},
+    ),
+    # The same numbers in another image are other features.
+    (
+        {("a", "b"): numbered((1, 5), (2, 6)), ("b", "c"): numbered((1, 5), (2, 6))},
+        {"a": 0, "b": 0, "c": 0},
+    ),
+    # d is matched with a feature of c that leads on, by one of its two matches.
+    (
+        {("c", "a"): numbered((4, 1), (5, 2)), ("c", "d"): numbered((6, 2), (4, 3))},
+        {"a": 1, "c": 1, "d": 1},
+    ),
+    ({("a", "b"): numbered((1, 1), (2, 2), (3, 3))}, {"a": 0, "b": 0}),
+    ({("b", "a"): numbered()}, {"a": 0, "b": 0}),
+    ({}, {}),
+])  # fmt: skip
 def test_images_with_few_features_in_tracks_of_three_are_weakly_connected(matches, tracks) -> None:
     for limit in range(4):
         expected = {name for name, count in tracks.items() if count < limit}
@@ -274,7 +250,7 @@ def test_strong_pairs_without_a_track_of_three_escalate(
 def test_each_escalate_has_a_bar_of_its_own_that_ends_full(
     before: Workspace, tmp_path: Path
 ) -> None:
-    workspace, shown = copy(before, tmp_path), io.StringIO()
+    workspace, shown = copy_of(before, tmp_path), io.StringIO()
     with workspace.locked():
         escalation.escalate(Context(workspace, progress=Progress(shown)))
     lines = [line for line in shown.getvalue().splitlines() if line.startswith("escalate, ")]
@@ -283,9 +259,9 @@ def test_each_escalate_has_a_bar_of_its_own_that_ends_full(
 
 
 def test_no_pair_that_verifies_unrectified_loses_inliers(
-    escalated: tuple[Workspace, StageReport], plain: Workspace
+    escalated: Workspace, plain: Workspace
 ) -> None:
-    assert len(geometry(escalated[0], EASY)) >= len(geometry(plain, EASY))
+    assert len(geometry(escalated, EASY)) >= len(geometry(plain, EASY))
 
 
 def test_pairs_that_verify_well_escalate_nowhere(
@@ -295,17 +271,15 @@ def test_pairs_that_verify_well_escalate_nowhere(
     folder.mkdir()
     for name in EASY:
         shutil.copy(photos / name, folder / name)
-    workspace = verified(folder, tmp_path / "out", "on-demand")
+    workspace = facade_run(folder, tmp_path / "out", "on-demand")
     first = matches(workspace, EASY)
     monkeypatch.setattr(escalation, "prepare", None)  # nothing to extract
     assert escalate(workspace).num_done == 0
     assert_array_equal(matches(workspace, EASY), first)
 
 
-def test_features_of_levels_follow_one_another(
-    escalated: tuple[Workspace, StageReport], before: Workspace
-) -> None:
-    store, earlier = FeatureStore(escalated[0].features), FeatureStore(before.features)
+def test_features_of_levels_follow_one_another(escalated: Workspace, before: Workspace) -> None:
+    store, earlier = FeatureStore(escalated.features), FeatureStore(before.features)
     for name in NAMES:
         ends = [part.stop for part in store.level_ranges(name).values()]
         first = store.read(name).select(store.level_indices(name, 0))
@@ -315,70 +289,66 @@ def test_features_of_levels_follow_one_another(
             assert (ids[: ends[0]] == 0).all()
             assert (ids[ends[0] :] > 0).all()
             assert ends == sorted(ends)
-    ids = image_ids(escalated[0].database)
-    with open_database(escalated[0].database) as database:
+    ids = image_ids(escalated.database)
+    with open_database(escalated.database) as database:
         for name in NAMES:
             assert database.num_keypoints_for_image(ids[name]) == len(store.read(name))
 
 
 def test_again_does_nothing(
-    escalated: tuple[Workspace, StageReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    escalated: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    workspace = copy(escalated[0], tmp_path / "again")
+    workspace = copy_of(escalated, tmp_path / "again")
     monkeypatch.setattr(escalation, "prepare", None)  # no features, so nothing to prepare
     assert escalate(workspace).num_done == 0
-    same_state(workspace, escalated[0])
+    same_state(workspace, escalated)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("where", ["write_matches", "verify_new"])
-def test_killed_run_goes_on_to_the_same_result(
-    before: Workspace,
-    escalated: tuple[Workspace, StageReport],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    where: str,
-) -> None:
-    workspace = copy(before, tmp_path / "killed")
-    calls = [getattr(escalation, where)]  # once before the first step; then it is killed
+def killed_at(patch: pytest.MonkeyPatch, where: str) -> None:
+    """Kill a function when it is called for the second time."""
+    calls = [getattr(escalation, where)]  # once before the first step
 
     def killed(*given: object, **options: object) -> None:
         if not calls:
             raise KeyboardInterrupt
         calls.pop()(*given, **options)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(escalation, where, killed)
-        with pytest.raises(KeyboardInterrupt):
-            escalate(workspace)
-    escalate(workspace)
-    same_state(workspace, escalated[0])
+    patch.setattr(escalation, where, killed)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_run_killed_between_two_changes_of_its_matches_goes_on_to_the_same_result(
-    before: Workspace,
-    escalated: tuple[Workspace, StageReport],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    number: int,
-) -> None:
-    workspace, commit = copy(before, tmp_path / "killed"), FileTransaction.commit
-    changed: list[Path] = []
+def killed_after(patch: pytest.MonkeyPatch, path: Path, number: int) -> None:
+    """Kill a run when it has changed a file so many times."""
+    changed, commit = list[Path](), FileTransaction.commit
 
     def killed(changes: FileTransaction) -> None:
         commit(changes)
         changed.append(changes._path)
-        if changed.count(workspace.matches) == number:
+        if changed.count(path) == number:
             raise KeyboardInterrupt
 
+    patch.setattr(FileTransaction, "commit", killed)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("when", ["write_matches", "verify_new", 1, 2, 3])
+def test_killed_run_goes_on_to_the_same_result(
+    before: Workspace,
+    escalated: Workspace,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    when: str | int,
+) -> None:
+    """Killed when it calls a function, or between two changes of its matches."""
+    workspace = copy_of(before, tmp_path / "killed")
     with monkeypatch.context() as patch:
-        patch.setattr(FileTransaction, "commit", killed)
+        if isinstance(when, str):
+            killed_at(patch, when)
+        else:
+            killed_after(patch, workspace.matches, when)
         with pytest.raises(KeyboardInterrupt):
             escalate(workspace)
     escalate(workspace)
-    same_state(workspace, escalated[0])
+    same_state(workspace, escalated)
 
 
 def test_photographs_without_a_feature_escalate_nowhere(tmp_path: Path) -> None:
@@ -386,12 +356,12 @@ def test_photographs_without_a_feature_escalate_nowhere(tmp_path: Path) -> None:
     photos.mkdir()
     for name in NAMES[:2]:
         Image.new("L", (320, 240)).save(photos / name)
-    workspace = verified(photos, tmp_path / "out", "on-demand")
+    workspace = facade_run(photos, tmp_path / "out", "on-demand")
     escalate(workspace)
     assert set(Context(workspace).features.num_keypoints().values()) == {0}
 
 
 def test_recipe_without_levels_has_nothing_to_escalate(plain: Workspace, tmp_path: Path) -> None:
-    workspace = copy(plain, tmp_path / "plain")
+    workspace = copy_of(plain, tmp_path / "plain")
     assert escalate(workspace).num_done == 0
     assert_array_equal(geometry(workspace, EASY), geometry(plain, EASY))

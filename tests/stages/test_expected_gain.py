@@ -21,17 +21,14 @@ COVERS, LEARNED = LEVELS[1], LEVELS[2]
 PATIENT = EscalateOptions(max_seconds_per_image=1e6)
 
 
-@pytest.mark.parametrize(
-    ("counts", "weak", "expected"),
-    [
-        ({"ab": 200, "ac": 150, "bc": 30}, "", ""),
-        ({"ab": 200, "ac": 30, "bc": 0}, "", "c"),
-        ({"ab": 200, "ac": 100, "bc": 0}, "", ""),
-        ({"ab": 99}, "", "ab"),
-        ({"ab": 200, "ac": 150, "bc": 100}, "c", "c"),
-        ({}, "", ""),
-    ],
-)
+@pytest.mark.parametrize(("counts", "weak", "expected"), [
+    ({"ab": 200, "ac": 150, "bc": 30}, "", ""),
+    ({"ab": 200, "ac": 30, "bc": 0}, "", "c"),
+    ({"ab": 200, "ac": 100, "bc": 0}, "", ""),
+    ({"ab": 99}, "", "ab"),
+    ({"ab": 200, "ac": 150, "bc": 100}, "c", "c"),
+    ({}, "", ""),
+])  # fmt: skip
 def test_images_without_a_strong_pair_or_without_tracks_are_insecure(
     counts: dict[str, int], weak: str, expected: str
 ) -> None:

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from results import database_content
-from small_scene import INTRINSICS, NAMES
+from small_scene import NAMES
+from verified import copy_of, verified
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
-from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.project.stores import STATIONARY
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import guide as stage
-from colmap_affrect.stages.context import Context, Inputs
-from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.guide import current, exact_inliers, guide, guided_counts
-from colmap_affrect.stages.match import match
-from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.stationary import NUM_CELLS
 from colmap_affrect.stages.verify import verified_inliers, verify_matches
 
@@ -34,15 +30,7 @@ ALWAYS = GuidedOptions(enabled="always")
 
 @pytest.fixture(scope="module")
 def before(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    workspace = Workspace(tmp_path_factory.mktemp("before"))
-    cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
-    with workspace.locked():
-        context = Context(workspace)
-        extract(context, Inputs.of(photos, cameras=cameras), load_recipe("unrectified-rootsift"))
-        choose_pairs(context)
-        match(context)
-        verify_matches(context)
-    return workspace
+    return verified(photos, tmp_path_factory.mktemp("before"))
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +39,6 @@ def after(before: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Worksp
     workspace = copy_of(before, tmp_path_factory.mktemp("after") / "out")
     guide(Context(workspace), ALWAYS)
     return workspace
-
-
-def copy_of(workspace: Workspace, folder: Path) -> Workspace:
-    return Workspace(Path(shutil.copytree(workspace.path, folder)))
 
 
 @pytest.fixture
@@ -70,15 +54,15 @@ def guided(after: Workspace, tmp_path: Path) -> Context:
 def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, context: Context) -> None:
     exact = verified_inliers(Context(before))
     assert guide(context, ALWAYS).num_done == len(exact) == 6
-    verified = verified_inliers(context)
+    found = verified_inliers(context)
     counts = guided_counts(context)
     assert counts["pairs"] > 1
     assert counts["matches_after"] > 1.05 * counts["matches_before"]
     for pair, indices in exact.items():
-        assert len(verified[pair]) >= len(indices)
+        assert len(found[pair]) >= len(indices)
         assert_array_equal(exact_inliers(context, current(context))[pair], indices)
         for side in (0, 1):
-            assert len(np.unique(verified[pair][:, side])) == len(verified[pair])
+            assert len(np.unique(found[pair][:, side])) == len(found[pair])
     raw = [raw_matches(item.database) for item in (before, context.workspace)]
     assert raw[0] == raw[1]
     assert rows_digest(before.database) != rows_digest(context.workspace.database)
@@ -92,9 +76,9 @@ def raw_matches(path: Path) -> list[tuple[int, bytes]]:
 
 def test_guided_matches_are_right(guided: Context) -> None:
     """A geometry of the first inliers explains nearly all that came later."""
-    exact, verified = exact_inliers(guided, current(guided)), verified_inliers(guided)
+    exact = exact_inliers(guided, current(guided))
     frames = {name: guided.features.read(name).keypoints for name in NAMES}
-    for pair, indices in verified.items():
+    for pair, indices in verified_inliers(guided).items():
         known = {*map(tuple, exact[pair])}
         new = np.array([row for row in indices.tolist() if tuple(row) not in known])
         if not len(new):
@@ -149,11 +133,8 @@ def test_again_nothing_happens_and_other_options_are_refused(guided: Context) ->
 def test_killed_before_the_geometries_are_written_it_goes_on(
     context: Context, guided: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def killed(*_: object) -> None:
-        raise KeyboardInterrupt
-
     monkeypatch.setattr(stage, "PAIRS_PER_WRITE", 4)
-    monkeypatch.setattr(stage.Guiding, "_write", killed)
+    monkeypatch.setattr(stage.Guiding, "_write", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         guide(context, ALWAYS)
     monkeypatch.undo()

@@ -10,6 +10,7 @@ import pytest
 from command import Call
 from results import database_content
 from small_scene import NAMES as PHOTOGRAPHS
+from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
@@ -36,8 +37,7 @@ def store(tmp_path: Path) -> FeatureStore:
     things = random.gamma(0.4, size=(NUM_FEATURES, 128))
     store = FeatureStore(tmp_path / "features.h5")
     for name in NAMES:
-        rows = things + 0.05 * random.random(things.shape)
-        rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+        rows = unit_rows(things + 0.05 * random.random(things.shape))
         centers = random.uniform(10, 400, (NUM_FEATURES, 2))
         ones = np.ones(NUM_FEATURES)
         lafs = lafs_from_keypoints(centers, 6 * ones, 0 * ones)

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from small_scene import INTRINSICS, NAMES
+from small_scene import NAMES
+from verified import copy_of, verified
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.features.base import EXTRACTORS
-from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import map as stage
-from colmap_affrect.stages.context import Context, Inputs
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, unmeasured_pairs
-from colmap_affrect.stages.extract import extract
-from colmap_affrect.stages.match import match
-from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import verify_matches
 
 RECIPE = """
 [rectifier]
@@ -45,25 +40,16 @@ def _shapeless() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def verified(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+def before(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """All pairs are verified by measured frames."""
     folder = tmp_path_factory.mktemp("verified")
     (folder / "recipe.toml").write_text(RECIPE)
-    workspace = Workspace(folder / "out")
-    cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
-    with workspace.locked():
-        context = Context(workspace)
-        inputs = Inputs.of(photos, cameras=cameras)
-        extract(context, inputs, load_recipe(str(folder / "recipe.toml")))
-        choose_pairs(context)
-        match(context)
-        verify_matches(context)
-    return workspace
+    return verified(photos, folder / "out", str(folder / "recipe.toml"))
 
 
 @pytest.fixture
-def context(verified: Workspace, tmp_path: Path) -> Context:
-    return Context(Workspace(Path(shutil.copytree(verified.path, tmp_path / "out"))))
+def context(before: Workspace, tmp_path: Path) -> Context:
+    return Context(copy_of(before, tmp_path / "out"))
 
 
 def escalation_of(context: Context) -> Escalation:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from synthetic import blobs, write_image
 
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import InitialCameras
@@ -42,13 +43,9 @@ MAX_ERROR_PX = 0.3
 
 
 def write_blobs(path: Path) -> None:
-    y, x = np.mgrid[:HEIGHT, :WIDTH]
-    image = np.full((HEIGHT, WIDTH), 100.0)
-    for center_x, center_y in BLOBS:
-        squared = (x - center_x) ** 2 + (y - center_y) ** 2
-        image += 120.0 * np.exp(-squared / (2 * BLOB_SIGMA_PX**2))
+    image = blobs((WIDTH, HEIGHT), BLOBS, BLOB_SIGMA_PX * np.eye(2), amplitude=120, background=100)
     path.parent.mkdir(exist_ok=True)
-    cv2.imwrite(str(path), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    write_image(path, image)
 
 
 def extracted(

@@ -150,14 +150,11 @@ def test_nearest_positions_take_cartesian_ones_and_images_without(rooms: Workspa
     assert nearest_positions(rooms.database, 5, 5.1) == [("1.png", "2.png")]
 
 
-@pytest.mark.parametrize(
-    ("values", "named"),
-    [
-        ({"methods": ("gps", "retrival")}, "'retrival': should be 'exhaustive', 'retrieval'"),
-        ({"methods": ()}, "methods"),
-        ({"num_neighbors": 0}, "num_neighbors=0"),
-    ],
-)
+@pytest.mark.parametrize(("values", "named"), [
+    ({"methods": ("gps", "retrival")}, "'retrival': should be 'exhaustive', 'retrieval'"),
+    ({"methods": ()}, "methods"),
+    ({"num_neighbors": 0}, "num_neighbors=0"),
+])  # fmt: skip
 def test_wrong_options_are_refused(values: dict[str, object], named: str) -> None:
     with pytest.raises(OptionError, match=named):
         PairOptions.from_mapping(values, "pairs")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +11,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from command import Call, pair_list
+from command import CAMERA, Call, pair_list
 from numpy.testing import assert_array_equal
 from results import database_content, hdf5_content
 from small_scene import IMAGE_SIZE, INTRINSICS, NAMES
+from verified import CAMERAS, copy_of
 
 from colmap_affrect.cli.parser import build_parser
 from colmap_affrect.colmap import pycolmap
@@ -24,7 +24,6 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pipeline import RunOptions, run
@@ -35,33 +34,30 @@ from colmap_affrect.stages.advice import advice
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.verify import verify_matches
 
-CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
-CAMERA_ARGUMENTS = [
-    "--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS,
-]  # fmt: skip
+CAMERA_ARGUMENTS = ["--camera-mode", "single", *CAMERA[2:]]
 OPTIONS = RunOptions(
     cameras=CAMERAS,
     verification=VerificationOptions(random_seed=3),
     mapping=SparseOptions(random_seed=3),
 )
 
+Finished = tuple[Workspace, ReconstructionReport]
+
 DIGITS = 9
 """Means over a model that was read back may differ from those before in the last digits."""
 
 
 @pytest.fixture(scope="module")
-def finished(
-    photos: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Workspace, ReconstructionReport]:
+def finished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A run of all four photographs; nothing may be changed in it."""
     path = tmp_path_factory.mktemp("finished") / "out"
     return Workspace(path), run(photos, path, OPTIONS)
 
 
 @pytest.fixture
-def copy(finished: tuple[Workspace, ReconstructionReport], tmp_path: Path) -> Workspace:
+def copy(finished: Finished, tmp_path: Path) -> Workspace:
     """A copy of the finished run, to be changed."""
-    return Workspace(Path(shutil.copytree(finished[0].path, tmp_path / "copy")))
+    return copy_of(finished[0], tmp_path / "copy")
 
 
 def without_times(report: dict[str, object]) -> dict[str, object]:
@@ -74,7 +70,7 @@ def without_times(report: dict[str, object]) -> dict[str, object]:
 
 
 def test_run_registers_all_photographs_and_leaves_all_results(
-    finished: tuple[Workspace, ReconstructionReport],
+    finished: Finished,
 ) -> None:
     workspace, report = finished
     assert report.status == "ok"
@@ -103,7 +99,7 @@ def test_run_registers_all_photographs_and_leaves_all_results(
 
 
 def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(
-    finished: tuple[Workspace, ReconstructionReport],
+    finished: Finished,
 ) -> None:
     workspace, _ = finished
     ids = image_ids(workspace.database)
@@ -116,7 +112,7 @@ def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(
 
 
 def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from_there(
-    finished: tuple[Workspace, ReconstructionReport], photos: Path, tmp_path: Path, call: Call
+    finished: Finished, photos: Path, tmp_path: Path, call: Call
 ) -> None:
     expected, first = finished
     out = ["--output-path", tmp_path / "out"]
@@ -145,9 +141,7 @@ def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from
     assert made.config.read_bytes() == expected.config.read_bytes()
 
 
-def test_advice_is_about_what_is_wrong(
-    finished: tuple[Workspace, ReconstructionReport], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     workspace, report = finished
     command = ("colmap-affrect", "run", "--image-path", "a b", "--output-path", "out", "-q")
     context, (model, *_) = Context(workspace, command=command), report.models
@@ -217,7 +211,7 @@ def test_idle_run_looks_at_no_header(
 
 @pytest.mark.parametrize("name", NAMES[1:3])
 def test_image_whose_features_are_lost_gets_the_same_again(
-    finished: tuple[Workspace, ReconstructionReport], copy: Workspace, photos: Path, name: str
+    finished: Finished, copy: Workspace, photos: Path, name: str
 ) -> None:
     expected, first = finished
     with h5py.File(copy.features, "a") as file:
