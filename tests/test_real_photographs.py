@@ -26,16 +26,13 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("recipe", "name", "min_correct", "median_error_deg"),
-    [
-        ("rectified", "fountain 0,5,10", 3, 0.5),
-        ("rectified", "herz 0,8,16,24", 4, 0.5),
-        ("rectified", "kermit /2", 6, 2.0),
-        ("rectified", "sacre_coeur /2", 5, 2.0),
-        ("on-demand", "herz 0,8,16,24", 4, 0.5),
-    ],
-)
+@pytest.mark.parametrize(("recipe", "name", "min_correct", "median_error_deg"), [
+    ("rectified", "fountain 0,5,10", 3, 0.5),
+    ("rectified", "herz 0,8,16,24", 4, 0.5),
+    ("rectified", "kermit /2", 6, 2.0),
+    ("rectified", "sacre_coeur /2", 5, 2.0),
+    ("on-demand", "herz 0,8,16,24", 4, 0.5),
+])  # fmt: skip
 def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_error_deg, tmp_path):
     result = compare_subset(name, SCENES, tmp_path, [recipe], 5)["methods"][recipe]
     scores = [seed["scores"] for seed in result["seeds"]]

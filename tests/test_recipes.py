@@ -95,19 +95,16 @@ def test_settings_change_single_options() -> None:
     assert extraction.features == load_recipe("default").extraction.features
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("rectifier.tilt_radius", "expected OPTION=VALUE"),
-        ("=3", "expected OPTION=VALUE"),
-        ("rectifyer.tilt_radius=1.8", "did you mean 'rectifier'"),
-        ("rectifier.tilt_radius=0.5", r"tilt_radius=0\.5: should be greater"),
-        ("rectifier.tilt_radius=wide", "=.wide.: should be a valid number"),
-        ("matching.max_ratio.deep=1", "is not a section"),
-        ("escalate=3", "escalate=3: should be a valid dict"),
-        ("rectifier=dense", "unknown rectifier 'dense' .did you mean 'dense-shapes'"),
-    ],
-)
+@pytest.mark.parametrize(("setting", "message"), [
+    ("rectifier.tilt_radius", "expected OPTION=VALUE"),
+    ("=3", "expected OPTION=VALUE"),
+    ("rectifyer.tilt_radius=1.8", "did you mean 'rectifier'"),
+    ("rectifier.tilt_radius=0.5", r"tilt_radius=0\.5: should be greater"),
+    ("rectifier.tilt_radius=wide", "=.wide.: should be a valid number"),
+    ("matching.max_ratio.deep=1", "is not a section"),
+    ("escalate=3", "escalate=3: should be a valid dict"),
+    ("rectifier=dense", "unknown rectifier 'dense' .did you mean 'dense-shapes'"),
+])  # fmt: skip
 def test_wrong_setting_is_one_clear_line(setting: str, message: str) -> None:
     with pytest.raises(OptionError, match=message) as error:
         load_recipe("default", [setting])

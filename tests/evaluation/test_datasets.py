@@ -272,10 +272,7 @@ SAME = '{"image1": "a.png", "image2": "b.png", "homography": "h.txt"}'
     ("[]", "damaged"),
     ('{"pairs": []}', "has no pairs"),
     ('{"pairs": [1]}', r"pairs\[0\]: expected options, got 1"),
-    (
-        '{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}',
-        "must be path",
-    ),
+    ('{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}', "must be path"),
     ('{"pairs": [{"image1": "a", "image2": "b"}]}', "needs homography, correspondences or"),
     (f'{{"pairs": [{SAME}, {SAME}]}}', "two pairs are called 'a b'"),
 ])  # fmt: skip

@@ -163,18 +163,16 @@ def test_escalation_stops_where_it_suffices_and_most_verified_inliers_count(
     assert recipe.summary["homographies"]["< 1 px"] == 1
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    (EvaluateOptions(recipes=["sift"]), "sift is COLMAP's and no recipe"),
-    (EvaluateOptions(max_num_keypoints=0), "--max-num-keypoints 0: must be at least 1"),
+@pytest.mark.parametrize(("protocol", "options", "message"), [
+    ("evd", EvaluateOptions(recipes=["sift"]), "sift is COLMAP's and no recipe"),
+    ("evd", EvaluateOptions(max_num_keypoints=0), "--max-num-keypoints 0: must be at least 1"),
+    ("megadepth", EvaluateOptions(), "unknown protocol 'megadepth': known are evd, svp"),
 ])  # fmt: skip
-def test_bad_options(options: Any, message: str, dataset: Path, tmp_path: Path) -> None:
+def test_bad_options(
+    protocol: str, options: Any, message: str, dataset: Path, tmp_path: Path
+) -> None:
     with pytest.raises(OptionError, match=message):
-        evaluate("evd", dataset, tmp_path, options)
-
-
-def test_unknown_protocols_are_refused(dataset: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="unknown protocol 'megadepth': known are evd, svp"):
-        evaluate("megadepth", dataset, tmp_path / "out")
+        evaluate(protocol, dataset, tmp_path, options)
 
 
 def test_poses_are_evaluated_by_category(tmp_path: Path) -> None:

@@ -104,14 +104,8 @@ def test_cover_shapes_covers_the_share_asked_for_or_reaches_a_limit(
 ) -> None:
     tilts, angles = random_classes(seed, count, MAX_TILT)
     metrics = metrics_from_tilts(tilts, angles)
-    cover = cover_shapes(
-        metrics,
-        np.ones(count),
-        radius=radius,
-        max_tilt=MAX_TILT,
-        covered_frac=covered_frac,
-        max_num_centers=max_num_centers,
-    )
+    limits = {"covered_frac": covered_frac, "max_num_centers": max_num_centers}
+    cover = cover_shapes(metrics, np.ones(count), radius=radius, max_tilt=MAX_TILT, **limits)
     references = [(1.0, 0.0), *cover.centers]
     distances = np.array(
         [[tilt_distance(t, a, *reference) for reference in references]
@@ -133,15 +127,9 @@ def test_cover_shapes_covers_the_share_asked_for_or_reaches_a_limit(
 
 def cover_with_defaults(tilts: list[float], angles: list[float], weights: list[float]) -> Array:
     """Centres that cover all votes with at most 8 balls of 1.7."""
-    cover = cover_shapes(
-        metrics_from_tilts(tilts, angles),
-        np.array(weights),
-        radius=RADIUS,
-        max_tilt=MAX_TILT,
-        covered_frac=1.0,
-        max_num_centers=8,
-    )
-    return cover.centers
+    given = metrics_from_tilts(tilts, angles), np.array(weights)
+    limits = {"covered_frac": 1.0, "max_num_centers": 8}
+    return cover_shapes(*given, radius=RADIUS, max_tilt=MAX_TILT, **limits).centers
 
 
 def test_cover_shapes_takes_the_heaviest_votes_first() -> None:
@@ -151,15 +139,11 @@ def test_cover_shapes_takes_the_heaviest_votes_first() -> None:
     assert tilt_distance(*centers[1], 3.0, 0.5) < np.log(RADIUS)
 
 
-@pytest.mark.parametrize(
-    ("tilts", "angles", "weights"),
-    [
-        ([1.0, 1.4, 1.69], [0.0, 0.9, 2.5], [1.0, 1.0, 1.0]),
-        ([5.9, 7.0, 1.0], [0.5, 0.5, 0.0], [9.0, 9.0, 1.0]),
-        ([], [], []),
-    ],
-    ids=["near the identity", "beyond the largest tilt", "nothing"],
-)
+@pytest.mark.parametrize(("tilts", "angles", "weights"), [
+    ([1.0, 1.4, 1.69], [0.0, 0.9, 2.5], [1.0, 1.0, 1.0]),
+    ([5.9, 7.0, 1.0], [0.5, 0.5, 0.0], [9.0, 9.0, 1.0]),
+    ([], [], []),
+], ids=["near the identity", "beyond the largest tilt", "nothing"])  # fmt: skip
 def test_cover_shapes_needs_no_center(
     tilts: list[float], angles: list[float], weights: list[float]
 ) -> None:

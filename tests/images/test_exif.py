@@ -22,19 +22,16 @@ def tags_of(path: Path, size: tuple[int, int], tags: dict[str, Any]) -> CameraTa
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {**BODY, "FocalLengthIn35mmFilm": 28},
-        {**MM50, "FocalPlaneXResolution": 3 / 0.7, "FocalPlaneResolutionUnit": 4},
-        {
-            "Make": "A", "FocalLength": 6.1, "FocalPlaneXResolution": 312.5,
-            "FocalPlaneResolutionUnit": 3,
-            "FocalPlaneYResolution": 312.5, "ExifImageWidth": 180, "ExifImageHeight": 120,
-        },
-        {},
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("tags", [
+    {**BODY, "FocalLengthIn35mmFilm": 28},
+    {**MM50, "FocalPlaneXResolution": 3 / 0.7, "FocalPlaneResolutionUnit": 4},
+    {
+        "Make": "A", "FocalLength": 6.1, "FocalPlaneXResolution": 312.5,
+        "FocalPlaneResolutionUnit": 3,
+        "FocalPlaneYResolution": 312.5, "ExifImageWidth": 180, "ExifImageHeight": 120,
+    },
+    {},
+])  # fmt: skip
 def test_focal_length_of_right_exif_is_exactly_colmaps(
     tmp_path: Path, suffix: str, tags: dict[str, Any]
 ) -> None:
@@ -57,14 +54,11 @@ def test_photograph_that_was_shrunk_is_rescaled_also_if_it_was_turned(
     assert tags.identity is not None
 
 
-@pytest.mark.parametrize(
-    ("size", "tags", "why"),
-    [
-        ((1092, 600), {"ExifImageWidth": 4368, "ExifImageHeight": 2912}, "cropped or padded: 1092"),
-        ((160, 107), {"ExifImageWidth": 4368, "ExifImageHeight": 2912}, "a thumbnail: 160 x 107"),
-        ((300, 200), {}, "resolution would be a focal length of 20 longer sides"),
-    ],
-)
+@pytest.mark.parametrize(("size", "tags", "why"), [
+    ((1092, 600), {"ExifImageWidth": 4368, "ExifImageHeight": 2912}, "cropped or padded: 1092"),
+    ((160, 107), {"ExifImageWidth": 4368, "ExifImageHeight": 2912}, "a thumbnail: 160 x 107"),
+    ((300, 200), {}, "resolution would be a focal length of 20 longer sides"),
+])  # fmt: skip
 def test_cropped_ones_thumbnails_and_impossible_views_are_distrusted(
     tmp_path: Path, size: tuple[int, int], tags: dict[str, Any], why: str
 ) -> None:
@@ -77,22 +71,19 @@ def tags(size: tuple[int, int], **values: Any) -> CameraTags:
     return CameraTags(size, focal_mm=50.0, **values)
 
 
-@pytest.mark.parametrize(
-    ("given", "sensor_mm", "focal_px", "is_rescaled"),
-    [
-        # Shrunk to a quarter by a program that updated sizes but not the resolution.
-        (tags((1092, 728), equivalent_mm=50.0, px_per_mm=(122, 122)), None, 1516.6, False),
-        (tags((1092, 728), px_per_mm=(122, 122)), 36.0, 1516.7, True),
-        # Cropped instead, as the shape tells: nobody knows.
-        (tags((1092, 600), equivalent_mm=50.0, px_per_mm=(122, 122)), None, None, False),
-        # Only one of two can be.
-        (tags((400, 300), equivalent_mm=28.0, px_per_mm=(122, 122)), None, 323.6, False),
-        # Pixels that are not square, and a zoom that focal lengths in mm do not know.
-        (tags((4368, 2912), px_per_mm=(122, 61)), None, None, False),
-        (tags((4368, 2912), px_per_mm=(122, 122), zoom=2.0), None, None, False),
-        (tags((4368, 2912)), 35.8, 6100.6, False),
-    ],
-)
+@pytest.mark.parametrize(("given", "sensor_mm", "focal_px", "is_rescaled"), [
+    # Shrunk to a quarter by a program that updated sizes but not the resolution.
+    (tags((1092, 728), equivalent_mm=50.0, px_per_mm=(122, 122)), None, 1516.6, False),
+    (tags((1092, 728), px_per_mm=(122, 122)), 36.0, 1516.7, True),
+    # Cropped instead, as the shape tells: nobody knows.
+    (tags((1092, 600), equivalent_mm=50.0, px_per_mm=(122, 122)), None, None, False),
+    # Only one of two can be.
+    (tags((400, 300), equivalent_mm=28.0, px_per_mm=(122, 122)), None, 323.6, False),
+    # Pixels that are not square, and a zoom that focal lengths in mm do not know.
+    (tags((4368, 2912), px_per_mm=(122, 61)), None, None, False),
+    (tags((4368, 2912), px_per_mm=(122, 122), zoom=2.0), None, None, False),
+    (tags((4368, 2912)), 35.8, 6100.6, False),
+])  # fmt: skip
 def test_statements_that_contradict_each_other(
     given: CameraTags, sensor_mm: float | None, focal_px: float | None, is_rescaled: bool
 ) -> None:

@@ -43,6 +43,13 @@ def write_mask(path: Path, mask: Mask, white: int = 255) -> None:
     write_image(path, mask.astype(np.uint8) * np.uint8(white))
 
 
+def touch(folder: Path, *names: str) -> None:
+    """Write empty files."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+
+
 def test_shrunk_mask_keeps_its_place() -> None:
     mask = np.zeros((90, 120), bool)
     mask[30:, 20:60] = True
@@ -92,17 +99,14 @@ def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
         Photographs(tmp_path, masks).mask("x.jpg")
 
 
-@pytest.mark.parametrize(
-    ("prepare_mask", "message"),
-    [
-        (lambda path: path.write_bytes(b""), "not a readable image"),
-        (lambda path: write_mask(path, diagonal_mask((300, 240))), "320 x 240 px and its mask 300"),
-        (
-            lambda path: path.write_bytes(png_of_size(32_000, 31_000)),
-            "320 x 240 px and its mask 32000 x 31000 px",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("prepare_mask", "message"), [
+    (lambda path: path.write_bytes(b""), "not a readable image"),
+    (lambda path: write_mask(path, diagonal_mask((300, 240))), "320 x 240 px and its mask 300"),
+    (
+        lambda path: path.write_bytes(png_of_size(32_000, 31_000)),
+        "320 x 240 px and its mask 32000 x 31000 px",
+    ),
+])  # fmt: skip
 def test_image_with_a_wrong_mask_is_reported_and_the_others_go_on(
     photo_path: Path,
     tmp_path: Path,
@@ -172,21 +176,13 @@ def test_gps_position_and_focal_length_of_exif_are_taken_over(tmp_path: Path) ->
 
 
 def test_list_images_finds_images_in_folders_and_passes_over_the_rest(tmp_path: Path) -> None:
-    for name in (
-        "z.JPG", "a b.png", "deep/er/č.tif", ".hidden.png", ".git/x.png", "notes.txt", "a.webp",
-        "folder.png/inside.bmp",
-    ):  # fmt: skip
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes(b"")
-    assert list_images(tmp_path) == [
-        "a b.png", "deep/er/č.tif", "folder.png/inside.bmp", "z.JPG",
-    ]  # fmt: skip
+    taken = ["a b.png", "deep/er/č.tif", "folder.png/inside.bmp", "z.JPG"]
+    touch(tmp_path, *taken, ".hidden.png", ".git/x.png", "notes.txt", "a.webp")
+    assert list_images(tmp_path) == taken
 
 
 def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
-    for name in ("a.png", "b c.png", "deep/č.png"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"")
+    touch(tmp_path, "a.png", "b c.png", "deep/č.png")
     listed = tmp_path / "list.txt"
     text = "\ufeff# comment\nb c.png\n\n./deep//č.png\nb c.png\n"
     listed.write_text(text, encoding="utf-8")
@@ -196,8 +192,7 @@ def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
 @pytest.mark.parametrize("line", ["d.png", "../photos/a.png", ""])
 def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: str) -> None:
     folder = tmp_path / "photos"
-    folder.mkdir()
-    (folder / "a.png").write_bytes(b"")
+    touch(folder, "a.png")
     listed = tmp_path / "list.txt"
     listed.write_text(line.format(folder=folder))
     with pytest.raises(ImageError, match=r"list\.txt: (lists .* not in|is empty)"):
@@ -205,8 +200,7 @@ def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: s
 
 
 def test_videos_are_named_with_what_to_do(photo_path: Path) -> None:
-    for name in ("film.MP4", "side.mov"):
-        (photo_path.parent / name).write_bytes(b"")
+    touch(photo_path.parent, "film.MP4", "side.mov")
     found = left_out(photo_path.parent)
     assert set(found) == {"*.mp4", "*.mov"}
     assert found["*.mp4"].startswith("1 left out, such as film.MP4: it is a video; take")

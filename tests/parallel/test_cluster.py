@@ -123,12 +123,13 @@ def test_files_that_workers_do_not_see_are_named(photos: Path, address: str) -> 
 
 def test_cluster_that_is_no_use_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster_module, "CONNECT_TIMEOUT_S", 0.2)
-    with pytest.raises(AffrectError, match=r"tcp://127\.0\.0\.1:1: no scheduler answers"):
-        connected("tcp://127.0.0.1:1").__enter__()
-    with pytest.raises(AffrectError, match="not an address such as"):
-        connected("10.0.0.1").__enter__()
-    with pytest.raises(AffrectError, match=r"no scheduler answers .*TLS expects"):
-        connected("tls://10.0.0.1:8786").__enter__()
+    for address, said in (
+        ("tcp://127.0.0.1:1", r"tcp://127\.0\.0\.1:1: no scheduler answers"),
+        ("10.0.0.1", "not an address such as"),
+        ("tls://10.0.0.1:8786", r"no scheduler answers .*TLS expects"),
+    ):
+        with pytest.raises(AffrectError, match=said):
+            connected(address).__enter__()
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(AffrectError, match=r"distributed is not installed; .*\[cluster\]"):
         connected("tcp://10.0.0.1:8786").__enter__()

@@ -69,21 +69,14 @@ def test_what_comes_to_be_there_meanwhile_stays_and_nothing_is_half_there(
     assert content(tmp_path) == {name: b"mine"}
 
 
-def make_link(folder: Path) -> None:
-    (folder / "a.txt").symlink_to(folder / "elsewhere.txt")
-
-
-def make_file(folder: Path) -> None:
-    (folder / "a.txt").write_text("mine")
-
-
-@pytest.mark.parametrize(
-    ("prepare", "why"), [(make_link, "is a symbolic link"), (make_file, "exists, and is left")]
-)
+@pytest.mark.parametrize(("prepare", "why"), [
+    (lambda path: path.symlink_to("elsewhere.txt"), "is a symbolic link"),
+    (lambda path: path.write_text("mine"), "exists, and is left"),
+])  # fmt: skip
 def test_what_is_in_the_way_is_refused_before_anything_is_made(
     tmp_path: Path, prepare: Callable[[Path], None], why: str
 ) -> None:
-    prepare(tmp_path)
+    prepare(tmp_path / "a.txt")
     before = content(tmp_path)
     with pytest.raises(OptionError, match=why), new_results(tmp_path / "a.txt"):
         pytest.fail("nothing may be made")
@@ -121,11 +114,8 @@ def test_temporary_folders_of_killed_processes_are_removed_and_no_others(tmp_pat
         assert first != second
         assert first.is_dir()
         assert not (tmp_path / ".affrect-killed").exists()
-    assert {path.name for path in tmp_path.iterdir()} == {
-        ".affrect-link",
-        ".affrect-of-somebody",
-        "elsewhere",
-    }
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {".affrect-link", ".affrect-of-somebody", "elsewhere"}
     assert not list((tmp_path / "elsewhere").iterdir())
 
 

@@ -84,17 +84,14 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
     assert "č d.png" in REPORT.to_json()
 
 
-@pytest.mark.parametrize(
-    ("report", "status"),
-    [
-        (REPORT, "partial"),
-        (replace(REPORT, unregistered={}), "ok"),
-        (replace(REPORT, models=(SHAKY, SMALL)), "doubtful"),
-        (replace(REPORT, models=(TURNED,)), "doubtful"),
-        (EMPTY, "no_model"),
-        (replace(EMPTY, unregistered={}), "no_model"),
-    ],
-)
+@pytest.mark.parametrize(("report", "status"), [
+    (REPORT, "partial"),
+    (replace(REPORT, unregistered={}), "ok"),
+    (replace(REPORT, models=(SHAKY, SMALL)), "doubtful"),
+    (replace(REPORT, models=(TURNED,)), "doubtful"),
+    (EMPTY, "no_model"),
+    (replace(EMPTY, unregistered={}), "no_model"),
+])  # fmt: skip
 def test_status_tells_whether_all_images_are_in_the_largest_model(
     report: ReconstructionReport, status: str
 ) -> None:
@@ -137,13 +134,10 @@ def test_long_lists_end_where_the_screen_does() -> None:
     assert len(report.to_mapping()["unregistered"]) == 100
 
 
-@pytest.mark.parametrize(
-    ("stage", "line"),
-    [
-        (StageReport("match", 2.04, 6), "match: 6 done in 2.0 s"),
-        (StageReport("match", 0.1, 3, 3), "match: 3 done, 3 already there in 0.1 s"),
-        (REPORT.stages[0], "extract: 3 done, 1 already there, 1 failed in 1.2 s"),
-    ],
-)
+@pytest.mark.parametrize(("stage", "line"), [
+    (StageReport("match", 2.04, 6), "match: 6 done in 2.0 s"),
+    (StageReport("match", 0.1, 3, 3), "match: 3 done, 3 already there in 0.1 s"),
+    (REPORT.stages[0], "extract: 3 done, 1 already there, 1 failed in 1.2 s"),
+])  # fmt: skip
 def test_stage_summary_is_one_line(stage: StageReport, line: str) -> None:
     assert stage.summary() == line

@@ -158,13 +158,10 @@ def test_values_that_were_not_written_are_damage(store: FeatureStore, matches: M
             read()
 
 
-@pytest.mark.parametrize(
-    ("name1", "name2", "key"),
-    [
-        ("a.png", "b.png", "a.png/b.png"),
-        ("west wing/a.png", "east/up/č.png", "west wing-a.png/east-up-č.png"),
-    ],
-)
+@pytest.mark.parametrize(("name1", "name2", "key"), [
+    ("a.png", "b.png", "a.png/b.png"),
+    ("west wing/a.png", "east/up/č.png", "west wing-a.png/east-up-č.png"),
+])  # fmt: skip
 def test_pair_key_is_that_of_hloc(name1: str, name2: str, key: str) -> None:
     assert pair_key(name1, name2) == key
 

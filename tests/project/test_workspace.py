@@ -59,18 +59,15 @@ def test_record_options_puts_the_options_on_record(workspace: Workspace) -> None
     assert [path.name for path in workspace.path.iterdir()] == ["config.toml"]
 
 
-@pytest.mark.parametrize(
-    ("changed", "named"),
-    [
-        ({**OPTIONS, "size": 4}, "size=3, and it is 4 now"),
-        ({**OPTIONS, "camera": {"mode": "single"}}, "camera.mode='auto', and it is 'single' now"),
-        ({**OPTIONS, "sigmas": (8.0,)}, "sigmas=[8.0, 16.0], and it is [8.0] now"),
-        ({**OPTIONS, "more": True}, "more=None, and it is True now"),
-        ({**OPTIONS, "camera": {}}, "camera.mode='auto', and it is None now"),
-        # The name of a part before its options.
-        ({**OPTIONS, "part": {"depth": 2, "name": "two"}}, "part.name='one', and it is 'two' now"),
-    ],
-)
+@pytest.mark.parametrize(("changed", "named"), [
+    ({**OPTIONS, "size": 4}, "size=3, and it is 4 now"),
+    ({**OPTIONS, "camera": {"mode": "single"}}, "camera.mode='auto', and it is 'single' now"),
+    ({**OPTIONS, "sigmas": (8.0,)}, "sigmas=[8.0, 16.0], and it is [8.0] now"),
+    ({**OPTIONS, "more": True}, "more=None, and it is True now"),
+    ({**OPTIONS, "camera": {}}, "camera.mode='auto', and it is None now"),
+    # The name of a part before its options.
+    ({**OPTIONS, "part": {"depth": 2, "name": "two"}}, "part.name='one', and it is 'two' now"),
+])  # fmt: skip
 def test_record_options_with_other_options_names_the_first_that_differs(
     workspace: Workspace, changed: dict[str, object], named: str
 ) -> None:
@@ -235,14 +232,11 @@ def test_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
 OTHER_VERSION = "was made by another version of .*; use another --output-path or remove it"
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[extract\nx = ", r"config\.toml: damaged"),
-        ('recipe = "default"\n[extract]\nimage_path = "/photos"\n', OTHER_VERSION),
-        ('format_version = 1\nrecipe = "default"\n', OTHER_VERSION),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("[extract\nx = ", r"config\.toml: damaged"),
+    ('recipe = "default"\n[extract]\nimage_path = "/photos"\n', OTHER_VERSION),
+    ('format_version = 1\nrecipe = "default"\n', OTHER_VERSION),
+])  # fmt: skip
 def test_record_that_cannot_be_gone_on_with_is_one_clear_line(
     workspace: Workspace, text: str, message: str
 ) -> None:
