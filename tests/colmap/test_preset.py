@@ -6,18 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mapping_tasks import ALL_GIVEN, NOTHING_KNOWN
+from mapping_tasks import ALL_GIVEN, NOTHING_KNOWN, SEED, synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.colmap.native_options import differences, flat_values
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options, verify
 from colmap_affrect.comparison.results import pair_errors
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions
-
-SEED = 3
 
 ROTATION_ERROR_DEG = 0.05
 """Keypoints are exact; what is left are float32 coordinates and the optimiser's tolerance."""
@@ -51,19 +50,14 @@ def reconstruct(
 
 def max_rotation_error_deg(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction) -> float:
     """Largest error of the relative rotation of two registered images."""
-    poses = []
-    for scene in (model, truth):
-        found = {image.name: image.cam_from_world() for image in scene.images.values()}
-        poses.append({k: (v.rotation.matrix(), v.translation) for k, v in found.items()})
-    return max(degrees for degrees, _ in pair_errors(*poses).values())
+    errors = pair_errors(model_poses(model), model_poses(truth))
+    return max(degrees for degrees, _ in errors.values())
 
 
 def test_two_images_register_with_our_preset_and_not_with_colmaps_default(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
-    pycolmap.set_random_seed(SEED)
-    scene = pycolmap.SyntheticDatasetOptions(num_frames_per_rig=2, num_rigs=1, num_points3D=400)
+    truth = synthesize(path, num_rigs=1, num_frames_per_rig=2, num_points3D=400)
     with open_database(path) as database:
-        truth = pycolmap.synthesize_dataset(scene, database)
         database.clear_two_view_geometries()
     verify(path, VerificationOptions(random_seed=SEED))
     assert reconstruct(path, pycolmap.IncrementalPipelineOptions(random_seed=SEED)) == []

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli_w
-from small_scene import INTRINSICS, write_photographs
+from results import tree
+from small_scene import write_photographs
+from verified import CAMERAS
 
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.doctor import Finding, diagnose
-from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
 
@@ -49,8 +50,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Folders:
     folder = tmp_path_factory.mktemp("finished")
     folders = Folders(folder / "my photos", folder / "out")
     write_photographs(folders.photos, NUM_IMAGES)
-    cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
-    run(folders.photos, folders.out, RunOptions(cameras=cameras))
+    run(folders.photos, folders.out, RunOptions(cameras=CAMERAS))
     return folders
 
 
@@ -71,12 +71,9 @@ def findings(path: Path | None) -> list[Finding]:
 
 
 def test_healthy_run_has_no_findings_and_stays_as_it_is(folders: Folders) -> None:
-    def state() -> dict[Path, bytes]:
-        return {path: path.read_bytes() for path in folders.out.rglob("*") if path.is_file()}
-
-    before = state()
+    before = tree(folders.out)
     assert findings(folders.out) == []
-    assert state() == before
+    assert tree(folders.out) == before
     checked = "\n".join(diagnose(folders.out).checked)
     for text in (
         "stages on record: extract, pairs, match, verify, escalate, guide, map; recipe default",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
 import socket
+import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,13 +18,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from local_cluster import local_cluster
 from random_weights import write_comparing_lightglue, write_random_weights
 from results import hdf5_content
-from small_scene import INTRINSICS, write_photographs
+from small_scene import write_photographs
+from verified import CAMERAS
 
 from colmap_affrect.errors import AffrectError, StoreError
-from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.parallel import cluster as cluster_module
 from colmap_affrect.parallel.cluster import Cluster, connected, environment, require_environment
 from colmap_affrect.parallel.executor import Executor, Threads
@@ -34,7 +36,7 @@ from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import Matching, iterate_matches, match
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 
-CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
+START_TIMEOUT_S = 60.0
 RECIPE = load_recipe("unrectified-rootsift")
 DAMAGED = "damaged.png"
 
@@ -42,8 +44,27 @@ DAMAGED = "damaged.png"
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A scheduler and two workers of one thread each, in processes of their own."""
-    with local_cluster(tmp_path_factory.mktemp("cluster"), 2) as started:
-        yield started
+    folder = tmp_path_factory.mktemp("cluster")
+    file = folder / "scheduler.json"
+    common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
+    worker = ["worker", *common, "--nthreads", "1", "--no-nanny", "--local-directory", str(folder)]
+    commands = [["scheduler", "--port", "0", *common], *[worker] * 2]
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *command], cwd=folder, stderr=subprocess.DEVNULL
+        )
+        for command in commands
+    ]
+    try:
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while not (file.exists() and file.read_text(encoding="utf-8")):
+            assert time.monotonic() < deadline, "the scheduler does not start"
+            time.sleep(0.1)
+        yield json.loads(file.read_text(encoding="utf-8"))["address"]
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
 
 
 @pytest.fixture(scope="module")
