@@ -3,8 +3,7 @@
 import math
 import time
 from collections.abc import Collection, Sequence
-from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks
@@ -97,9 +96,8 @@ def run(
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder for all results, made if missing.
         options: see :class:`RunOptions`.
-        executor: where images and pairs are worked on, a cluster for one
-            (:func:`colmap_affrect.parallel.cluster.connected`); by default in threads of this
-            process.
+        executor: where images and pairs are worked on, e.g. a cluster
+            (:func:`colmap_affrect.parallel.cluster.connected`); None: threads of this process.
         overwrite: discard results that are there.
         page: also write ``report.html``.
         progress: where to show progress.
@@ -110,10 +108,10 @@ def run(
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
     _check_by_hand(options.by_hand, names, mapper)
-    shown = copy(progress)
-    shown.forecast = Forecast(len(names), _num_pairs(names, options.pairs))
+    forecast = Forecast(len(names), _num_pairs(names, options.pairs))
     until_s, workspace = time.monotonic() + 60 * options.max_minutes, Workspace(output_path)
     given = options.by_hand, options.command
+    shown = replace(progress, forecast=forecast)
     context = Context(workspace, options.resources, executor, shown, until_s, *given)
     if options.extend:
         if overwrite:
