@@ -45,7 +45,9 @@ def test_unreadable_image_is_reported_and_the_run_goes_on(
     arguments = ["run", "--image-path", trio, "--output-path", tmp_path / "out", *FAST]
     ended = call(*arguments)
     assert (ended.code, len(ended.errors)) == (1, 1)
-    assert ended.stderr[-1] == "error: could not read 1 of the images: broken.jpg"
+    assert ended.stderr[-1].startswith(
+        "error: could not read 1 of the images: broken.jpg; the results are"
+    )
     assert "not broken.jpg: unreadable" in ended.stdout
     report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert report["unregistered"] == {"broken.jpg": "unreadable"}
