@@ -294,10 +294,10 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
         "--methods", ",".join(METHODS[:2]),
     )  # fmt: skip
     assert ended.code == 1
-        (error,) = ended.errors
-        assert error.startswith("error: could not read 1 of the images: broken.png; the results are")
+    (error,) = ended.errors
+    assert error.startswith("error: could not read 1 of the images: broken.png; ")
     assert ended.stdout.startswith("method")
-    assert "Of 4 photographs are registered: " in ended.stdout
+    assert "Photographs that are registered:\nour features (unrectified-rootsift): " in ended.stdout
 
 
 @pytest.mark.usefixtures("no_page")
