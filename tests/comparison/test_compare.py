@@ -297,7 +297,7 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
     (error,) = ended.errors
     assert error.startswith("error: could not read 1 of the images: broken.png; ")
     assert ended.stdout.startswith("method")
-    assert "Photographs that are registered:\nour features (unrectified-rootsift): " in ended.stdout
+    assert "Photographs that are registered:\nour mapper with SIFT (sift): 3 of 4" in ended.stdout
 
 
 @pytest.mark.usefixtures("no_page")
