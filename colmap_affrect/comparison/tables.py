@@ -64,7 +64,7 @@ def headline(comparison: Comparison) -> list[str]:
         return [f"Nothing was reconstructed: {few}."]
     named = {method.name: method for method in finished}
     others = [name for name in named if name not in SIFT_SUMMARIES]
-    ours = max(others, key=lambda name: named[name].right.max, default="")
+    ours = max(others, key=lambda name: named[name].right.mean, default="")
     kinds = {SIFT_COLMAP: "COLMAP as it is", SIFT: "our mapper with SIFT", ours: "our features"}
     what, texts = "correct" if comparison.has_ground_truth else "sure", list[str]()
     for name in filter(named.get, kinds):
