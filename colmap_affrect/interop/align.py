@@ -10,6 +10,7 @@ from statistics import median
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.by_hand import triangulated
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.model_files import read_given_model, write_model
 from colmap_affrect.errors import DatabaseError, OptionError
@@ -194,7 +195,7 @@ def _marked_points(
 ) -> tuple[Places, Places]:
     """Return where marked points are in the model, and the true places of control points."""
     where = f"--points {path}"
-    marks: defaultdict[str, list[tuple[pycolmap.Image, Array]]] = defaultdict(list)
+    marks: defaultdict[str, dict[int, Array]] = defaultdict(dict)  # by image id
     true = Places()
     for place, row in read_table(path, where, ("point", "image", "px", "py", *METRIC), "point"):
         name = row.get("point", "")
@@ -203,18 +204,14 @@ def _marked_points(
         if any(column in row for column in METRIC):
             true[name] = _numbers(row, METRIC, place)
         if row.get("image", "") in images:
-            marks[name].append((images[row["image"]], _numbers(row, ("px", "py"), place)))
+            marks[name][images[row["image"]].image_id] = _numbers(row, ("px", "py"), place)
     views = {name: marked for name, marked in marks.items() if len(marked) > 1}
     if not views:
         raise OptionError(f"{where}: no point is marked in two registered photographs")
     old = Places()
     for name, marked in views.items():
-        flat = [model.cameras[image.camera_id].cam_from_img(mark) for image, mark in marked]
-        rays = np.column_stack([np.array(flat), np.ones(len(flat))])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        poses = [image.cam_from_world().matrix() for image, _ in marked]
-        point = pycolmap.triangulate_multi_view_point(poses, rays)
+        point = triangulated(model, marked)
         if point is None:
             raise OptionError(f"{where}: the rays of point {name} do not meet; look at its marks")
-        old[name] = np.asarray(point).ravel()
+        old[name] = point
     return old, true
