@@ -132,7 +132,7 @@ def read_marks(path: Path, names: Collection[str]) -> Marks:
     stems |= {name: [name] for name in names}  # a whole name is that of no other
     marks = defaultdict[str, dict[str, Array]](dict)
     known = [column for alike in COLUMNS.values() for column in alike]
-    for place, row in read_table(path, where, [*known, "z"], header=tuple(COLUMNS)):
+    for place, row in read_table(path, where, [*known, "z"], key="", usual=tuple(COLUMNS)):
         cells = [next((row[key] for key in keys if key in row), "") for keys in COLUMNS.values()]
         point, image, *numbers = cells
         if not point or not image:

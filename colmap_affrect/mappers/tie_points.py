@@ -25,7 +25,9 @@ MOST = 2.5  # nats: of images that six tie points alone hold twelve of thirteen 
 NUM_FREE = 3  # tie points that any place of an image can agree with
 NEAR, NUM_NEAR = 0.1, 5
 """Depths of so many points near a mark, up to this part of the longer side, stand for its own."""
-Mark = tuple[str, int, float]  # of a point in an image, by its id, and its reprojection error in px
+ImageResidual = tuple[
+    str, int, float
+]  # of a point in an image, by its id, and its reprojection error in px
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class TiePoints:
                 if mark.has_point3D():
                     yield name, image_id, mark
 
-    def residuals(self, model: pycolmap.Reconstruction) -> list[Mark]:
+    def residuals(self, model: pycolmap.Reconstruction) -> list[ImageResidual]:
         """Return the residuals of all that a model observes."""
         places = (
             (n, i, m.xy, model.points3D[m.point3D_id].xyz) for n, i, m in self.observed(model)
@@ -120,7 +122,7 @@ class TiePoints:
 NONE = TiePoints({})
 
 
-def tied_evidence(residuals: Sequence[Mark]) -> dict[int, float]:
+def tied_evidence(residuals: Sequence[ImageResidual]) -> dict[int, float]:
     """Return what residuals say for the places of images, by image id, in nats.
 
     Of points that three images see or more: two nearly always agree.

@@ -9,13 +9,13 @@ from colmap_affrect.options import suggestion
 
 
 def read_table(
-    path: Path, where: str, columns: Sequence[str], key: str = "name", header: Sequence[str] = ()
+    path: Path, where: str, columns: Sequence[str], key: str = "name", usual: Sequence[str] = ()
 ) -> list[tuple[str, dict[str, str]]]:
     """Return the rows of a CSV file, without empty cells, and for each the place to name.
 
     It may have the columns in any order, and must have ``key``: else OptionError, which begins
-    with ``where``, such as ``--cameras-path FILE``. Where a ``header`` is given, a first line
-    that names no column is a row under it, and no key is asked for.
+    with ``where``, such as ``--cameras-path FILE``. A table with a ``usual`` header may
+    leave that out: then its first line names no column.
     """
     try:
         reader = csv.reader(path.read_text("utf-8-sig").splitlines(), skipinitialspace=True)
@@ -24,10 +24,9 @@ def read_table(
         reason = getattr(error, "strerror", None) or error
         raise OptionError(f"{where}: cannot be read ({reason})") from error
     rows = [(number, cells) for number, cells in lines if any(cells)]
-    if header and rows and not {cell.lower() for cell in rows[0][1]} & set(columns):
-        rows.insert(0, (0, list(header)))
-    key = "" if header else key
     header = [cell.lower() for cell in rows[0][1]] if rows else []
+    if usual and header and not {*header} & {*columns}:
+        header, rows = list(usual), [(0, []), *rows]
     if len(header) == 1 and ";" in header[0]:
         raise OptionError(f"{where}: separate cells by commas, and write numbers with a point")
     if unknown := [column for column in header if column not in columns]:
@@ -35,7 +34,8 @@ def read_table(
             f"{where}: unknown column '{unknown[0]}'{suggestion(unknown[0], columns)}"
         )
     if (key and key not in header) or len(set(header)) < len(header):
-        raise OptionError(f"{where}: its first line must have the column '{key}', and each once")
+        must = key or columns[0]
+        raise OptionError(f"{where}: its first line must have the column '{must}', and each once")
     for number, cells in rows[1:]:
         if len(cells) > len(header):
             raise OptionError(
