@@ -25,9 +25,8 @@ MOST = 2.5  # nats: of images that six tie points alone hold twelve of thirteen 
 NUM_FREE = 3  # tie points that any place of an image can agree with
 NEAR, NUM_NEAR = 0.1, 5
 """Depths of so many points near a mark, up to this part of the longer side, stand for its own."""
-ImageResidual = tuple[
-    str, int, float
-]  # of a point in an image, by its id, and its reprojection error in px
+ImageResidual = tuple[str, int, float]
+"""Name of a point, id of an image, and the reprojection error of the one in the other in px."""
 
 
 @dataclass(frozen=True)
