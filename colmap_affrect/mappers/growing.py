@@ -6,6 +6,7 @@ All adjustments know what is known of the cameras (:mod:`colmap_affrect.mappers.
 import copy
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import Bridges
 from colmap_affrect.mappers.evidence import Evidence
 from colmap_affrect.mappers.pair_graph import CameraById, PairGraph, PoseById, cameras_of, poses_of
-from colmap_affrect.project.report import Bridge
 
 MIN_POINTS = 10  # of a first pair
 ALWAYS = 10  # images up to which everything is adjusted after each one
@@ -139,11 +139,9 @@ class Grower:
         return next((i for i in ids if mapper.register_next_image(self.options, i)), None)
 
 
-def join(
-    model: pycolmap.Reconstruction, bridges: Bridges, grower: Grower, evidence: Evidence
-) -> MappedModel:
+def join(mapped: MappedModel, bridges: Bridges, grower: Grower, evidence: Evidence) -> MappedModel:
     """Bridge from a model to images until nothing joins."""
-    built: dict[str, Bridge] = {}
+    model, built = mapped.reconstruction, dict(mapped.bridges)
     score = evidence.of(model)
     while True:
         for found in bridges.find(model)[:MAX_TRIALS]:
@@ -153,6 +151,6 @@ def join(
             if grown.num_reg_images() > model.num_reg_images() and new_score > score:
                 break
         else:
-            return MappedModel(model, built)
+            return replace(mapped, reconstruction=model, bridges=built)
         model, score = grown, new_score
         built[grower.graph.names[found.image_id]] = found.bridge

@@ -18,6 +18,7 @@ from colmap_affrect.colmap.two_views import Cameras, decomposed_homography, homo
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
 from colmap_affrect.geometry.epipolar import sampson_errors
+from colmap_affrect.geometry.parallax import Size
 from colmap_affrect.geometry.two_views import Depths, essential_matrix, triangulated_depths
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.thinning import matches_of_best_tracks
@@ -151,6 +152,11 @@ class PairGraph:
         first, second = (self.keypoints[i][rows].astype(np.float64) for i, rows in columns)
         return first, second
 
+    def sizes(self, ids: Ids) -> tuple[Size, Size]:
+        """Return the sizes of the images of a pair."""
+        first, second = (self.cameras[image_id] for image_id in ids)
+        return (first.width, first.height), (second.width, second.height)
+
     def _some_points(self, pair: VerifiedPair) -> tuple[Array, Array]:
         return self.points(pair, -(-len(pair.matches) // MAX_MATCHES))
 
@@ -165,10 +171,10 @@ class PairGraph:
         pose, both = relative_pose(poses[first], poses[second]), (cameras[first], cameras[second])
         return float(_agrees(pose, both, self._some_points(pair))[0].mean())
 
-    def is_explained_by(self, model: pycolmap.Reconstruction) -> bool:
-        """Tell whether a model has all images of all pairs, and no pair contradicts it."""
-        has_all = self.keypoints.keys() <= set(model.reg_image_ids())
-        return has_all and not self.contradicted(model)
+    def unexplained_by(self, model: pycolmap.Reconstruction) -> list[VerifiedPair]:
+        """Return the pairs that contradict a model, or have an image that it has not."""
+        inside, against = set(model.reg_image_ids()), self.contradicted(model)
+        return [p for p in self.pairs if p.ids in against or not inside.issuperset(p.ids)]
 
     def contradicted(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
         """Return the pairs most of whose inliers disagree with a model that has both images."""

@@ -19,7 +19,7 @@ from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import Bridges
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.growing import Grower, join
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, cameras_of
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 ZOOMS = 1.0, 1.4, 0.7, 2.0
@@ -29,8 +29,6 @@ SHARED_SIGMA = 0.1
 these images do not tell it."""
 SAME_FOCAL = 0.03  # of the logarithm: bridges built with one are right with the other
 NUM_STARTS = 3
-
-Models = list[pycolmap.Reconstruction]
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,10 @@ class Search:
 
     def evidence_of(self, models: Sequence[MappedModel]) -> float:
         """Return the evidence of the best of some models."""
-        return max((self.evidence.of(model.reconstruction) for model in models), default=0.0)
+        return max(map(self._evidence_of, models), default=0.0)
+
+    def _evidence_of(self, mapped: MappedModel) -> float:
+        return self.evidence.of(mapped.reconstruction)
 
     def best(self, graph: PairGraph) -> list[MappedModel]:
         """Return the best model, and then the best ones of images that none before has."""
@@ -61,7 +62,7 @@ class Search:
         left = usual.copy()
         while left:
             near = left.pop(0)
-            found = near.joined(graph, near._grown(graph))
+            found = near.joined(graph, near._grown(graph, graph.pairs))
             if not found:
                 continue
             model = found[0].reconstruction
@@ -79,13 +80,18 @@ class Search:
             grower.finish(mapped.reconstruction)
         return best
 
-    def beyond(self, graph: PairGraph, start: pycolmap.Reconstruction) -> list[MappedModel]:
-        """Do so when bridges begin at a model, too, near whose focal lengths unknown ones stay."""
-        near, again = self._as_found(start), pycolmap.Reconstruction(start)
+    def beyond(self, graph: PairGraph, start: MappedModel) -> list[MappedModel]:
+        """Do so when one is known already, near whose focal lengths unknown ones stay.
+
+        It is one of those that bridges begin at; others grow from pairs that it does not explain.
+        """
+        again = pycolmap.Reconstruction(start.reconstruction)
+        near = self._as_found(again)
         grower = near.grower(graph)
         grower.finish(again)
-        models = sorted([again, *near._grown(graph)], key=self.evidence.of, reverse=True)
-        found = near.joined(graph, models)
+        grown = near._grown(graph, graph.unexplained_by(again))
+        models = [replace(start, reconstruction=again), *grown]
+        found = near.joined(graph, sorted(models, key=self._evidence_of, reverse=True))
         for model in found:
             grower.finish(model.reconstruction)
         return found
@@ -144,28 +150,29 @@ class Search:
         used = {camera.camera_id: camera for camera in cameras_of(model).values()}
         return {k: used[k].mean_focal_length() for k in used.keys() & self.unknown.keys()}
 
-    def joined(self, graph: PairGraph, models: Models) -> list[MappedModel]:
+    def joined(self, graph: PairGraph, models: Sequence[MappedModel]) -> list[MappedModel]:
         """Return the best model that bridges make of one of some, and those left out of it."""
         if not models:
             return []
-        if not self.num_starts or graph.is_explained_by(models[0]):
-            return [MappedModel(models[0])]
+        if not self.num_starts or not graph.unexplained_by(models[0].reconstruction):
+            return [models[0]]
         grower, bridges = self.grower(graph), Bridges(graph, self.native.random_seed)
         starts = models[: self.num_starts]
         joined = [join(model, bridges, grower, self.evidence) for model in starts]
-        best = max(joined, key=lambda mapped: self.evidence.of(mapped.reconstruction))
+        best = max(joined, key=self._evidence_of)
         found, inside = [best], set(best.reconstruction.reg_image_ids())
         for model in models:
-            if len(set(model.reg_image_ids()) - inside) > 1:
-                found.append(MappedModel(model))
-                inside.update(model.reg_image_ids())
+            own = set(model.reconstruction.reg_image_ids())
+            if len(own - inside) > 1:
+                found.append(model)
+                inside |= own
         return found
 
-    def _grown(self, graph: PairGraph) -> Models:
-        """Return models of different images, that with most evidence first."""
+    def _grown(self, graph: PairGraph, first: Sequence[VerifiedPair]) -> list[MappedModel]:
+        """Return models of different images from first pairs, that with most evidence first."""
         models: dict[frozenset[int], tuple[float, pycolmap.Reconstruction]] = {}
         best, in_vain = 0.0, 0
-        pairs = sorted(graph.pairs, key=lambda pair: -len(pair.matches))
+        pairs = sorted(first, key=lambda pair: -len(pair.matches))
         with closing(_in_order(self.grower(graph), [pair.ids for pair in pairs])) as grown:
             for model in grown:
                 images, evidence = frozenset(model.reg_image_ids()), self.evidence.of(model)
@@ -176,7 +183,7 @@ class Search:
                 is_complete = len(images) == len(graph.keypoints)
                 if in_vain >= self.num_seeds or (is_complete and self.evidence.is_confirmed(model)):
                     break
-        return [model for _, model in sorted(models.values(), key=lambda found: -found[0])]
+        return [MappedModel(m) for _, m in sorted(models.values(), key=lambda found: -found[0])]
 
 
 def _in_order(

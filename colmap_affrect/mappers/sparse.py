@@ -59,15 +59,16 @@ class SparseMapper(IncrementalMapper):
         is_large = len(graph.keypoints) >= LARGE
         if is_large and task.before:
             search = self._search(task, graph, native, shown)
-            best = _joined_by_hand(search, graph, _again(search, graph, task.before))
+            joined = search.joined(graph, [_again(search, graph, task.before)])
+            best = _joined_by_hand(search, graph, joined)
         elif is_large or task.extend:
             found = super().map(task, output_path, random_seed, show)
-            is_whole = found and graph.is_explained_by(found[0].reconstruction)
+            is_whole = found and not graph.unexplained_by(found[0].reconstruction)
             if is_whole and not task.tie_points:
                 return found
             search = replace(self._search(task, graph, native, shown), num_starts=1)
-            models = sorted((m.reconstruction for m in found), key=search.evidence.of, reverse=True)
-            best = _joined_by_hand(search, graph, search.joined(graph, models))
+            found.sort(key=lambda mapped: -search.evidence_of([mapped]))
+            best = _joined_by_hand(search, graph, search.joined(graph, found))
             if task.extend:
                 for model in best:
                     task.extend.restore(model.reconstruction)
@@ -124,7 +125,7 @@ class SparseMapper(IncrementalMapper):
         ids = {name: image_id for image_id, name in graph.names.items()}
         pairs = ((ids[a], ids[b]) for a, b in task.unmeasured)
         unmeasured = {(min(pair), max(pair)) for pair in pairs}
-        best = _again(search, graph, task.before) if task.before else []
+        best = [_again(search, graph, task.before)] if task.before else []
         most = search.evidence_of(best)
         measured = {MEASURED_PAIRS: unmeasured} if unmeasured else {}
         for name, left_out in {**measured, ALL_PAIRS: set[Ids]()}.items():
@@ -132,16 +133,17 @@ class SparseMapper(IncrementalMapper):
             if start and search.is_certain(start, graph):
                 break
             reduced = graph.without(left_out)
-            if start and reduced.is_explained_by(start):
+            if start and not reduced.unexplained_by(start):
                 continue
             if start:
-                models = search.beyond(reduced, start)
+                models = search.beyond(reduced, best[0])
             else:
                 models = _of_some_tracks(search, reduced, graph) or search.best(reduced)
             evidence = search.evidence_of(models)
             if not models or (best and evidence <= most):
                 continue
-            moves = (*(best[0].moves if best else ()), name, *models[0].moves)
+            before = best[0].moves if best else ()
+            moves = tuple(dict.fromkeys((*before, name, *models[0].moves)))
             best, most = [replace(model, moves=moves) for model in models], evidence
             if is_sharing:
                 model = _with_own_cameras(own[1], own[0].without(left_out), search, best[0])
@@ -164,13 +166,12 @@ def _joined_by_hand(
     return joiner.join(models)
 
 
-def _again(search: Search, graph: PairGraph, before: MappedModel) -> list[MappedModel]:
-    """Return a model with the poses of one before, and all that now joins it."""
+def _again(search: Search, graph: PairGraph, before: MappedModel) -> MappedModel:
+    """Return a model with the poses of one before, and all that its tracks now register."""
     grower = search.grower(graph)
-    joined = search.joined(graph, [grower.again(before.reconstruction)])
-    for mapped in joined:
-        grower.finish(mapped.reconstruction)
-    return [replace(m, moves=tuple(dict.fromkeys((*before.moves, AGAIN)))) for m in joined]
+    model = grower.again(before.reconstruction)
+    grower.finish(model)
+    return MappedModel(model, moves=tuple(dict.fromkeys((*before.moves, AGAIN))))
 
 
 def _with_own_cameras(

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,9 +58,9 @@ class TieJoiner:
         """Place images, and what bridges join to them."""
         model = self.grower.placed(poses, cameras, copy.deepcopy(mapped.reconstruction))
         bridges = Bridges(self.grower.graph, self.grower.native.random_seed)
-        grown = join(model, bridges, self.grower, self.evidence)
         moves = tuple(dict.fromkeys((*mapped.moves, BY_HAND)))
-        return MappedModel(grown.reconstruction, {**mapped.bridges, **grown.bridges}, moves)
+        placed = replace(mapped, reconstruction=model, moves=moves)
+        return join(placed, bridges, self.grower, self.evidence)
 
     def _new_poses(
         self, model: pycolmap.Reconstruction, left: Sequence[MappedModel]

@@ -20,7 +20,7 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.recipes import EscalateOptions, Level
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")
-SHARE_OF_BEST = 0.3  # pairs worth less than that part of the best wait for what it tells
+MAPPING_S = 0.06  # of one core, by listed pair: what follows on each step, mapping again
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,7 @@ class ExpectedGain:
     ) -> tuple[float, list[Pair], float]:
         """Return images saved by second, pairs for a level now, and seconds of all worth it.
 
+        A step has the pairs that save more by second than it does as a whole, mapping included.
         ``others``: bits of the levels that make this one needless.
         """
         gain, states = gain_of(level), self.states
@@ -149,7 +150,7 @@ class ExpectedGain:
         found.sort(key=lambda item: (-item[0] * sum(value for _, value in item[1]), item[2]))
         left: defaultdict[str | int, float] = defaultdict(lambda: 1.0)  # chance of being lost still
         chosen, there = list[Pair](), set[str]()
-        best = saved = spent_s = all_s = 0.0
+        saved, spent_s, all_s = 0.0, MAPPING_S * len(states), 0.0
         for chance, tied, pair in found:
             lacking = [name for name in pair if name in self.lacking and name not in there]
             seconds = gain.image_s * sum(self.megapixels[name] for name in lacking)
@@ -159,15 +160,16 @@ class ExpectedGain:
             if rate * options.max_seconds_per_image < 1.0:
                 continue
             all_s += seconds
-            if rate < SHARE_OF_BEST * best:
+            if rate * spent_s < saved:
                 continue
-            best = max(best, rate)
             chosen.append(pair)
             there.update(lacking)
             saved, spent_s = saved + brought, spent_s + seconds
             for key, _ in tied:
                 left[key] *= 1.0 - chance
-        return (saved / spent_s if chosen else 0.0), chosen, all_s
+        if not chosen or saved * options.max_seconds_per_image < spent_s:
+            return 0.0, [], 0.0
+        return saved / spent_s, chosen, all_s
 
 
 def insecure_images(

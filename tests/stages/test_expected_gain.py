@@ -8,6 +8,7 @@ import pytest
 
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.recipes import EscalateOptions, Level, load_recipe, recipe_names
+from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.expected_gain import (
     ExpectedGain,
     PairState,
@@ -100,7 +101,8 @@ def test_pairs_of_images_in_need_come_by_what_hints_at_a_surface() -> None:
     assert chosen(gains(INLIERS, {"a": 0.2})) == ["ae"]  # the others of a are strong
 
 
-def test_nothing_is_worth_more_than_it_costs() -> None:
+def test_nothing_is_worth_more_than_it_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(expected_gain, "MAPPING_S", 0.0)
     pairs, hints = gains(INLIERS, {"d": 1.0}, {"bd": 8}), {"bd": 8}
     rate, (best,), seconds = pairs.best_pairs(1, COVERS, 0b10, PATIENT)
     assert seconds >= gain_of(COVERS).pair_s
@@ -143,7 +145,20 @@ def test_a_level_that_verified_nothing_is_less_likely_to() -> None:
     assert gain_of(COVERS).chance(terms(PairState(0, 3), 5, 0)) > fresh
 
 
-def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_another() -> None:
+def test_the_more_mapping_costs_the_more_pairs_a_step_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = gains(INLIERS, {"d": 1.0}, {"ad": 1, "bd": 8, "cd": 2}, lacking="c")
+    assert chosen(pairs) == ["bd"]
+    rate = pairs.best_pairs(1, COVERS, 0b10, PATIENT)[0]
+    monkeypatch.setattr(expected_gain, "MAPPING_S", 10.0)
+    assert chosen(pairs) == ["bd", "cd", "ad"]
+    assert pairs.best_pairs(1, COVERS, 0b10, PATIENT)[0] < 0.5 * rate
+
+
+def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(expected_gain, "MAPPING_S", 0.0)
+
     def rate(inliers: dict[str, int], registered: str = "abc") -> float:
         all_inliers = {"ab": 200, "bc": 200, **inliers}
         pairs = gains(all_inliers, {"d": 1.0}, {"ad": 5}, registered=registered)
