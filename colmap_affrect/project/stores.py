@@ -35,6 +35,7 @@ NOT_KNOWN = Content()
 STATIONARY = "stationary_cells"  # [size, cells] of the places that never move
 STEP = "step"  # level and pairs of the step of escalation that has begun and not ended
 FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
+IN_VAIN = "all_features_in_vain"  # that list, and whether all features bring no more than some
 CLIMBING = "climbing_list"  # the same, of which there was a model before pairs were matched again
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
@@ -260,7 +261,7 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for note in (FINISHED, STEP, CLIMBING):
+            for note in (FINISHED, IN_VAIN, STEP, CLIMBING):
                 file.attrs.pop(note, None)
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))

@@ -18,12 +18,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import cached_property
-from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import ImageError, such_as
-from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
@@ -35,7 +33,12 @@ from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.expected_gain import ExpectedGain, PairState
 from colmap_affrect.stages.extract import extract_images
-from colmap_affrect.stages.match import matched_at_level, write_batches, write_matches
+from colmap_affrect.stages.match import (
+    matched_at_level,
+    num_confirming,
+    write_batches,
+    write_matches,
+)
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers, verify_new
@@ -168,7 +171,7 @@ class Escalation:
         for pair, indices in matches.items():
             key = indices.tobytes()
             if pair not in known or known[pair][0] != key:
-                known[pair] = key, self._confirming(pair, indices)
+                known[pair] = key, num_confirming(self.features, pair, indices)
         return {pair: known[pair][1] for pair in pairs}
 
     def next_work(self) -> tuple[int, list[Pair]] | None:
@@ -275,12 +278,7 @@ class Escalation:
         names, (first, second) = found.names, map(self.features.read_frames, found.names)
         if count := len(verifier.inliers(names, (first, second), found.indices)):
             return count, 0
-        return 0, self._confirming(names, found.indices)
-
-    def _confirming(self, pair: Pair, indices: Any) -> int:
-        first, second = map(self.features.read_frames, pair)
-        rows, columns = indices.T
-        return num_consistent_matches(first[rows], second[columns])
+        return 0, num_confirming(self.features, names, found.indices)
 
 
 def _megapixels(size: tuple[int, int], limit_px: int) -> float:

@@ -17,12 +17,13 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
+from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.matchers.base import MATCHERS, ImageFeatures, MatcherContext, MatcherOptions
 from colmap_affrect.pairs.lists import Pair, PairList, ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import FINISHED, FeatureStore, MatchStore, PairMatches
+from colmap_affrect.project.stores import FINISHED, IN_VAIN, FeatureStore, MatchStore, PairMatches
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.stages.context import Context, Resources, require_same_files
 from colmap_affrect.stages.extract import write_images_and_keypoints
@@ -34,6 +35,9 @@ logger = logging.getLogger(__name__)
 PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
 MANY_MATCHES = 300  # of the features matched first: photographs of different things have up to 76
+NUM_TRIED, MIN_GROWTH = 40, 1.1
+"""Pairs matched by all features before many are, and what these must have more matches that confirm
+each other. Small scans have none."""
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
 IMAGES_IN_MEMORY = 40  # of 13,000 features
@@ -69,7 +73,8 @@ def match(
         match_pairs(context, missing, options, advance, options.max_num_first)
     loose = not_well_tied(context.matches, pairs) if pairs and not is_finished else []
     with context.progress.stage("match, all features", len(loose), "pairs") as advance:
-        match_pairs(context, loose, options, advance)
+        if not _is_in_vain(context, loose, options, digest):
+            match_pairs(context, loose, options, advance)
     warnings = {}
     if pairs and (missing or finished is None):
         is_asked = options.filter_stationary_matches
@@ -122,6 +127,32 @@ def not_well_tied(matches: MatchStore, pairs: Sequence[Pair]) -> list[Pair]:
     count = Counter(name for pair in many for name in pair)
     well_tied = {name for name, num in count.items() if num >= NUM_WELL_TIED}
     return [pair for pair in nums if pair not in many and not well_tied.issuperset(pair)]
+
+
+def _is_in_vain(
+    context: Context, loose: Sequence[Pair], options: MatcherOptions, digest: str
+) -> bool:
+    """Tell whether all features tie pairs no better than some, by a sample where pairs are many."""
+    matches = context.matches
+    known = matches.note(IN_VAIN)
+    if (not known or known[0] != digest) and len(loose) > NUM_TRIED:
+        sample = loose[:: -(-len(loose) // NUM_TRIED)]
+
+        def confirmed(found: Iterable[PairMatches]) -> int:
+            return sum(num_confirming(context.features, one.names, one.indices) for one in found)
+
+        with closing(matched_at_level(context, sample, options, 0)) as found:
+            after = confirmed(found)
+        known = [digest, after < MIN_GROWTH * confirmed(matches.read(sample))]
+        matches.keep_note(IN_VAIN, known)
+    return bool(known and known == [digest, True])
+
+
+def num_confirming(features: FeatureStore, names: Pair, indices: Any) -> int:
+    """Return how many of the (M, 2) raw matches of a pair confirm each other."""
+    first, second = map(features.read_frames, names)
+    rows, columns = indices.T
+    return num_consistent_matches(first[rows], second[columns])
 
 
 def write_batches(

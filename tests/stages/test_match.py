@@ -128,3 +128,21 @@ def test_all_features_are_matched_once_a_pair_that_tied_an_image_is_not_listed(
     many = next(store.read([(a, c)])).indices
     assert len(many) > 2 * few
     assert database_content(out / "database.db")["raw matches"][a, c] == len(many)
+
+
+@pytest.mark.parametrize(("growth", "are_left"), [(1.1, False), (1e9, True)])
+def test_all_features_are_not_matched_where_a_sample_of_pairs_gains_nothing(
+    photos: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, growth: float,
+    are_left: bool,
+) -> None:  # fmt: skip
+    """Which is on record: the same command says so again."""
+    monkeypatch.setattr(stage, "NUM_TRIED", 2)
+    monkeypatch.setattr(stage, "MIN_GROWTH", growth)
+    out = tmp_path / "out"
+    assert call("extract", "--image-path", photos, "--output-path", out).code == 0
+    assert call("pairs", "--output-path", out).code == 0
+    for _ in range(2):
+        assert call("match", "--output-path", out, "--set", "matching.max_num_first=300").code == 0
+        store = MatchStore(out / "matches.h5")
+        assert bool(store.nums_of_some(exhaustive_pairs(PHOTOGRAPHS))) == are_left
+        monkeypatch.setattr(stage, "MIN_GROWTH", 0.0)
