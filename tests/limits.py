@@ -20,7 +20,7 @@ LIMITS = {
     "lines of the tests": 22_000,
     "lines of the longest file": 400,
     "lines of the longest function": 60,
-    "imports between folders": 164,
+    "imports between folders": 165,
     "words of ARCHITECTURE.md": 2_500,
     "words of BENCHMARKS.md": 2_500,
 }

@@ -16,6 +16,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import significance
 from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
+from colmap_affrect.geometry.parallax import line_of_writing
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -25,6 +26,7 @@ Frames = tuple[Floats, Floats]  # (N, 2, 3) of each image of a pair, in pixel-ce
 Matches = NDArray[np.integer]  # (M, 2), rows of the features of each image of a pair
 
 PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many
+MAX_WRITTEN_SHARE = 0.15  # of the inliers on a line of writing; where more are, they made it
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
 
@@ -92,7 +94,7 @@ def estimate_geometry(
     """Return the two-view geometry of (M, 2) raw matches; an empty one if it is rejected.
 
     The side of the smaller id comes first. ``extracted_px`` is the longest side that photographs
-    were shrunk to before extraction, if any.
+    were shrunk to before extraction, if any. Matches of writing are left out where they are many.
     """
     cameras = (sides[0].camera, sides[1].camera)
     matched = (sides[0].keypoints[matches[:, 0]], sides[1].keypoints[matches[:, 1]])
@@ -115,7 +117,14 @@ def estimate_geometry(
         geometry = _planar_geometry(geometry, (points1, points2), chosen)
         if len(geometry.inlier_matches) < min_num_inliers or is_chance(geometry):
             return pycolmap.TwoViewGeometry()
-    geometry.inlier_matches = matches.astype(np.uint32)[np.asarray(geometry.inlier_matches)[:, 0]]
+    inliers = np.asarray(geometry.inlier_matches)[:, 0]
+    if options.min_significance:
+        sizes = [(camera.width, camera.height) for camera in cameras]
+        written = line_of_writing(points1[inliers], points2[inliers], (sizes[0], sizes[1]))
+        if written.mean() > MAX_WRITTEN_SHARE:
+            scene = np.delete(matches, inliers[written], axis=0)
+            return estimate_geometry(sides, scene, options, extracted_px)
+    geometry.inlier_matches = matches.astype(np.uint32)[inliers]
     return geometry
 
 

@@ -3,10 +3,12 @@
 All points are (N, 2) px with the corner of the image at (0, 0); sizes are (width, height) px.
 """
 
+from typing import Any
+
 import cv2
 import numpy as np
 
-from colmap_affrect.geometry.arrays import Array, Floats, Indices
+from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices
 from colmap_affrect.geometry.two_views import homogeneous
 
 Size = tuple[int, int]
@@ -20,6 +22,11 @@ MARGIN = 16  # px around an image, for what is moved out of it
 MIN_FREE_SHARE = 0.1  # where keypoints are so dense that chance leaves less, nothing can be told
 NUM_STARTS = 30  # rotations of two matches each; least squares begin with the best
 MAX_ITERATIONS = 3  # least squares are repeated without outliers
+WRITING_ERROR, WRITING_HEIGHT = 0.001, 0.015  # of the longer side: a line of small print
+WRITING_SLOPE = 0.087  # of a line against the sides of an image, five degrees
+MIN_ONE_VIEW, ONE_VIEW_ERROR = 0.85, 0.003  # share of matches, and longer sides: paper is not flat
+SIDE_PX, WINDOW_PX, MIN_VARIANCE = 400, 11, 60.0  # of what is compared, in gray values
+MAX_NUM_SIMILARITIES = 300  # tried: enough for a set that one in eight matches is in
 
 
 def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], error: float) -> float:
@@ -73,6 +80,65 @@ def _rays(points: Array) -> Array:
 def _some(points: Array) -> Array:
     """Return at most ``MAX_NUM_POINTS``, evenly spaced in their order."""
     return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
+
+
+def line_of_writing(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Bools:
+    """Return which matches are on one thin line along the sides of both images, as print is.
+
+    It is the largest set that a similarity explains, and empty where that is no line. Matches of
+    one line tell no pose, and a caption is at another place of each print.
+    """
+    _, found = cv2.estimateAffinePartial2D(
+        points1,
+        points2,
+        ransacReprojThreshold=WRITING_ERROR * max(map(max, sizes)),
+        maxIters=MAX_NUM_SIMILARITIES,
+    )
+    on_line = np.zeros(len(points1), bool) if found is None else found.ravel() > 0
+    for points, size in zip((points1, points2), sizes, strict=True):
+        inside = points[on_line]
+        if not len(inside):
+            return on_line
+        _, _, axes = np.linalg.svd(inside - inside.mean(axis=0), full_matrices=False)
+        is_thin = np.ptp(inside @ axes[-1]) <= WRITING_HEIGHT * max(size)
+        if not is_thin or np.abs(axes[0]).min() > WRITING_SLOPE:
+            return np.zeros(len(points1), bool)
+    return on_line
+
+
+def homography_of_one_view(
+    points1: Array, points2: Array, sizes: tuple[Size, Size]
+) -> Array | None:
+    """Return the (3, 3) homography of px that explains nearly all matches, if there is one."""
+    error = ONE_VIEW_ERROR * max(map(max, sizes))
+    homography, found = cv2.findHomography(points1, points2, cv2.RANSAC, error)
+    if homography is None or np.mean(found) < MIN_ONE_VIEW:
+        return None
+    return np.asarray(homography)
+
+
+def correlation(gray1: Bytes, gray2: Bytes, homography: Array) -> float:
+    """Return the median correlation of windows of a gray image and of another, moved onto it.
+
+    The (3, 3) homography takes px of image 1 to image 2; windows of one gray do not count.
+    """
+    scale = SIDE_PX / max(gray2.shape)
+    half = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])  # to pixel centres
+    shrunk = half @ np.diag([scale, scale, 1.0]) @ homography @ np.linalg.inv(half)
+    size = round(gray2.shape[1] * scale), round(gray2.shape[0] * scale)
+    second = cv2.resize(gray2, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    blur = 0.5 / np.sqrt(abs(np.linalg.det(shrunk[:2, :2])))
+    blurred = cv2.GaussianBlur(gray1, (0, 0), blur).astype(np.float32)
+    first = cv2.warpPerspective(blurred, shrunk, size, borderValue=-1.0)
+    is_seen = cv2.erode((first >= 0.0).astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX)))
+    products: Any = first, second, first * first, second * second, first * second
+    means = (cv2.blur(image, (WINDOW_PX, WINDOW_PX)) for image in products)
+    mean1, mean2, square1, square2, product = means
+    variances = square1 - mean1**2, square2 - mean2**2
+    places = (is_seen > 0) & (np.maximum(*variances) > MIN_VARIANCE)
+    deviations = np.sqrt(np.maximum(variances[0] * variances[1], 1.0))
+    found = ((product - mean1 * mean2) / deviations)[places]
+    return float(np.median(found)) if found.size else 0.0
 
 
 def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -> float:

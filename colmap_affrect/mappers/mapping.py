@@ -14,6 +14,7 @@ from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
 from colmap_affrect.errors import damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
+from colmap_affrect.mappers.one_view import one_views
 from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, graph_of
 from colmap_affrect.mappers.reliability import Judgement, focal_growths, judge
 from colmap_affrect.mappers.snapshots import with_snapshots
@@ -145,7 +146,10 @@ def _summary(
 ) -> ModelSummary:
     """Count what a model holds, and say how sure it is of each photograph."""
     model = mapped.reconstruction
-    images = [model.images[image_id] for image_id in model.reg_image_ids()]
+    inside = set(model.reg_image_ids())
+    images = [model.images[image_id] for image_id in sorted(inside)]
+    graph = graph_of(task, MIN_NUM_MATCHES)
+    alike = sorted(one_views(graph, task.image_path))
     focals = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
     return ModelSummary(
         registered_names=tuple(sorted(focals)),
@@ -159,5 +163,6 @@ def _summary(
         taken_out={name: one.reason for name, one in taken.items()},
         focals_px=focals,
         moves=mapped.moves,
-        tie_points=tie_points_of(task, graph_of(task, MIN_NUM_MATCHES)).report(model),
+        tie_points=tie_points_of(task, graph).report(model),
+        one_view=tuple((graph.names[a], graph.names[b]) for a, b in alike if inside >= {a, b}),
     )

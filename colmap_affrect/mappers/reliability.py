@@ -29,6 +29,7 @@ from colmap_affrect.mappers.adjustment import (
 )
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import Evidence, cells, pair_evidence
+from colmap_affrect.mappers.one_view import one_views
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
     Ids,
@@ -200,14 +201,15 @@ def measure(
     three, long = evidence.three_view_ratios(model), num_long_tracks(model)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
     growths = focal_growths(model, task) if growths is None else growths
+    one_view = one_views(graph, task.image_path)
     fitting_px = _fitting_focals(model, task, priors)
     tied = tied_evidence(tie_points_of(task, graph).residuals(model))
     zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
     found = {}
     for image_id, own in pairs_of.items():
         shares, weights = [agreements[p.ids] for p in own], [len(p.matches) for p in own]
-        cells_of = [evidence.num_cells(pair) for pair in own]
-        nats = sum(pair_evidence(share * n, n) for share, n in zip(shares, cells_of, strict=True))
+        cells_of = {p.ids: evidence.num_cells(p) for p in own if p.ids not in one_view}
+        nats = sum(pair_evidence(agreements[ids] * n, n) for ids, n in cells_of.items())
         rotations = [turned[p.ids] for p in own if p.ids in turned] or list(turned.values())
         name, camera = graph.names[image_id], cameras[image_id]
         focal_px = float(camera.mean_focal_length())
@@ -238,15 +240,10 @@ def _rotation_shares(
     }
     found = {}
     for pair in list(strongest.values())[:: -(-len(strongest) // MAX_PAIRS_TURNED) or 1]:
-        sizes = _sizes(graph, pair.ids)
+        sizes = graph.sizes(pair.ids)
         error = MAX_ERROR * max(map(max, sizes))
         found[pair.ids] = rotation_share(*graph.points(pair), sizes, error)
     return found
-
-
-def _sizes(graph: PairGraph, ids: Ids) -> tuple[Size, Size]:
-    first, second = (graph.cameras[image_id] for image_id in ids)
-    return (first.width, first.height), (second.width, second.height)
 
 
 def _originals(
@@ -260,7 +257,7 @@ def _originals(
     mirrored = []
     for pair in graph.pairs[:: max(1, -(-len(graph.pairs) // MAX_PAIRS_FOR_COPIES))]:
         first, second = (graph.keypoints[image_id] for image_id in pair.ids)
-        if mirrored_share(first, second, _sizes(graph, pair.ids)) >= MIN_SHARE_MIRRORED:
+        if mirrored_share(first, second, graph.sizes(pair.ids)) >= MIN_SHARE_MIRRORED:
             mirrored.append(pair.ids)
     unclear = {image_id for ids in mirrored for image_id in ids}
     support: defaultdict[int, float] = defaultdict(float)

@@ -20,7 +20,7 @@ SOURCES = {  # how a summary calls where focal lengths are from; others by their
 
 OF_LARGEST = (  # what ``report.json`` has of the largest model under its own name
     "registered_names", "probabilities", "doubtful", "mean_track_length",
-    "mean_reprojection_error_px", "moves",
+    "mean_reprojection_error_px", "moves", "one_view",
 )  # fmt: skip
 
 SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
@@ -136,6 +136,7 @@ class ModelSummary:
     focals_px: dict[str, float] = field(default_factory=dict)  # of the cameras of the images
     moves: tuple[str, ...] = ()  # what made the model, by the sparse mapper
     tie_points: tuple[Residual, ...] = ()  # those by hand, the worst first
+    one_view: tuple[tuple[str, str], ...] = ()  # prints of one negative, or from one place
 
     @property
     def sure(self) -> tuple[str, ...]:
@@ -151,6 +152,8 @@ class ModelSummary:
         """Return what a summary says of the largest model."""
         lines = _some(f"joined      {name} {one.text()}" for name, one in self.bridges.items())
         lines += _some(f"doubtful    {line}" for line in by_story(self.doubtful))
+        alike = (f"one view    {a} and {b}: no depth between them" for a, b in self.one_view)
+        lines += _some(alike)
         return [
             f"sure        {len(self.sure)}, right with a probability of {SURE:.0%} or more",
             *lines,

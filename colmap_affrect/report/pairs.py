@@ -220,6 +220,7 @@ def _chosen(
         [(pair, "most inliers disagree with the model") for pair in shares if shares[pair] < 0.5],
         [(pair, "rejected by hand") for pair in context.by_hand.rejected],
         [((name, x.by), f"{name} came in by this pair") for name, x in model.bridges.items()],
+        [(pair, "one view: of one negative, or from one place") for pair in model.one_view],
         [(best.get(name), f"{name} is doubtful") for name in model.doubtful],
         [(best.get(name), f"{name} is missing") for name in report.unregistered],
         [(best[name], f"the strongest pair of {name}") for name in held[:MAX_NUM_ALIKE]],

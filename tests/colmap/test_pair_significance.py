@@ -219,3 +219,31 @@ def test_threshold_grows_with_photographs_that_were_shrunk() -> None:
     assert max_error_px(cameras, options, 6400) == 3.0
     colmap = VerificationOptions.preset("colmap", max_error_px=3.0)
     assert max_error_px(cameras, colmap, 640) == 3.0
+
+
+def with_caption(frames: Frames) -> Frames:
+    """Add forty matches of print below, which is a little larger and elsewhere in image 2."""
+    lafs, _ = frames_of([np.eye(3)], 40, 11)
+    lafs[:, :, 2] = np.random.default_rng(12).uniform((200, 440), (350, 446), (40, 2))
+    moved = transform_frames(np.array([[1.05, 0.02, 60.0], [-0.02, 1.05, -390.0], [0, 0, 1]]), lafs)
+    return np.concatenate([frames[0], lafs]), np.concatenate([frames[1], moved])
+
+
+def test_writing_at_another_place_ties_no_pair_and_leaves_none() -> None:
+    normals = (0.05, 0.02, 0.2), (-0.1, 0.1, 0.3)
+    scene = frames_of([plane_homography(np.array(n)) for n in normals], 80, 1)
+    wrong = np.random.default_rng(3).permutation(80)
+    unrelated = scene[0], scene[1][wrong]
+    for frames, expected in (scene, 80), (unrelated, 0):
+        sides = tuple(
+            Side(camera(number), rows(lafs)) for number, lafs in enumerate(with_caption(frames), 1)
+        )
+        matches = np.stack([np.arange(120)] * 2, axis=1)
+        found = estimate_geometry((sides[0], sides[1]), matches, VerificationOptions())
+        inliers = np.asarray(found.inlier_matches).reshape(-1, 2)[:, 0]
+        assert (inliers < 80).sum() >= 0.95 * expected
+        assert (inliers >= 80).sum() <= 4  # those that the epipolar geometry explains by chance
+        accepted = estimate_geometry(
+            (sides[0], sides[1]), matches, VerificationOptions(min_significance=0.0)
+        )
+        assert len(accepted.inlier_matches) >= 40

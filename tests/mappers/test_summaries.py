@@ -23,6 +23,7 @@ MODEL = ModelSummary(
     bridges={"č.jpg": Bridge("a.jpg", 32, 36, 0.031)},
     taken_out={"d.jpg": "held by only 3 points"},
     focals_px={"a.jpg": 812.5, "č.jpg": 900.0},
+    one_view=(("a.jpg", "č.jpg"),),
 )
 
 

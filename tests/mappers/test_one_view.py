@@ -1,0 +1,54 @@
+"""Prints of one negative show one view; photographs of other things where they are do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from mapping_tasks import write_images
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.mappers.one_view import one_views
+from colmap_affrect.mappers.pair_graph import PairGraph
+
+WIDTH, HEIGHT = 480, 320
+PRINT = np.array([[0.55, -0.01, 130.0], [0.01, 0.55, 40.0], [0.0, 0.0, 1.0]])
+"""Px of the photograph to those of its print, the corner of each at (0, 0)."""
+
+
+def texture(seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, 40, (HEIGHT // 4, WIDTH // 4))
+    return np.asarray(cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) + 128)
+
+
+def printed(photograph: np.ndarray) -> np.ndarray:
+    """A print on white paper, of half the contrast."""
+    centres = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
+    moved = (centres @ PRINT @ np.linalg.inv(centres))[:2]
+    return np.asarray(
+        cv2.warpAffine(0.5 * photograph + 60, moved, (WIDTH, HEIGHT), borderValue=250.0)
+    )
+
+
+def test_prints_of_one_negative_are_one_view(tmp_path: Path) -> None:
+    photographs = {"a.png": texture(1), "b.png": printed(texture(1)), "c.png": printed(texture(2))}
+    for name, content in photographs.items():
+        cv2.imwrite(str(tmp_path / name), np.clip(content, 0, 255).astype(np.uint8))
+    points = np.random.default_rng(3).uniform((20, 20), (WIDTH - 20, HEIGHT - 20), (60, 2))
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500, WIDTH, HEIGHT)
+    moved = project(PRINT, points)
+    moved[:8] += 30.0  # wrong ones
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.inlier_matches = np.stack([np.arange(60, dtype=np.uint32)] * 2, axis=1)
+    with open_database(tmp_path / "database.db") as database:
+        write_images(database, camera, photographs)
+        for image_id, places in enumerate((points, moved, moved), 1):
+            database.write_keypoints(image_id, places.astype(np.float32))
+        for other in (2, 3):  # of both the same matches
+            database.write_two_view_geometry(1, other, geometry)
+    graph = PairGraph.read(tmp_path / "database.db")
+    assert one_views(graph, tmp_path) == {(1, 2)}
+    assert one_views(graph, None) == frozenset()
