@@ -8,7 +8,7 @@ import hashlib
 import json
 import struct
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -204,10 +204,14 @@ def read_given_model(folder: Path, option: str = "") -> pycolmap.Reconstruction:
         raise errors.OptionError(f"{option}{folder}: {why}") from error
 
 
-def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
-    """Return how many points that three images or more see each image sees, by its id."""
+def num_long_tracks(model: pycolmap.Reconstruction, same_view: Mapping[int, int]) -> Counter[int]:
+    """Return how many points of three views or more each image sees, by its id.
+
+    ``same_view``: of images that show the view of another one, the id of that.
+    """
     tracks = ({e.image_id for e in point.track.elements} for point in model.points3D.values())
-    return Counter(image_id for images in tracks if len(images) > 2 for image_id in images)
+    long = (images for images in tracks if len({same_view.get(i, i) for i in images}) > 2)
+    return Counter(image_id for images in long for image_id in images)
 
 
 def seen_points(image: pycolmap.Image) -> Indices:

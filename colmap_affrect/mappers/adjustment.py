@@ -164,5 +164,5 @@ class Adjuster:
 
 def has_long_tracks(model: pycolmap.Reconstruction) -> bool:
     """Tell whether each image sees enough points of three images to do without those of two."""
-    counts = num_long_tracks(model)
+    counts = num_long_tracks(model, {})
     return all(counts[image_id] >= MIN_LONG_TRACKS for image_id in model.reg_image_ids())

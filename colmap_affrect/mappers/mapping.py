@@ -146,9 +146,8 @@ def _summary(
 ) -> ModelSummary:
     """Count what a model holds, and say how sure it is of each photograph."""
     model = mapped.reconstruction
-    inside = set(model.reg_image_ids())
+    inside, graph = set(model.reg_image_ids()), graph_of(task, MIN_NUM_MATCHES)
     images = [model.images[image_id] for image_id in sorted(inside)]
-    graph = graph_of(task, MIN_NUM_MATCHES)
     alike = sorted(one_views(graph, task.image_path))
     focals = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
     return ModelSummary(

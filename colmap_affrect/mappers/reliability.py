@@ -198,10 +198,12 @@ def measure(
     for pair in pairs:
         for image_id in pair.ids:
             pairs_of[image_id].append(pair)
-    three, long = evidence.three_view_ratios(model), num_long_tracks(model)
+    one_view, same_view = one_views(graph, task.image_path), dict[int, int]()
+    for first, second in sorted(one_view):
+        same_view[second] = same_view.get(first, first)
+    three, long = evidence.three_view_ratios(model), num_long_tracks(model, same_view)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
     growths = focal_growths(model, task) if growths is None else growths
-    one_view = one_views(graph, task.image_path)
     fitting_px = _fitting_focals(model, task, priors)
     tied = tied_evidence(tie_points_of(task, graph).residuals(model))
     zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)

@@ -10,6 +10,7 @@ from mapping_tasks import write_images
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.mappers.one_view import one_views
 from colmap_affrect.mappers.pair_graph import PairGraph
@@ -52,3 +53,14 @@ def test_prints_of_one_negative_are_one_view(tmp_path: Path) -> None:
     graph = PairGraph.read(tmp_path / "database.db")
     assert one_views(graph, tmp_path) == {(1, 2)}
     assert one_views(graph, None) == frozenset()
+
+
+def test_points_that_one_view_sees_twice_are_of_two_views() -> None:
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=30))
+    images = sorted(model.reg_image_ids())
+    for point_id in sorted(model.point3D_ids()):
+        model.delete_point3D(point_id)
+    track = pycolmap.Track([pycolmap.TrackElement(image_id, 0) for image_id in images[:3]])
+    model.add_point3D(np.zeros(3), track)
+    assert num_long_tracks(model, {}) == dict.fromkeys(images[:3], 1)
+    assert not num_long_tracks(model, {images[2]: images[0]})
