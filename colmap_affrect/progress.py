@@ -1,4 +1,4 @@
-"""Progress of long stages, a tqdm bar, plain lines or silence, and how long a whole run takes."""
+"""Progress of long stages: a tqdm bar, lines or silence; and when the first model will be there."""
 
 import subprocess
 import threading
@@ -14,7 +14,7 @@ from colmap_affrect.errors import shown
 
 Advance = Callable[[int], None]  # report that so many more units are done
 NUM_PLAIN_LINES = 10
-COSTS = {"extract": 1.0, "match": 0.25, "verify": 0.15, "map": 0.7}
+COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 """Of an image or a pair in a stage, in the time of an image in ``extract``: measured on runs
 of 8 to 1000 photographs, good for a factor of 2."""
 MIN_ELAPSED_S = 3.0  # of a stage: before, it has loaded files and networks, and says too little
@@ -39,7 +39,7 @@ class Forecast:
         self._cost, self._start_s = is_known * COSTS.get(name, 0.0) * total, self._clock()
 
     def text(self, frac: float) -> str:
-        """Say how long the whole run takes, when a fraction of the stage is done.
+        """Say how long the first model takes, when a fraction of the stage is done.
 
         Empty while too little is measured, in the last minute, and from mapping on.
         """
@@ -51,7 +51,7 @@ class Forecast:
         if minutes < 1:
             return ""
         about = f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
-        return f"whole run: about {about} left"
+        return f"first model in about {about}"
 
 
 @dataclass(eq=False)

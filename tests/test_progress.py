@@ -36,7 +36,7 @@ def test_forecast_measures_what_has_begun_and_guesses_the_rest_from_it() -> None
             advance(1)
     minutes = 10 + 190 * (COSTS["match"] + COSTS["verify"]) + 28 * COSTS["map"]
     assert lines.getvalue().splitlines()[4] == (
-        f"extract: 10/20 images, whole run: about {minutes / 60:.1f} h left"
+        f"extract: 10/20 images, first model in about {minutes:.0f} min"
     )
     forecast.begin("match", 190)
     forecast.begin("verify", 190)
