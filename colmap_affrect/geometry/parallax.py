@@ -24,7 +24,7 @@ NUM_STARTS = 30  # rotations of two matches each; least squares begin with the b
 MAX_ITERATIONS = 3  # least squares are repeated without outliers
 WRITING_ERROR, WRITING_HEIGHT = 0.001, 0.015  # of the longer side: a line of small print
 WRITING_SLOPE = 0.087  # of a line against the sides of an image, five degrees
-MIN_ONE_VIEW, ONE_VIEW_ERROR = 0.85, 0.003  # share of matches, and longer sides: paper is not flat
+MIN_ONE_VIEW, ONE_VIEW_ERROR = 0.85, 0.01  # share of matches, and longer sides: paper is not flat
 SIDE_PX, WINDOW_PX, MIN_VARIANCE = 400, 11, 60.0  # of what is compared, in gray values
 MAX_NUM_SIMILARITIES = 300  # tried: enough for a set that one in eight matches is in
 
@@ -106,15 +106,14 @@ def line_of_writing(points1: Array, points2: Array, sizes: tuple[Size, Size]) ->
     return on_line
 
 
-def homography_of_one_view(
-    points1: Array, points2: Array, sizes: tuple[Size, Size]
-) -> Array | None:
-    """Return the (3, 3) homography of px that explains nearly all matches, if there is one."""
+def one_view_homography(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Array | None:
+    """Return the (3, 3) homography of px of matches that a mere change of scale nearly explains."""
     error = ONE_VIEW_ERROR * max(map(max, sizes))
-    homography, found = cv2.findHomography(points1, points2, cv2.RANSAC, error)
-    if homography is None or np.mean(found) < MIN_ONE_VIEW:
+    _, found = cv2.estimateAffinePartial2D(points1, points2, ransacReprojThreshold=error)
+    if found is None or np.mean(found) < MIN_ONE_VIEW:
         return None
-    return np.asarray(homography)
+    homography, _ = cv2.findHomography(points1, points2, cv2.RANSAC, error / 3)
+    return None if homography is None else np.asarray(homography)
 
 
 def correlation(gray1: Bytes, gray2: Bytes, homography: Array) -> float:

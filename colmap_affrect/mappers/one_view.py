@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from colmap_affrect.errors import ImageError
-from colmap_affrect.geometry.parallax import correlation, homography_of_one_view
+from colmap_affrect.geometry.parallax import correlation, one_view_homography
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph
 
@@ -21,7 +21,7 @@ def one_views(graph: PairGraph, image_path: Path | None) -> frozenset[Ids]:
     found = set[Ids]()
     for pair in graph.pairs[:: -(-len(graph.pairs) // MAX_PAIRS) or 1] if image_path else ():
         points1, points2 = graph.points(pair)
-        homography = homography_of_one_view(points1, points2, graph.sizes(pair.ids))
+        homography = one_view_homography(points1, points2, graph.sizes(pair.ids))
         if homography is None or image_path is None:
             continue
         try:

@@ -17,7 +17,8 @@ from colmap_affrect.mappers.pair_graph import PairGraph
 
 WIDTH, HEIGHT = 480, 320
 PRINT = np.array([[0.55, -0.01, 130.0], [0.01, 0.55, 40.0], [0.0, 0.0, 1.0]])
-"""Px of the photograph to those of its print, the corner of each at (0, 0)."""
+TURNED = np.array([[0.9, 0.05, 10.0], [-0.02, 0.95, 8.0], [5e-4, 0.0, 1.0]])
+"""Px of the photograph to those of its print and of another view, the corner of each at (0, 0)."""
 
 
 def texture(seed: int) -> np.ndarray:
@@ -25,17 +26,16 @@ def texture(seed: int) -> np.ndarray:
     return np.asarray(cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) + 128)
 
 
-def printed(photograph: np.ndarray) -> np.ndarray:
+def printed(photograph: np.ndarray, homography: np.ndarray = PRINT) -> np.ndarray:
     """A print on white paper, of half the contrast."""
     centres = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
-    moved = (centres @ PRINT @ np.linalg.inv(centres))[:2]
-    return np.asarray(
-        cv2.warpAffine(0.5 * photograph + 60, moved, (WIDTH, HEIGHT), borderValue=250.0)
-    )
+    moved, faded = centres @ homography @ np.linalg.inv(centres), 0.5 * photograph + 60
+    return np.asarray(cv2.warpPerspective(faded, moved, (WIDTH, HEIGHT), borderValue=250.0))
 
 
 def test_prints_of_one_negative_are_one_view(tmp_path: Path) -> None:
     photographs = {"a.png": texture(1), "b.png": printed(texture(1)), "c.png": printed(texture(2))}
+    photographs["d.png"] = printed(texture(1), TURNED)
     for name, content in photographs.items():
         cv2.imwrite(str(tmp_path / name), np.clip(content, 0, 255).astype(np.uint8))
     points = np.random.default_rng(3).uniform((20, 20), (WIDTH - 20, HEIGHT - 20), (60, 2))
@@ -46,9 +46,9 @@ def test_prints_of_one_negative_are_one_view(tmp_path: Path) -> None:
     geometry.inlier_matches = np.stack([np.arange(60, dtype=np.uint32)] * 2, axis=1)
     with open_database(tmp_path / "database.db") as database:
         write_images(database, camera, photographs)
-        for image_id, places in enumerate((points, moved, moved), 1):
+        for image_id, places in enumerate((points, moved, moved, project(TURNED, points)), 1):
             database.write_keypoints(image_id, places.astype(np.float32))
-        for other in (2, 3):  # of both the same matches
+        for other in (2, 3, 4):  # of 2 and 3 the same matches; 4 is another view of the plane
             database.write_two_view_geometry(1, other, geometry)
     graph = PairGraph.read(tmp_path / "database.db")
     assert one_views(graph, tmp_path) == {(1, 2)}
