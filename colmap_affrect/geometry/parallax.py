@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices
+from colmap_affrect.geometry.conventions import pixel_from_colmap, resized_from_original
 from colmap_affrect.geometry.two_views import homogeneous
 
 Size = tuple[int, int]
@@ -88,12 +89,8 @@ def line_of_writing(points1: Array, points2: Array, sizes: tuple[Size, Size]) ->
     It is the largest set that a similarity explains, and empty where that is no line. Matches of
     one line tell no pose, and a caption is at another place of each print.
     """
-    _, found = cv2.estimateAffinePartial2D(
-        points1,
-        points2,
-        ransacReprojThreshold=WRITING_ERROR * max(map(max, sizes)),
-        maxIters=MAX_NUM_SIMILARITIES,
-    )
+    how = cv2.RANSAC, WRITING_ERROR * max(map(max, sizes)), MAX_NUM_SIMILARITIES
+    _, found = cv2.estimateAffinePartial2D(points1, points2, None, *how)
     on_line = np.zeros(len(points1), bool) if found is None else found.ravel() > 0
     for points, size in zip((points1, points2), sizes, strict=True):
         inside = points[on_line]
@@ -107,24 +104,25 @@ def line_of_writing(points1: Array, points2: Array, sizes: tuple[Size, Size]) ->
 
 
 def one_view_homography(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Array | None:
-    """Return the (3, 3) homography of px of matches that a mere change of scale nearly explains."""
+    """Return the (3, 3) homography of px centres if a change of scale nearly explains matches."""
     error = ONE_VIEW_ERROR * max(map(max, sizes))
     _, found = cv2.estimateAffinePartial2D(points1, points2, ransacReprojThreshold=error)
     if found is None or np.mean(found) < MIN_ONE_VIEW:
         return None
-    homography, _ = cv2.findHomography(points1, points2, cv2.RANSAC, error / 3)
+    centres = pixel_from_colmap(points1), pixel_from_colmap(points2)
+    homography, _ = cv2.findHomography(*centres, cv2.RANSAC, error / 3)
     return None if homography is None else np.asarray(homography)
 
 
 def correlation(gray1: Bytes, gray2: Bytes, homography: Array) -> float:
     """Return the median correlation of windows of a gray image and of another, moved onto it.
 
-    The (3, 3) homography takes px of image 1 to image 2; windows of one gray do not count.
+    The (3, 3) homography takes px centres of image 1 to image 2; windows of one gray do not count.
     """
-    scale = SIDE_PX / max(gray2.shape)
-    half = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])  # to pixel centres
-    shrunk = half @ np.diag([scale, scale, 1.0]) @ homography @ np.linalg.inv(half)
-    size = round(gray2.shape[1] * scale), round(gray2.shape[0] * scale)
+    height, width = gray2.shape
+    scale = SIDE_PX / max(height, width)
+    size = round(width * scale), round(height * scale)
+    shrunk = resized_from_original((width, height), size) @ homography
     second = cv2.resize(gray2, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     blur = 0.5 / np.sqrt(abs(np.linalg.det(shrunk[:2, :2])))
     blurred = cv2.GaussianBlur(gray1, (0, 0), blur).astype(np.float32)

@@ -19,10 +19,12 @@ MAX_PAIRS = 1000  # looked at, all of 45 photographs; of more some are missed
 def one_views(graph: PairGraph, image_path: Path | None) -> frozenset[Ids]:
     """Return the pairs of a graph that show one view, by the photographs below a folder."""
     found = set[Ids]()
-    for pair in graph.pairs[:: -(-len(graph.pairs) // MAX_PAIRS) or 1] if image_path else ():
+    if image_path is None:
+        return frozenset()
+    for pair in graph.pairs[:: -(-len(graph.pairs) // MAX_PAIRS) or 1]:
         points1, points2 = graph.points(pair)
         homography = one_view_homography(points1, points2, graph.sizes(pair.ids))
-        if homography is None or image_path is None:
+        if homography is None:
             continue
         try:
             first, second = (read_gray(image_path / graph.names[i]) for i in pair.ids)
