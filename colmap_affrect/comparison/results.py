@@ -97,11 +97,6 @@ class SeedResult:
         """Images of the largest model."""
         return self.models[0] if self.models else ()
 
-    @property
-    def right_names(self) -> tuple[str, ...]:
-        """Images registered correctly; without ground truth those that the mapper is sure of."""
-        return self.scores.correct_names if self.scores else self.sure
-
 
 @dataclass(frozen=True)
 class Measure:
@@ -163,7 +158,8 @@ class MethodResult:
     @property
     def right(self) -> Span:
         """Images registered correctly; without ground truth those that the mapper is sure of."""
-        return Span.of(len(seed.right_names) for seed in self.seeds)
+        found = (s.scores.correct_names if s.scores else s.sure for s in self.seeds)
+        return Span.of(map(len, found))
 
     @property
     def shown_seed(self) -> SeedResult | None:

@@ -95,10 +95,12 @@ class Adjuster:
         options.refine_focal_length = self.refining.refine_focal_length
         options.refine_principal_point = self.refining.refine_principal_point
         options.refine_extra_params = self.refining.refine_extra_params
-        options.min_track_length = 3 if has_long_tracks(model) else 2
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = self.noise_px
         config, registered = pycolmap.BundleAdjustmentConfig(), set(model.reg_image_ids())
+        counts = num_long_tracks(model, {})
+        has_long = all(counts[image_id] >= MIN_LONG_TRACKS for image_id in registered)
+        options.min_track_length = 3 if has_long else 2
         images = sorted(registered if image_ids is None else set(image_ids))
         for image_id in images:
             config.add_image(image_id)
@@ -160,9 +162,3 @@ class Adjuster:
         # Reprojection errors are in px, priors in units of their deviation times the noise.
         normal = pyceres.factors.NormalPrior(mean, np.diag((sigma / self.noise_px) ** 2))
         problem.add_residual_block(normal, None, [camera.params])
-
-
-def has_long_tracks(model: pycolmap.Reconstruction) -> bool:
-    """Tell whether each image sees enough points of three images to do without those of two."""
-    counts = num_long_tracks(model, {})
-    return all(counts[image_id] >= MIN_LONG_TRACKS for image_id in model.reg_image_ids())

@@ -41,21 +41,15 @@ class MappingTask:
     """What to map."""
 
     database_path: Path  # COLMAP database with two-view geometries
-    image_path: (
-        Path | None
-    )  # folder of the photographs, for the colours of points; None: no colours
+    image_path: Path | None  # folder of the photographs, for the colours of points
     extend: ExistingModel | None = None  # register images into this model
     # the model from before pairs were matched again, and what made it: mappers may begin with it
     before: MappedModel | None = None
     snapshot_path: Path | None = None  # of snapshots to go on from; mappers may leave it unused
-    cancellation: pycolmap.CancellationToken | None = (
-        None  # by which mapping is stopped from outside
-    )
+    cancellation: pycolmap.CancellationToken | None = None  # stops mapping from outside
     # pairs of image names that only frames verify which were not measured one by one
     unmeasured: frozenset[tuple[str, str]] = frozenset()
-    cameras: Mapping[int, CameraRecord] = field(
-        default_factory=dict
-    )  # what is known of them, by id
+    cameras: Mapping[int, CameraRecord] = field(default_factory=dict)  # what is known, by id
     may_share: bool = False  # images of one size may turn out to share a camera that nobody knows
     # which keypoints show the same by hand, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)

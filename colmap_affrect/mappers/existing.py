@@ -81,7 +81,10 @@ class ExistingModel:
 
         The model as a whole is moved back onto them: COLMAP gives it another scale.
         """
-        _move_onto(model, self.images)
+        kept = [image for image in self.images if model.image(image.image_id).has_pose]
+        now = _points_of([model.image(image.image_id) for image in kept])
+        if moved := pycolmap.estimate_sim3d(now, _points_of(kept)):
+            model.transform(moved)
         for image in self.images:
             frame = model.frame(image.frame_id)
             if not (frame.has_pose() and self.refine):
@@ -182,14 +185,6 @@ def _take_poses(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) ->
             raise AffrectError(
                 f"--extend {path}: the pose of {image.name} does not fit the rig it has here"
             )
-
-
-def _move_onto(model: pycolmap.Reconstruction, images: list[pycolmap.Image]) -> None:
-    """Move a model by the similarity that brings its images onto their earlier poses."""
-    registered = [image for image in images if model.image(image.image_id).has_pose]
-    now = _points_of([model.image(image.image_id) for image in registered])
-    if moved := pycolmap.estimate_sim3d(now, _points_of(registered)):
-        model.transform(moved)
 
 
 def _points_of(images: list[pycolmap.Image]) -> Array:

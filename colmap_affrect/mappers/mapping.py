@@ -158,7 +158,7 @@ def _summary(
         probabilities={name: round(one.probability, 3) for name, one in found.items()},
         gains={name: round(one.gain, 3) for name, one in {**taken, **found}.items()},
         doubtful={name: one.reason for name, one in found.items() if one.probability < DOUBTFUL},
-        bridges=dict(mapped.bridges),
+        bridges={name: one for name, one in mapped.bridges.items() if name in focals},
         taken_out={name: one.reason for name, one in taken.items()},
         focals_px=focals,
         moves=mapped.moves,

@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import networkx
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
@@ -32,6 +33,7 @@ from colmap_affrect.mappers.evidence import Evidence, cells, pair_evidence
 from colmap_affrect.mappers.one_view import one_views
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
+    MIN_SHARE,
     Ids,
     PairGraph,
     VerifiedPair,
@@ -41,7 +43,6 @@ from colmap_affrect.mappers.pair_graph import (
 )
 from colmap_affrect.mappers.tie_points import tie_points_of, tied_evidence
 from colmap_affrect.parallel.executor import available_cores, map_ordered
-from colmap_affrect.project.report import Bridge
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 FREE_SIGMA = 1.0  # of the logarithm of a focal length that is given, where it is freed
@@ -59,6 +60,9 @@ MIN_SHARE_MIRRORED = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
 images a tenth by chance."""
 MAX_PAIRS_FOR_COPIES = 1000  # looked at, all of 45 photographs; of more some copies are missed
+CHANCE_INLIERS, CHANCE_SCALE = 35.0, 10.0
+"""A lone pair with as many inliers between two parts is as likely of two scenes, found by chance
+among all pairs of these, as of one; each ten more make the former less likely by a factor of e."""
 MIN_LOSS = 0.7  # of the log odds: what takes less from the odds is no reason to doubt
 NUM_REASONS = 2  # that are said of a photograph
 FOCAL_CONTRADICTED = "the given focal length does not fit"
@@ -82,12 +86,13 @@ class Measures:
     focal_px: float  # of its camera
     fitting_px: float  # what fits, where the focal length that the user gave does not; else 0
     turned: float  # share of the matches of its strongest pairs that a mere rotation explains
-    bridge: Bridge | None  # what it came in by, if that was no track
     original: str  # name of the photograph that it may be a mirrored copy of, or empty
     zoom: float
     """Longest by shortest focal length of the photographs of its size, where nobody knows them:
     parts of photographs have longer ones, and their middle is elsewhere."""
     tied: float  # what its tie points by hand say for its place, in nats
+    cut: str  # the pair without which it and others, at most half of all, would be apart, or empty
+    num_cut: int  # inliers of that pair
 
 
 @dataclass(frozen=True)
@@ -96,11 +101,6 @@ class Term:
 
     value: Callable[[Measures], float]  # the larger the surer
     reason: Callable[[Measures], str]  # what to say where it is small
-
-
-def _bridge_reason(m: Measures) -> str:
-    text = "bridged by {} alone, at a distance known to +-{:.0%}"
-    return text.format(m.bridge.by, m.bridge.scale_error_frac) if m.bridge else ""
 
 
 TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
@@ -127,7 +127,6 @@ TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
         lambda m: -max(m.turned, USUAL_TURNED),
         lambda m: f"a camera that only turned explains {m.turned:.0%} of the matches: no parallax",
     ),
-    "bridge": Term(lambda m: -float(m.bridge is not None), _bridge_reason),
     "original": Term(
         lambda m: -float(bool(m.original)), lambda m: f"may be a mirrored copy of {m.original}"
     ),
@@ -139,7 +138,7 @@ TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
         ),
     ),
 }
-OF_MATCHES = {"evidence", "agreement", "points of three", "bridge"}  # terms that more may mend
+OF_MATCHES = {"evidence", "agreement", "points of three"}  # terms that more may mend
 
 
 @dataclass(frozen=True)
@@ -171,7 +170,9 @@ def judge(
 def judged(measures: Measures) -> Judgement:
     """Return the probability that a photograph stands right, and what takes most from it."""
     log_odds, left = _coefficients()["constant"] + measures.tied, 0.0
-    losses = [(-measures.tied, "its tie points disagree")]
+    apart = math.exp((CHANCE_INLIERS - measures.num_cut) / CHANCE_SCALE) if measures.cut else 0.0
+    why = f"with others it hangs on the {measures.num_cut} inliers of {measures.cut} alone"
+    losses = [(-measures.tied, "its tie points disagree"), (math.log1p(apart), why)]
     for name, fitted in _coefficients()["terms"].items():
         value = TERMS[name].value(measures)
         log_odds += fitted["weight"] * value
@@ -180,6 +181,7 @@ def judged(measures: Measures) -> Judgement:
     worst = sorted((loss for loss in losses if loss[0] >= MIN_LOSS), reverse=True)
     reasons = [text for _, text in (worst or [max(losses)])[:NUM_REASONS]]
     now, then = (1.0 / (1.0 + math.exp(-odds)) for odds in (log_odds, log_odds + left))
+    now /= 1.0 + apart
     return Judgement(now, "; ".join(reasons), then - now)
 
 
@@ -204,6 +206,7 @@ def measure(
     three, long = evidence.three_view_ratios(model), num_long_tracks(model, same_view)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
     growths = focal_growths(model, task) if growths is None else growths
+    cuts = _cuts(pairs, agreements)
     fitting_px = _fitting_focals(model, task, priors)
     tied = tied_evidence(tie_points_of(task, graph).residuals(model))
     zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
@@ -223,11 +226,30 @@ def measure(
             focal_px=focal_px,
             fitting_px=fitting_px.get(camera.camera_id, 0.0),
             turned=float(np.mean(rotations)) if rotations else 0.0,
-            bridge=mapped.bridges.get(name),
             original=graph.names[originals[image_id]] if image_id in originals else "",
             zoom=zooms.get((camera.width, camera.height), 1.0),
             tied=tied.get(image_id, 0.0),
+            cut=" - ".join(graph.names[i] for i in cuts[image_id].ids) if image_id in cuts else "",
+            num_cut=len(cuts[image_id].matches) if image_id in cuts else 0,
         )
+    return found
+
+
+def _cuts(
+    pairs: Sequence[VerifiedPair], agreements: Mapping[Ids, float]
+) -> dict[int, VerifiedPair]:
+    """Return the pair without which an image, with others, would be apart from half of all or more.
+
+    Of several such pairs the one with fewest inliers.
+    """
+    agreeing = {pair.ids: pair for pair in pairs if agreements[pair.ids] >= MIN_SHARE}
+    graph, found = networkx.Graph(list(agreeing)), dict[int, VerifiedPair]()
+    cut = [agreeing[min(ids), max(ids)] for ids in networkx.bridges(graph)]
+    for pair in sorted(cut, key=lambda pair: (-len(pair.matches), pair.ids)):
+        rest = networkx.restricted_view(graph, [], [pair.ids])
+        sides = [networkx.node_connected_component(rest, image_id) for image_id in pair.ids]
+        least = min(map(len, sides))
+        found |= {i: pair for side in sides if len(side) == least > 1 for i in side}
     return found
 
 
@@ -251,10 +273,9 @@ def _rotation_shares(
 def _originals(
     graph: PairGraph, pairs: Sequence[VerifiedPair], agreements: Mapping[Ids, float]
 ) -> dict[int, int]:
-    """Return the original of each mirrored copy.
+    """Return the original of each mirrored copy: more matches of the others agree with it.
 
-    The photograph is the one that more matches of the others agree with, but for those that have a
-    mirrored copy themselves.
+    Those of others that have a mirrored copy themselves do not count.
     """
     mirrored = []
     for pair in graph.pairs[:: max(1, -(-len(graph.pairs) // MAX_PAIRS_FOR_COPIES))]:

@@ -47,12 +47,9 @@ class Search:
         """Return what grows models of a graph."""
         return Grower(graph, self.adjuster, self.native, self.show)
 
-    def evidence_of(self, models: Sequence[MappedModel]) -> float:
+    def evidence_of(self, *models: MappedModel) -> float:
         """Return the evidence of the best of some models."""
-        return max(map(self._evidence_of, models), default=0.0)
-
-    def _evidence_of(self, mapped: MappedModel) -> float:
-        return self.evidence.of(mapped.reconstruction)
+        return max((self.evidence.of(model.reconstruction) for model in models), default=0.0)
 
     def best(self, graph: PairGraph) -> list[MappedModel]:
         """Return the best model, and then the best ones of images that none before has."""
@@ -91,7 +88,7 @@ class Search:
         grower.finish(again)
         grown = near._grown(graph, graph.unexplained_by(again))
         models = [replace(start, reconstruction=again), *grown]
-        found = near.joined(graph, sorted(models, key=self._evidence_of, reverse=True))
+        found = near.joined(graph, sorted(models, key=self.evidence_of, reverse=True))
         for model in found:
             grower.finish(model.reconstruction)
         return found
@@ -159,7 +156,7 @@ class Search:
         grower, bridges = self.grower(graph), Bridges(graph, self.native.random_seed)
         starts = models[: self.num_starts]
         joined = [join(model, bridges, grower, self.evidence) for model in starts]
-        best = max(joined, key=self._evidence_of)
+        best = max(joined, key=self.evidence_of)
         found, inside = [best], set(best.reconstruction.reg_image_ids())
         for model in models:
             own = set(model.reconstruction.reg_image_ids())

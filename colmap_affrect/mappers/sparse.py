@@ -57,20 +57,19 @@ class SparseMapper(IncrementalMapper):
             show(count)
 
         is_large = len(graph.keypoints) >= LARGE
-        if is_large and task.before:
-            search = self._search(task, graph, native, shown)
-            joined = search.joined(graph, [_again(search, graph, task.before)])
-            best = _joined_by_hand(search, graph, joined)
-        elif is_large or task.extend:
-            found = super().map(task, output_path, random_seed, show)
-            is_whole = found and not graph.unexplained_by(found[0].reconstruction)
-            if is_whole and not task.tie_points:
-                return found
+        if is_large or task.extend:
             search = replace(self._search(task, graph, native, shown), num_starts=1)
-            found.sort(key=lambda mapped: -search.evidence_of([mapped]))
+            if task.before:
+                found = [_again(search, graph, task.before)]
+            else:
+                found = super().map(task, output_path, random_seed, show)
+                is_whole = found and not graph.unexplained_by(found[0].reconstruction)
+                if is_whole and not task.tie_points:
+                    return found
+                found.sort(key=search.evidence_of, reverse=True)
             best = _joined_by_hand(search, graph, search.joined(graph, found))
-            if task.extend:
-                for model in best:
+            for model in best:
+                if task.extend:
                     task.extend.restore(model.reconstruction)
         else:
             native.mapper.init_max_forward_motion = 1.0  # the evidence decides on such pairs
@@ -126,7 +125,7 @@ class SparseMapper(IncrementalMapper):
         pairs = ((ids[a], ids[b]) for a, b in task.unmeasured)
         unmeasured = {(min(pair), max(pair)) for pair in pairs}
         best = [_again(search, graph, task.before)] if task.before else []
-        most = search.evidence_of(best)
+        most = search.evidence_of(*best)
         measured = {MEASURED_PAIRS: unmeasured} if unmeasured else {}
         for name, left_out in {**measured, ALL_PAIRS: set[Ids]()}.items():
             start = best[0].reconstruction if best else None
@@ -139,7 +138,7 @@ class SparseMapper(IncrementalMapper):
                 models = search.beyond(reduced, best[0])
             else:
                 models = _of_some_tracks(search, reduced, graph) or search.best(reduced)
-            evidence = search.evidence_of(models)
+            evidence = search.evidence_of(*models)
             if not models or (best and evidence <= most):
                 continue
             before = best[0].moves if best else ()
@@ -153,7 +152,7 @@ class SparseMapper(IncrementalMapper):
                     inside = set(model.reg_image_ids())
                     apart = (inside.isdisjoint(m.reconstruction.reg_image_ids()) for m in best[1:])
                     best = [first, *compress(best[1:], apart)]
-                    most = search.evidence_of(best)
+                    most = search.evidence_of(*best)
         if not best and is_sharing:
             return self._best(replace(task, may_share=False), own[0], native, show)
         return _joined_by_hand(search, graph, best)
@@ -171,7 +170,7 @@ def _again(search: Search, graph: PairGraph, before: MappedModel) -> MappedModel
     grower = search.grower(graph)
     model = grower.again(before.reconstruction)
     grower.finish(model)
-    return MappedModel(model, moves=tuple(dict.fromkeys((*before.moves, AGAIN))))
+    return MappedModel(model, before.bridges, tuple(dict.fromkeys((*before.moves, AGAIN))))
 
 
 def _with_own_cameras(

@@ -184,7 +184,9 @@ class Escalation:
             tried = self.matches.levels(self.pairs, "tried")
             return level, [p for p in map(tuple, pairs) if not tried.get(p, -1) >> level & 1]
         model, sizes = self.model(), self.features.image_sizes()
-        if not (needs := self.needs(model)):
+        limit_px = self.extraction.max_image_size_px
+        worth = {n: x * _megapixels(sizes[n], limit_px) for n, x in self.needs(model).items()}
+        if not worth:
             return None
         states, loose, best = self.states(), self._loose(), (0.0, 0, list[Pair]())
         self.left_s = 0.0
@@ -196,7 +198,7 @@ class Escalation:
                 states,
                 loose,
                 # Others take like for same: only for images that no measured ones hold.
-                {n: x for n, x in needs.items() if self.is_measured[number] or n not in held},
+                {n: x for n, x in worth.items() if self.is_measured[number] or n not in held},
                 {name: _megapixels(size, level.max_image_size_px) for name, size in sizes.items()},
                 [k for k, is_measured in enumerate(self.is_measured) if not is_measured],
                 {name for name in sizes if number not in ranges[name]},

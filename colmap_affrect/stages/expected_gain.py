@@ -1,9 +1,10 @@
 """Which pairs are matched again, and at which level: what is likely to bring most per second.
 
 A pair at a level is worth the chance that it verifies there, times the photographs that it would
-tie, over what it costs. The chances are logistic regressions on what is known of a pair, one for
-each kind of level, and the costs are nominal. Both are in ``expected_gain.json``;
-``tests/benchmarks/fit_expected_gain.py`` fits the former on photographs whose poses are known.
+tie, in megapixels as are costs, over what it costs. The chances are logistic regressions on what is
+known of a pair, one for each kind of level, and the costs are nominal. Both are in
+``expected_gain.json``; ``tests/benchmarks/fit_expected_gain.py`` fits the former on photographs
+whose poses are known.
 """
 
 import json
@@ -91,7 +92,7 @@ class ExpectedGain:
 
     states: Mapping[Pair, PairState]  # of all pairs
     loose: Set[str]  # images with few features in tracks through three images
-    needs: Mapping[str, float]  # what more matches may be worth to images, 1 to those that are lost
+    needs: Mapping[str, float]  # what more matches may be worth: megapixels, of lost images all
     megapixels: Mapping[str, float]  # of each image, as its features are extracted
     unmeasured: Collection[int]  # levels whose frames are not measured
     lacking: Collection[str]  # images without features of the level yet
@@ -130,7 +131,7 @@ class ExpectedGain:
     def best_pairs(
         self, number: int, level: Level, others: int, options: EscalateOptions
     ) -> tuple[float, list[Pair], float]:
-        """Return images saved by second, pairs for a level now, and seconds of all worth it.
+        """Return megapixels saved by second, pairs for a level now, and seconds of all worth it.
 
         A step has the pairs that save more by second than it does as a whole, mapping included.
         ``others``: bits of the levels that make this one needless.
@@ -157,7 +158,7 @@ class ExpectedGain:
             seconds += gain.pair_s * max(self.megapixels[name] for name in pair)
             brought = chance * sum(value * left[key] for key, value in tied)
             rate = brought / seconds
-            if rate * options.max_seconds_per_image < 1.0:
+            if rate * options.max_seconds_per_megapixel < 1.0:
                 continue
             all_s += seconds
             if rate * spent_s < saved:
@@ -167,7 +168,7 @@ class ExpectedGain:
             saved, spent_s = saved + brought, spent_s + seconds
             for key, _ in tied:
                 left[key] *= 1.0 - chance
-        if not chosen or saved * options.max_seconds_per_image < spent_s:
+        if not chosen or saved * options.max_seconds_per_megapixel < spent_s:
             return 0.0, [], 0.0
         return saved / spent_s, chosen, all_s
 

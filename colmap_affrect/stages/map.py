@@ -56,7 +56,7 @@ def map_images(
     is_same = known.partition("+")[2] == inputs.partition("+")[2]  # as it was said by hand
     if goes_on and known_models and is_same:
         model = pycolmap.Reconstruction(str(workspace.sparse / "0"))
-        before = MappedModel(model, moves=known_models[0].moves)
+        before = MappedModel(model, known_models[0].bridges, known_models[0].moves)
     task = _task(context, extend, before)
     workspace.record_made_from(map="")  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))

@@ -79,9 +79,9 @@ def turned(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:
         yaw, pitch = np.deg2rad([4.0 * number - 2.0 * len(paths), 5.0 * (number % 3 - 1)])
         rotation, _ = cv2.Rodrigues(np.array([pitch, yaw, 0.02 * number]))
         warp = inner @ rotation @ np.linalg.inv(inner)
-        cv2.imwrite(
-            str(out / f"turned-{path.name}"), cv2.warpPerspective(image, warp, (width, height))
-        )
+        view = cv2.warpPerspective(image, warp, (width, height))
+        inner_part = view[height // 8 : -height // 8, width // 8 : -width // 8]
+        cv2.imwrite(str(out / f"turned-{path.name}"), inner_part)
 
 
 def mixed(paths: Sequence[Path], out: Path, others: Sequence[Path]) -> None:
@@ -268,7 +268,8 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
         for kind in CAMERAS:  # and "misplaced": one photograph of a model is moved
             if kind != "unknown" and not true_cameras:
                 continue
-            for number, part in enumerate(parts_of(sorted(images), kind, num_parts, rng)):
+            num = num_parts // 2 if kind == "wrong" else num_parts  # most given ones fit
+            for number, part in enumerate(parts_of(sorted(images), kind, num, rng)):
                 told = cameras_of(kind, records, true_cameras, rng)
                 if told is None:
                     break

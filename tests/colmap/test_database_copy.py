@@ -49,9 +49,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def add_position(
-    database: pycolmap.Database,
-    position: np.ndarray,
-    system: pycolmap.PosePriorCoordinateSystem,
+    database: pycolmap.Database, position: np.ndarray, system: pycolmap.PosePriorCoordinateSystem
 ) -> None:
     prior = pycolmap.PosePrior(position=position, coordinate_system=system)
     prior.corr_data_id = database.read_image(2).data_id

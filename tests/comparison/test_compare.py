@@ -22,11 +22,7 @@ from colmap_affrect.comparison.compare import CompareOptions, compare
 from colmap_affrect.comparison.method_run import MethodRun
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.tables import to_json, verdict
-from colmap_affrect.errors import (
-    AffrectError,
-    OptionError,
-    StoreError,
-)
+from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.lists import PairOptions

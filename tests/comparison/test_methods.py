@@ -9,10 +9,7 @@ from small_scene import write_photographs
 
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import import_images
-from colmap_affrect.comparison.method_run import (
-    extract_sift,
-    match_sift,
-)
+from colmap_affrect.comparison.method_run import extract_sift, match_sift
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions

@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
-from colmap_affrect.comparison.results import (
-    PoseScores,
-    correct_images,
-    pair_errors,
-    pose_scores,
-)
+from colmap_affrect.comparison.results import PoseScores, correct_images, pair_errors, pose_scores
 from colmap_affrect.errors import AffrectError
 
 

@@ -15,12 +15,7 @@ from synthetic import write_image
 import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.errors import (
-    AffrectError,
-    DatabaseError,
-    OptionError,
-    StoreError,
-)
+from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, StoreError
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace

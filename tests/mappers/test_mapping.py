@@ -5,13 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from mapping_tasks import (
-    NOTHING_KNOWN,
-    SEED,
-    mapper_of,
-    synthesize,
-    task_with_given_cameras,
-)
+from mapping_tasks import NOTHING_KNOWN, SEED, mapper_of, synthesize, task_with_given_cameras
 from small_scene import NAMES, write_photographs
 from verified import verified
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.parallax import mirrored_share
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.reliability import TERMS, judge, judged, measure
-from colmap_affrect.project.report import DOUBTFUL, SURE, Bridge
+from colmap_affrect.project.report import DOUBTFUL, SURE
 
 
 def scene(tmp_path: Path, num_images: int = 5) -> tuple[MappedModel, MappingTask]:
@@ -55,7 +56,6 @@ def test_image_that_contradicts_its_pairs_is_doubted_and_the_others_are_not(tmp_
 def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     good = measure(mapped, task)[last(mapped).name]
-    bridge = Bridge("a", 11, 39, 0.25)
     bad = {
         "evidence": (replace(good, evidence=-20.0), "speak against"),
         "agreement": (replace(good, agreement=0.1), "only 10% of the matches"),
@@ -66,10 +66,6 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
             "the given focal length does not fit, 720 px: 910 px does",
         ),
         "parallax": (replace(good, turned=1.0), "only turned explains 100% of the matches"),
-        "bridge": (
-            replace(good, bridge=bridge),
-            "bridged by a alone, at a distance known to +-25%",
-        ),
         "original": (replace(good, original="c.jpg"), "mirrored copy of c.jpg"),
         "one lens": (replace(good, zoom=1.65), "are up to 1.65 times apart"),
     }
@@ -78,6 +74,27 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
         assert TERMS[name].value(measures) < TERMS[name].value(good)
         assert text in TERMS[name].reason(measures)
         assert judged(measures).probability <= judged(good).probability
+
+
+def test_parts_that_one_pair_ties(tmp_path: Path) -> None:
+    """The smaller part hangs on the larger one, and not the other way round."""
+    mapped, task = scene(tmp_path, 5)
+    ids = sorted(mapped.reconstruction.reg_image_ids())
+    with open_database(task.database_path) as database:
+        for one, two in itertools.product(ids[:3], ids[3:]):
+            if (one, two) == (ids[1], ids[4]):
+                num = len(database.read_two_view_geometry(one, two).inlier_matches)
+            else:
+                database.delete_two_view_geometry(one, two)
+    names = [mapped.reconstruction.images[i].name for i in ids]
+    found = measure(mapped, task)
+    assert [bool(found[name].cut) for name in names] == [False] * 3 + [True] * 2
+    assert found[names[3]].cut == f"{names[1]} - {names[4]}"
+    assert found[names[3]].num_cut == num
+    alone, few = (judged(replace(found[names[3]], num_cut=num)) for num in (200, 29))
+    assert few.probability < DOUBTFUL < alone.probability - 0.3
+    assert f"hangs on the 29 inliers of {names[1]} - {names[4]} alone" in few.reason
+    assert few.gain > 0.5
 
 
 def test_camera_that_only_turned(tmp_path: Path) -> None:

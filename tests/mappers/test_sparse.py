@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,9 +87,9 @@ def is_inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         return np.asarray(((points > 0) & (points < (WIDTH, HEIGHT))).all(axis=1))
 
 
-def mapped(path: Path, output_path: Path) -> list[MappedModel]:
+def mapped(path: Path, output_path: Path, **values: Any) -> list[MappedModel]:
     output_path.mkdir()
-    task = task_with_given_cameras(path)
+    task = task_with_given_cameras(path, **values)
     return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None)
 
 
@@ -124,6 +125,8 @@ def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path
         assert bridge.by != name
         assert bridge.num_agreeing > 0.8 * bridge.num_ratios
         assert 0.0 < bridge.scale_error_frac < MAX_SCALE_ERROR
+    (again,) = mapped(path, tmp_path / "again", before=model)
+    assert again.bridges == model.bridges
 
 
 @pytest.mark.long

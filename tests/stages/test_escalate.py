@@ -141,9 +141,7 @@ def test_hard_pair_escalates_and_succeeds(escalated: Workspace) -> None:
     assert store.levels([HARD], "tried")[HARD].bit_length() - 1 == level > 0
 
 
-def test_trial_of_a_pair_is_what_the_database_then_holds(
-    escalated: Workspace,
-) -> None:
+def test_trial_of_a_pair_is_what_the_database_then_holds(escalated: Workspace) -> None:
     size_px = Context(escalated).extraction.max_image_size_px
     verifier = PairVerifier(escalated.database, VerificationOptions(), size_px)
     store = FeatureStore(escalated.features)
@@ -167,7 +165,7 @@ max_image_size_px = 360
 features = { name = "rootsift", contrast_threshold = 0.01 }
 [escalate]
 strong_num_inliers = 1000000
-max_seconds_per_image = 1e9
+max_seconds_per_megapixel = 1e9
 """
 
 

@@ -19,7 +19,7 @@ from colmap_affrect.stages.expected_gain import (
 
 LEVELS = load_recipe("default").levels
 COVERS, LEARNED = LEVELS[1], LEVELS[2]
-PATIENT = EscalateOptions(max_seconds_per_image=1e6)
+PATIENT = EscalateOptions(max_seconds_per_megapixel=1e6)
 
 
 @pytest.mark.parametrize(("counts", "weak", "expected"), [
@@ -107,7 +107,7 @@ def test_nothing_is_worth_more_than_it_costs(monkeypatch: pytest.MonkeyPatch) ->
     rate, (best,), seconds = pairs.best_pairs(1, COVERS, 0b10, PATIENT)
     assert seconds >= gain_of(COVERS).pair_s
     assert best == ("b", "d")
-    just, below = (EscalateOptions(max_seconds_per_image=f / rate) for f in (1.01, 0.99))
+    just, below = (EscalateOptions(max_seconds_per_megapixel=f / rate) for f in (1.01, 0.99))
     assert chosen(pairs, just) == ["bd"]
     assert chosen(pairs, below) == []
     sure = gains(INLIERS, {"d": 0.5}, hints)  # half of the need, half of the worth

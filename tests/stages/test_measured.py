@@ -28,7 +28,7 @@ name = "identity"
 features = "shapeless"
 [escalate]
 strong_num_inliers = 1000000
-max_seconds_per_image = 1e9
+max_seconds_per_megapixel = 1e9
 """
 
 
@@ -92,8 +92,8 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
 ) -> None:
     """Those of an image that no measured frames match, and not those of the others."""
     own = without_matches(context, NAMES[3])
-    options = EscalateOptions(strong_num_inliers=1)
-    worthless = options.changed(max_seconds_per_image=0.0)
+    options = EscalateOptions(strong_num_inliers=1, max_seconds_per_megapixel=1e6)
+    worthless = options.changed(max_seconds_per_megapixel=0.0)
     assert Escalation(context, worthless).next_work() is None
     escalation = Escalation(context, options)
     assert escalation.next_work() == (1, own)

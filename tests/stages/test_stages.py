@@ -69,9 +69,7 @@ def without_times(report: dict[str, object]) -> dict[str, object]:
     }
 
 
-def test_run_registers_all_photographs_and_leaves_all_results(
-    finished: Finished,
-) -> None:
+def test_run_registers_all_photographs_and_leaves_all_results(finished: Finished) -> None:
     workspace, report = finished
     assert report.status == "ok"
     assert report.registered_names == tuple(sorted(NAMES))
