@@ -47,6 +47,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 FREE_SIGMA = 1.0  # of the logarithm of a focal length that is given, where it is freed
 MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing
+MIN_TOLD = 0.03  # of it where a model tells a focal length: of parts of photographs it is 0.15
 MIN_MOVE = 0.1  # of the logarithm of a given focal length that is told from another
 NUM_ITERATIONS = 100  # of a trial: three times as many change growths by 4 % at most
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
@@ -88,8 +89,8 @@ class Measures:
     turned: float  # share of the matches of its strongest pairs that a mere rotation explains
     original: str  # name of the photograph that it may be a mirrored copy of, or empty
     zoom: float
-    """Longest by shortest focal length of the photographs of its size, where nobody knows them:
-    parts of photographs have longer ones, and their middle is elsewhere."""
+    """Longest by shortest focal length of the photographs of its size, of those that only the model
+    tells: parts of photographs have longer ones, and their middle is elsewhere."""
     tied: float  # what its tie points by hand say for its place, in nats
     cut: str  # the pair without which it and others, at most half of all, would be apart, or empty
     num_cut: int  # inliers of that pair
@@ -209,7 +210,7 @@ def measure(
     cuts = _cuts(pairs, agreements)
     fitting_px = _fitting_focals(model, task, priors)
     tied = tied_evidence(tie_points_of(task, graph).residuals(model))
-    zooms = _zooms(camera for key, camera in used.items() if priors[key].sigma > EXIF_SIGMA)
+    zooms = _zooms(camera for key, camera in used.items() if growths.get(key, 0.0) >= MIN_TOLD)
     found = {}
     for image_id, own in pairs_of.items():
         shares, weights = [agreements[p.ids] for p in own], [len(p.matches) for p in own]
@@ -238,17 +239,15 @@ def measure(
 def _cuts(
     pairs: Sequence[VerifiedPair], agreements: Mapping[Ids, float]
 ) -> dict[int, VerifiedPair]:
-    """Return the pair without which an image, with others, would be apart from half of all or more.
-
-    Of several such pairs the one with fewest inliers.
-    """
+    """Return the pair without which an image, with others, would be apart from half of all."""
     agreeing = {pair.ids: pair for pair in pairs if agreements[pair.ids] >= MIN_SHARE}
-    graph, found = networkx.Graph(list(agreeing)), dict[int, VerifiedPair]()
+    graph, found = networkx.Graph(), dict[int, VerifiedPair]()
+    graph.add_edges_from(agreeing)
     cut = [agreeing[min(ids), max(ids)] for ids in networkx.bridges(graph)]
     for pair in sorted(cut, key=lambda pair: (-len(pair.matches), pair.ids)):
         rest = networkx.restricted_view(graph, [], [pair.ids])
         sides = [networkx.node_connected_component(rest, image_id) for image_id in pair.ids]
-        least = min(map(len, sides))
+        least = min(map(len, sides))  # of several pairs that with fewest inliers counts
         found |= {i: pair for side in sides if len(side) == least > 1 for i in side}
     return found
 

@@ -119,6 +119,16 @@ def test_camera_that_only_turned(tmp_path: Path) -> None:
     assert min(one.turned for one in measure(mapped, replace(task)).values()) > 0.9
 
 
+def test_only_focal_lengths_that_the_model_tells_are_compared(tmp_path: Path) -> None:
+    mapped, task = scene(tmp_path)
+    camera = last(mapped).camera
+    camera.params[list(camera.focal_length_idxs())] *= 1.5
+    for growth, zoom in ((0.2, 1.5), (0.01, 1.0)):
+        growths = dict.fromkeys(mapped.reconstruction.cameras, growth)
+        found = measure(mapped, task, growths)
+        assert [one.zoom for one in found.values()] == pytest.approx([zoom] * 5)
+
+
 def add_mirrored_copy(mapped: MappedModel, task: MappingTask, ids: tuple[int, int]) -> None:
     """Let image ``ids[1]`` have the keypoints of a smaller mirrored copy of the other, too.
 
