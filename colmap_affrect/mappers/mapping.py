@@ -63,7 +63,7 @@ def model_folders(sparse_path: Path) -> list[Path]:
 
 
 Judgements = Mapping[str, Judgement]  # by the names of the images
-WRONG = 0.1  # probability below which an image leaves its model: nine of ten are wrong
+WRONG = 0.05  # probability below which an image leaves its model: nineteen of twenty are wrong
 
 
 def map_database(
