@@ -54,7 +54,7 @@ def advice(
         words = ("--tie-points", str(table or "tie-points.csv"))
         found.append(Advice(why, _again(context, *words)))
     for name, bridge in model.bridges.items():
-        if f"bridged by {bridge.by}" in model.doubtful.get(name, ""):
+        if name in model.doubtful:
             why = f"if the matches of {name} and {bridge.by} are wrong by eye, leave them out"
             found.append(Advice(why, _again(context, "--reject-pair", f"{name},{bridge.by}")))
     if may_change and FOCAL_UNKNOWN in doubts:
