@@ -1,7 +1,4 @@
-"""Reading of image files and encoding of pictures, through OpenCV.
-
-Headers say what files are of before memory is taken for pixels.
-"""
+"""Reading of image files, by header before pixels, and encoding of pictures, through OpenCV."""
 
 import math
 import re
@@ -10,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from threading import Lock
 from typing import Any, BinaryIO, TypeVar
 
 import cv2
@@ -27,6 +25,7 @@ from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
 
 MAX_NUM_PX = 1 << 29  # of a photograph; those of the largest cameras have 400 megapixels
+ONE_AT_A_TIME = Lock()  # filters of warnings are of the process: threads would mix them up
 PNG = b"\x89PNG\r\n\x1a\n"
 READERS = {
     b"\xff\xd8": jpeg_factory,
@@ -47,7 +46,7 @@ def read_header(path: Path, read: Callable[[BinaryIO], Found]) -> Found | None:
     if not path.is_file():  # a pipe would wait for ever
         return None
     try:
-        with warnings.catch_warnings(), path.open("rb") as file:
+        with ONE_AT_A_TIME, warnings.catch_warnings(), path.open("rb") as file:
             warnings.simplefilter("ignore")  # Pillow warns of broken EXIF
             return read(file)
     except Exception:  # noqa: BLE001 - damaged files raise nearly anything in Pillow
