@@ -85,8 +85,7 @@ class Progress:
             return forecast.text(done / total) if forecast else ""
 
         def print_line(text: str) -> None:
-            more = f", {text}" if text else ""
-            show(f"{title}: {done}/{total} {unit}{more}", file=stream)
+            show(f"{title}: {done}/{total} {unit}{text and ', '}{text}", file=stream)
 
         def advance_lines(count: int) -> None:
             nonlocal num_lines
@@ -141,8 +140,7 @@ class Stopwatch:
     """Adds up the seconds of named steps."""
 
     def __init__(self, *steps: str) -> None:
-        # by step; those named beforehand come first and may stay 0
-        self.seconds: dict[str, float] = dict.fromkeys(steps, 0.0)
+        self.seconds = dict.fromkeys(steps, 0.0)  # those named first may stay 0
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import cv2
+import networkx
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
@@ -59,11 +60,10 @@ class PairReader:
     """Reads pairs of a database, with what the stores and the model of a run know."""
 
     def __init__(self, path: Path, context: Context) -> None:
-        workspace, model_path = context.workspace, context.workspace.sparse / "0"
+        workspace, folder = context.workspace, context.workspace.sparse / "0"
         has_stores = "match" in workspace.begun and not workspace.is_changed
         self.path, self.context, self.stores = path, context, context if has_stores else None
-        has_model = model_path.exists()
-        self.model = read_given_model(model_path) if has_model else pycolmap.Reconstruction()
+        self.model = read_given_model(folder) if folder.exists() else pycolmap.Reconstruction()
         self.shares = agreements(path, self.model)
 
     def read(self, names: Pair) -> KnownPair:
@@ -214,10 +214,14 @@ def _chosen(
         for name, other in (pair, pair[::-1]):
             if other in inside or not inside:
                 best.setdefault(name, pair)
+    agreeing = networkx.Graph()
+    agreeing.add_edges_from(pair for pair in shares if shares[pair] >= 0.5)
+    alone = [p for p in networkx.bridges(agreeing) if min(map(agreeing.degree, p)) > 1]
     held = sorted(inside & best.keys(), key=lambda name: verified[best[name]])
     guided = sorted(context.guided.read(), key=lambda pair: len(pair.exact) - pair.num_inliers)
     sorts: list[list[tuple[Any, str]]] = [
         [(pair, "most inliers disagree with the model") for pair in shares if shares[pair] < 0.5],
+        [(pair, "it alone ties two parts of the model") for pair in alone],
         [(pair, "rejected by hand") for pair in context.by_hand.rejected],
         [((name, x.by), f"{name} came in by this pair") for name, x in model.bridges.items()],
         [(pair, "one view: of one negative, or from one place") for pair in model.one_view],

@@ -232,7 +232,7 @@ def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
     }  # fmt: skip
     guided = [SimpleNamespace(names=("b", "c"), exact=range(500), num_inliers=800)]
     guided += [SimpleNamespace(names=("a", "b"), exact=range(500), num_inliers=0)]
-    shares = {("a", "c"): 0.1, ("a", "b"): 0.9, ("a", "e"): 0.0}
+    shares = {("a", "c"): 0.1, ("a", "e"): 0.0, **dict.fromkeys(pairwise("abcde"), 0.9)}
     found = chosen(report, verified, ByHand(rejected=(("e", "a"),)), shares, guided)
     assert found == {
         ("a", "c"): "most inliers disagree with the model",
@@ -240,8 +240,8 @@ def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
         ("a", "f"): "f is doubtful; the strongest pair of f",
         ("f", "g"): "g is missing",
         ("d", "e"): "the strongest pair of e",
-        ("b", "c"): "guided",
-        ("c", "d"): "the strongest pair of d",
+        ("b", "c"): "it alone ties two parts of the model; guided",
+        ("c", "d"): "it alone ties two parts of the model; the strongest pair of d",
     }
 
 
