@@ -5,7 +5,7 @@ Entry points of other packages are in the group ``colmap_affrect.mappers``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
@@ -43,8 +43,8 @@ class MappingTask:
     database_path: Path  # COLMAP database with two-view geometries
     image_path: Path | None  # folder of the photographs, for the colours of points
     extend: ExistingModel | None = None  # register images into this model
-    # the model from before pairs were matched again, and what made it: mappers may begin with it
-    before: MappedModel | None = None
+    # models from before pairs were matched again, the best first: mappers may begin with them
+    before: Sequence[MappedModel] = ()
     snapshot_path: Path | None = None  # of snapshots to go on from; mappers may leave it unused
     cancellation: pycolmap.CancellationToken | None = None  # stops mapping from outside
     # pairs of image names that only frames verify which were not measured one by one

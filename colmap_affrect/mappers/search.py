@@ -7,7 +7,7 @@ bridges add images to them. One number chooses: how much the verified pairs spea
 
 import math
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -77,17 +77,17 @@ class Search:
             grower.finish(mapped.reconstruction)
         return best
 
-    def beyond(self, graph: PairGraph, start: MappedModel) -> list[MappedModel]:
-        """Do so when one is known already, near whose focal lengths unknown ones stay.
+    def beyond(self, graph: PairGraph, known: Sequence[MappedModel]) -> list[MappedModel]:
+        """Do so when some are known already; focal lengths stay near those of the first.
 
-        It is one of those that bridges begin at; others grow from pairs that it does not explain.
+        Bridges begin at these, too; others grow from pairs that the first does not explain.
         """
-        again = pycolmap.Reconstruction(start.reconstruction)
+        again = pycolmap.Reconstruction(known[0].reconstruction)
         near = self._as_found(again)
         grower = near.grower(graph)
         grower.finish(again)
         grown = near._grown(graph, graph.unexplained_by(again))
-        models = [replace(start, reconstruction=again), *grown]
+        models = [replace(known[0], reconstruction=again), *known[1:], *grown]
         found = near.joined(graph, sorted(models, key=self.evidence_of, reverse=True))
         for model in found:
             grower.finish(model.reconstruction)
@@ -149,21 +149,11 @@ class Search:
 
     def joined(self, graph: PairGraph, models: Sequence[MappedModel]) -> list[MappedModel]:
         """Return the best model that bridges make of one of some, and those left out of it."""
-        if not models:
-            return []
-        if not self.num_starts or not graph.unexplained_by(models[0].reconstruction):
-            return [models[0]]
+        if not (models and self.num_starts and graph.unexplained_by(models[0].reconstruction)):
+            return list(models[:1])
         grower, bridges = self.grower(graph), Bridges(graph, self.native.random_seed)
-        starts = models[: self.num_starts]
-        joined = [join(model, bridges, grower, self.evidence) for model in starts]
-        best = max(joined, key=self.evidence_of)
-        found, inside = [best], set(best.reconstruction.reg_image_ids())
-        for model in models:
-            own = set(model.reconstruction.reg_image_ids())
-            if len(own - inside) > 1:
-                found.append(model)
-                inside |= own
-        return found
+        joined = [join(m, bridges, grower, self.evidence) for m in models[: self.num_starts]]
+        return with_own_images([max(joined, key=self.evidence_of), *models])
 
     def _grown(self, graph: PairGraph, first: Sequence[VerifiedPair]) -> list[MappedModel]:
         """Return models of different images from first pairs, that with most evidence first."""
@@ -181,6 +171,17 @@ class Search:
                 if in_vain >= self.num_seeds or (is_complete and self.evidence.is_confirmed(model)):
                     break
         return [MappedModel(m) for _, m in sorted(models.values(), key=lambda found: -found[0])]
+
+
+def with_own_images(models: Iterable[MappedModel]) -> list[MappedModel]:
+    """Leave out models with less than two images that none before has."""
+    found, inside = list[MappedModel](), set[int]()
+    for model in models:
+        own = set(model.reconstruction.reg_image_ids())
+        if len(own - inside) > 1:
+            found.append(model)
+            inside |= own
+    return found
 
 
 def _in_order(

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import compress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,7 +12,7 @@ from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
-from colmap_affrect.mappers.search import Search
+from colmap_affrect.mappers.search import Search, with_own_images
 from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
@@ -60,7 +59,7 @@ class SparseMapper(IncrementalMapper):
         if is_large or task.extend:
             search = replace(self._search(task, graph, native, shown), num_starts=1)
             if task.before:
-                found = [_again(search, graph, task.before)]
+                found = _again(search, graph, task.before)
             else:
                 found = super().map(task, output_path, random_seed, show)
                 is_whole = found and not graph.unexplained_by(found[0].reconstruction)
@@ -124,7 +123,7 @@ class SparseMapper(IncrementalMapper):
         ids = {name: image_id for image_id, name in graph.names.items()}
         pairs = ((ids[a], ids[b]) for a, b in task.unmeasured)
         unmeasured = {(min(pair), max(pair)) for pair in pairs}
-        best = [_again(search, graph, task.before)] if task.before else []
+        best = _again(search, graph, task.before)
         most = search.evidence_of(*best)
         measured = {MEASURED_PAIRS: unmeasured} if unmeasured else {}
         for name, left_out in {**measured, ALL_PAIRS: set[Ids]()}.items():
@@ -135,7 +134,7 @@ class SparseMapper(IncrementalMapper):
             if start and not reduced.unexplained_by(start):
                 continue
             if start:
-                models = search.beyond(reduced, best[0])
+                models = search.beyond(reduced, best)
             else:
                 models = _of_some_tracks(search, reduced, graph) or search.best(reduced)
             evidence = search.evidence_of(*models)
@@ -149,9 +148,7 @@ class SparseMapper(IncrementalMapper):
                 if model and own[1].evidence.of(model) > most + MIN_GAIN:
                     is_sharing, (graph, search) = False, own
                     first = replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))
-                    inside = set(model.reg_image_ids())
-                    apart = (inside.isdisjoint(m.reconstruction.reg_image_ids()) for m in best[1:])
-                    best = [first, *compress(best[1:], apart)]
+                    best = with_own_images([first, *best[1:]])
                     most = search.evidence_of(*best)
         if not best and is_sharing:
             return self._best(replace(task, may_share=False), own[0], native, show)
@@ -165,12 +162,15 @@ def _joined_by_hand(
     return joiner.join(models)
 
 
-def _again(search: Search, graph: PairGraph, before: MappedModel) -> MappedModel:
-    """Return a model with the poses of one before, and all that its tracks now register."""
-    grower = search.grower(graph)
-    model = grower.again(before.reconstruction)
-    grower.finish(model)
-    return MappedModel(model, before.bridges, tuple(dict.fromkeys((*before.moves, AGAIN))))
+def _again(search: Search, graph: PairGraph, before: Sequence[MappedModel]) -> list[MappedModel]:
+    """Return models with the poses of some before, and all that their tracks now register."""
+    grower, found = search.grower(graph), list[MappedModel]()
+    for mapped in before:
+        model = grower.again(mapped.reconstruction)
+        grower.finish(model)
+        moves = tuple(dict.fromkeys((*mapped.moves, AGAIN)))
+        found.append(replace(mapped, reconstruction=model, moves=moves))
+    return with_own_images(found)
 
 
 def _with_own_cameras(

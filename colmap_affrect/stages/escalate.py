@@ -8,8 +8,7 @@ other. Which pairs are matched again, and at which level, is decided anew after 
 begun is on record, so that a killed run goes on in the same way.
 
 Images are in need that the model before has not, or is not sure of. While there is none, those that
-have no strong pair, or few features in tracks through three images. When one has got these, a small
-set waits for the next model.
+have no strong pair, or few features in tracks through three; a small set is mapped when one has.
 """
 
 import logging
@@ -22,7 +21,7 @@ from functools import cached_property
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import ImageError, such_as
-from colmap_affrect.mappers.mapping import model_folders, read_summary
+from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
@@ -65,7 +64,7 @@ def escalate(context: Context, options: EscalateOptions | None = None) -> StageR
         escalation.match_at(todo, level)
         escalated.update(todo)
     warnings = dict[str, str]()
-    if not escalated or not escalation.model().registered_names:  # else the next model tells
+    if not escalated or not escalation.models()[0].registered_names:  # else the next model tells
         warnings = escalation.waiting()
         if work:
             warnings["time"] = "it is over; the same command without --max-time tries more"
@@ -113,27 +112,27 @@ class Escalation:
             if first in ids and second in ids and self.context.by_hand.allows(first, second)
         }
 
-    def model(self) -> ModelSummary:
-        """Return what is known of the model before, that of none where there is none."""
-        folders = model_folders(self.context.workspace.sparse)
-        return read_summary(folders[0]) if folders else ModelSummary((), 0, 0.0, 0.0)
+    def models(self) -> list[ModelSummary]:
+        """Return what is known of the models before, that of an empty one where there are none."""
+        return read_summaries(self.context.workspace.sparse) or [ModelSummary((), 0, 0.0, 0.0)]
 
-    def needs(self, model: ModelSummary) -> dict[str, float]:
-        """Return what more matches may be worth to images: 1 to those that a model has not.
+    def needs(self, models: Sequence[ModelSummary]) -> dict[str, float]:
+        """Return what more matches may be worth to images: 1 to those that no model has.
 
-        To doubtful ones what they may add to the probability that these are right, and a quarter
-        of that to others, which are likely right as they are.
+        To doubtful ones of the first what they may add to the probability that these are right,
+        and a quarter of all that to those which are likely right in the model that they are in.
         """
         workspace, names = self.context.workspace, self.features.names()
-        lost = set(names) - set(model.sure)
+        lost = set(names) - set(models[0].sure)
         if workspace.made_from("map") != self.context.verified_digest():
             strong, counts = self.options.strong_num_inliers, self.num_inliers()
             insecure = lost & expected_gain.insecure_images(counts, strong, self._loose())
             # The next model tells of what has been tied since.
             maps_next = insecure != lost and workspace.sparse.exists() and len(names) < LARGE
             lost = set() if maps_next else insecure
-        worth = {name: LIKELY if name in model.likely else 1.0 for name in sorted(lost)}
-        return {name: share * model.gains.get(name, 1.0) for name, share in worth.items()}
+        likely = frozenset[str]().union(*(model.likely for model in models))
+        worth = {name: LIKELY if name in likely else 1.0 for name in sorted(lost)}
+        return {name: share * models[0].gains.get(name, 1.0) for name, share in worth.items()}
 
     def _held(self, model: ModelSummary, states: Mapping[Pair, PairState]) -> set[str]:
         """Return the images of a model that measured frames tie to one that is likely right."""
@@ -183,14 +182,14 @@ class Escalation:
             level, pairs = step
             tried = self.matches.levels(self.pairs, "tried")
             return level, [p for p in map(tuple, pairs) if not tried.get(p, -1) >> level & 1]
-        model, sizes = self.model(), self.features.image_sizes()
+        models, sizes = self.models(), self.features.image_sizes()
         limit_px = self.extraction.max_image_size_px
-        worth = {n: x * _megapixels(sizes[n], limit_px) for n, x in self.needs(model).items()}
+        worth = {n: x * _megapixels(sizes[n], limit_px) for n, x in self.needs(models).items()}
         if not worth:
             return None
         states, loose, best = self.states(), self._loose(), (0.0, 0, list[Pair]())
         self.left_s = 0.0
-        held = self._held(model, states)
+        held = self._held(models[0], states)
         ranges = {name: self.features.level_ranges(name) for name in sizes}
         for number in self.levels:
             level = self.extraction.levels[number]
@@ -202,11 +201,10 @@ class Escalation:
                 {name: _megapixels(size, level.max_image_size_px) for name, size in sizes.items()},
                 [k for k, is_measured in enumerate(self.is_measured) if not is_measured],
                 {name for name in sizes if number not in ranges[name]},
-                model.registered_names,
+                models[0].registered_names,
             )
             kinds = self.is_measured  # of frames, by level
-            alike = [k for k in range(number, len(kinds)) if kinds[k] == kinds[number]]
-            others = sum(1 << k for k in alike)
+            others = sum(1 << k for k in range(number, len(kinds)) if kinds[k] == kinds[number])
             rate, pairs, seconds = gain.best_pairs(number, level, others, self.options)
             self.left_s += seconds / available_cores()
             best = max(best, (rate, number, pairs), key=lambda found: found[0])
@@ -235,7 +233,7 @@ class Escalation:
     def waiting(self) -> dict[str, str]:
         """Say what levels that lack weights may tie, if anything is left to tie."""
         how = self.context.resources.how_to_complete(self.extraction)
-        if not how or not (left := sorted(self.needs(self.model()))):
+        if not how or not (left := sorted(self.needs(self.models()))):
             return {}
         text = f"its weights are not here; it may tie {such_as(left)}: {how}; then run this again"
         return {"learned matching": text}

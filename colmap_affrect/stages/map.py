@@ -12,7 +12,7 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
-from colmap_affrect.mappers.mapping import map_database, read_summaries
+from colmap_affrect.mappers.mapping import map_database, model_folders, read_summaries
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
@@ -52,11 +52,12 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     known_models = read_summaries(workspace.sparse)  # refuses edited ones
-    before = None
+    before = list[MappedModel]()
     is_same = known.partition("+")[2] == inputs.partition("+")[2]  # as it was said by hand
     if goes_on and known_models and is_same:
-        model = pycolmap.Reconstruction(str(workspace.sparse / "0"))
-        before = MappedModel(model, known_models[0].bridges, known_models[0].moves)
+        for folder, known_model in zip(model_folders(workspace.sparse), known_models, strict=True):
+            model = pycolmap.Reconstruction(str(folder))
+            before.append(MappedModel(model, known_model.bridges, known_model.moves))
     task = _task(context, extend, before)
     workspace.record_made_from(map="")  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
@@ -67,7 +68,7 @@ def map_images(
     return StageReport("map", wall_s, len(models)), models
 
 
-def _task(context: Context, extend: Extension | None, before: MappedModel | None) -> MappingTask:
+def _task(context: Context, extend: Extension | None, before: Sequence[MappedModel]) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace, by_hand = context.workspace, context.by_hand
     copied, path = workspace.is_foreign, workspace.database

@@ -279,9 +279,7 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
     return {i.camera_id: replace(UNKNOWN, names=(i.name,)) for i in images}
 
 
-def test_photographs_get_cameras_of_their_own_and_models_of_other_places_stay(
-    tmp_path: Path,
-) -> None:
+def test_photographs_get_own_cameras_and_models_of_other_places_stay(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     task = MappingTask(path, None, cameras=two_places(path), may_share=True)
     large, small = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
@@ -291,3 +289,6 @@ def test_photographs_get_cameras_of_their_own_and_models_of_other_places_stay(
     )
     assert found == pytest.approx([TRUE_FOCAL, TRUE_FOCAL, TRUE_FOCAL, 1.7 * TRUE_FOCAL], rel=0.03)
     assert small.reconstruction.num_reg_images() == 2
+    known = replace(task, before=[large, small])
+    again = mapper_of("sparse").map(known, tmp_path, 0, lambda _: None)
+    assert [model.reconstruction.num_reg_images() for model in again] == [4, 2]

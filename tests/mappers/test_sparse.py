@@ -125,7 +125,7 @@ def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path
         assert bridge.by != name
         assert bridge.num_agreeing > 0.8 * bridge.num_ratios
         assert 0.0 < bridge.scale_error_frac < MAX_SCALE_ERROR
-    (again,) = mapped(path, tmp_path / "again", before=model)
+    (again,) = mapped(path, tmp_path / "again", before=[model])
     assert again.bridges == model.bridges
 
 
