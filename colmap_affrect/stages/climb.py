@@ -1,7 +1,7 @@
 """Climb: map, match again what lost and doubtful photographs need, and map on, until nothing helps.
 
-The first model says what is needed: where it is sure of all photographs, nothing more is done. Each
-later one begins with the one before, and so is not worse, by the evidence.
+The first model says what is needed: where it is sure of all photographs, nothing more is done.
+Later models begin with those before, and so are not worse, by the evidence.
 """
 
 from colmap_affrect.mappers.base import Mapper
