@@ -133,7 +133,7 @@ class ExpectedGain:
     ) -> tuple[float, list[Pair], float]:
         """Return megapixels saved by second, pairs for a level now, and seconds of all worth it.
 
-        A step has the pairs that save more by second than it does as a whole, mapping included.
+        A step has the pairs that save more by second than it does as a whole. Mapping is included.
         ``others``: bits of the levels that make this one needless.
         """
         gain, states = gain_of(level), self.states
@@ -151,7 +151,7 @@ class ExpectedGain:
         found.sort(key=lambda item: (-item[0] * sum(value for _, value in item[1]), item[2]))
         left: defaultdict[str | int, float] = defaultdict(lambda: 1.0)  # chance of being lost still
         chosen, there = list[Pair](), set[str]()
-        saved, spent_s, all_s = 0.0, MAPPING_S * len(states), 0.0
+        saved, spent_s, all_s = 0.0, MAPPING_S * len(states), MAPPING_S * len(states)
         for chance, tied, pair in found:
             lacking = [name for name in pair if name in self.lacking and name not in there]
             seconds = gain.image_s * sum(self.megapixels[name] for name in lacking)
