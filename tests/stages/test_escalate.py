@@ -20,7 +20,7 @@ from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import FileTransaction
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions
@@ -207,20 +207,14 @@ def numbered(*rows: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize(("matches", "tracks"), [
     # Features 5 and 6 of b lead from a to c; feature 7 of b does not.
-    (
-        {("a", "b"): numbered((1, 5), (2, 6), (3, 7)), ("b", "c"): numbered((5, 8), (6, 9))},
-        {"a": 2, "b": 2, "c": 2},
-    ),
+    ({("a", "b"): numbered((1, 5), (2, 6), (3, 7)), ("b", "c"): numbered((5, 8), (6, 9))},
+     {"a": 2, "b": 2, "c": 2}),
     # The same numbers in another image are other features.
-    (
-        {("a", "b"): numbered((1, 5), (2, 6)), ("b", "c"): numbered((1, 5), (2, 6))},
-        {"a": 0, "b": 0, "c": 0},
-    ),
+    ({("a", "b"): numbered((1, 5), (2, 6)), ("b", "c"): numbered((1, 5), (2, 6))},
+     {"a": 0, "b": 0, "c": 0}),
     # d is matched with a feature of c that leads on, by one of its two matches.
-    (
-        {("c", "a"): numbered((4, 1), (5, 2)), ("c", "d"): numbered((6, 2), (4, 3))},
-        {"a": 1, "c": 1, "d": 1},
-    ),
+    ({("c", "a"): numbered((4, 1), (5, 2)), ("c", "d"): numbered((6, 2), (4, 3))},
+     {"a": 1, "c": 1, "d": 1}),
     ({("a", "b"): numbered((1, 1), (2, 2), (3, 3))}, {"a": 0, "b": 0}),
     ({("b", "a"): numbered()}, {"a": 0, "b": 0}),
     ({}, {}),
@@ -245,9 +239,17 @@ def test_strong_pairs_without_a_track_of_three_escalate(
     assert work.next_work() == (1, list(chain))
 
 
-def test_each_escalate_has_a_bar_of_its_own_that_ends_full(
-    before: Workspace, tmp_path: Path
+def test_photographs_that_are_likely_right_in_another_model_need_a_quarter(
+    before: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    work = Escalation(Context(before), EscalateOptions())
+    digest = work.context.verified_digest()
+    monkeypatch.setattr(Workspace, "made_from", lambda *_: digest)
+    models = [ModelSummary(names, 9, 2.0, 0.5) for names in ((), EASY)]
+    assert work.needs(models) == {EASY[0]: 0.25, EASY[1]: 0.25, NAMES[2]: 1.0}
+
+
+def test_each_step_has_a_bar_that_ends_full(before: Workspace, tmp_path: Path) -> None:
     workspace, shown = copy_of(before, tmp_path), io.StringIO()
     with workspace.locked():
         escalation.escalate(Context(workspace, progress=Progress(shown)))
@@ -256,9 +258,7 @@ def test_each_escalate_has_a_bar_of_its_own_that_ends_full(
     assert all(done == total for done, total in last.values())
 
 
-def test_no_pair_that_verifies_unrectified_loses_inliers(
-    escalated: Workspace, plain: Workspace
-) -> None:
+def test_no_verified_pair_loses_inliers(escalated: Workspace, plain: Workspace) -> None:
     assert len(geometry(escalated, EASY)) >= len(geometry(plain, EASY))
 
 
