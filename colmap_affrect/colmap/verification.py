@@ -266,6 +266,13 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
     return sorted(networkx.connected_components(graph), key=lambda part: (-len(part), min(part)))
 
 
+def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
+    """Return, smaller image first, the pairs that alone tie two parts of two images or more."""
+    graph: networkx.Graph[T] = networkx.Graph()
+    graph.add_edges_from(pairs)
+    return [(min(p), max(p)) for p in networkx.bridges(graph) if min(map(graph.degree, p)) > 1]
+
+
 def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], Indices]:
     """Return the (M, 2) features of each verified pair of image ids that are inliers."""
     with colmap_database.open_database(path) as database:

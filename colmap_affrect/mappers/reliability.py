@@ -14,11 +14,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import networkx
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.colmap.verification import connected_parts, lone_ties
 from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.adjustment import (
     EXIF_SIGMA,
@@ -207,7 +207,7 @@ def measure(
     three, long = evidence.three_view_ratios(model), num_long_tracks(model, same_view)
     turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
     growths = focal_growths(model, task) if growths is None else growths
-    cuts = _cuts(pairs, agreements)
+    cuts = _cuts({pair.ids: pair for pair in pairs if agreements[pair.ids] >= MIN_SHARE})
     fitting_px = _fitting_focals(model, task, priors)
     tied = tied_evidence(tie_points_of(task, graph).residuals(model))
     zooms = _zooms(camera for key, camera in used.items() if growths.get(key, 0.0) >= MIN_TOLD)
@@ -236,19 +236,14 @@ def measure(
     return found
 
 
-def _cuts(
-    pairs: Sequence[VerifiedPair], agreements: Mapping[Ids, float]
-) -> dict[int, VerifiedPair]:
+def _cuts(agreeing: Mapping[Ids, VerifiedPair]) -> dict[int, VerifiedPair]:
     """Return the pair without which an image, with others, would be apart from half of all."""
-    agreeing = {pair.ids: pair for pair in pairs if agreements[pair.ids] >= MIN_SHARE}
-    graph, found = networkx.Graph(), dict[int, VerifiedPair]()
-    graph.add_edges_from(agreeing)
-    cut = [agreeing[min(ids), max(ids)] for ids in networkx.bridges(graph)]
-    for pair in sorted(cut, key=lambda pair: (-len(pair.matches), pair.ids)):
-        rest = networkx.restricted_view(graph, [], [pair.ids])
-        sides = [networkx.node_connected_component(rest, image_id) for image_id in pair.ids]
+    found = dict[int, VerifiedPair]()
+    for ids in sorted(lone_ties(agreeing), key=lambda ids: (-len(agreeing[ids].matches), ids)):
+        parts = connected_parts(agreeing.keys() - {ids})
+        sides = [part for part in parts if not part.isdisjoint(ids)]
         least = min(map(len, sides))  # of several pairs that with fewest inliers counts
-        found |= {i: pair for side in sides if len(side) == least > 1 for i in side}
+        found |= {i: agreeing[ids] for side in sides if len(side) == least for i in side}
     return found
 
 

@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import cv2
-import networkx
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
@@ -20,6 +19,7 @@ from colmap_affrect.colmap.checks import FATAL
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.colmap.verification import lone_ties
 from colmap_affrect.data import ColorImage
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.geometry.affine import project
@@ -214,9 +214,7 @@ def _chosen(
         for name, other in (pair, pair[::-1]):
             if other in inside or not inside:
                 best.setdefault(name, pair)
-    agreeing = networkx.Graph()
-    agreeing.add_edges_from(pair for pair in shares if shares[pair] >= 0.5)
-    alone = [p for p in networkx.bridges(agreeing) if min(map(agreeing.degree, p)) > 1]
+    alone = lone_ties(pair for pair in shares if shares[pair] >= 0.5)
     held = sorted(inside & best.keys(), key=lambda name: verified[best[name]])
     guided = sorted(context.guided.read(), key=lambda pair: len(pair.exact) - pair.num_inliers)
     sorts: list[list[tuple[Any, str]]] = [
