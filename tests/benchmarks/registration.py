@@ -113,11 +113,15 @@ def compare_subset(
 
 
 def rows_of(name: str, comparison: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each method and seed of a comparison."""
+    """Return a row for each method and seed of a comparison.
+
+    ``seconds`` are those of a whole run, with the mean of the seeds where each took its own.
+    """
     rows = []
     for method, result in comparison["methods"].items():
         for seed in result.get("seeds", ()):
             scores = seed["scores"] or {}
+            wrong_names = set(scores.get("wrong_names", ()))
             rows.append(
                 {
                     "subset": name,
@@ -128,6 +132,9 @@ def rows_of(name: str, comparison: dict[str, Any]) -> list[dict[str, Any]]:
                     "correct": len(scores["correct_names"]) if scores else None,
                     "rotation_error_deg": scores.get("median_rotation_error_deg"),
                     "points": seed["points3D"],
+                    "sure": len(seed["sure"]),
+                    "sure_and_wrong": len(wrong_names.intersection(seed["sure"])),
+                    "seconds": result["total_s"],
                 }
             )
     return rows
