@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from os import PathLike
-from typing import Any, ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, get_args
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -21,6 +21,8 @@ from pydantic_core import ErrorDetails
 
 from colmap_affrect.errors import OptionError, such_as
 
+EffortName = Literal["low", "normal", "high"]  # how much is tried for photographs in need
+EFFORT_NAMES: tuple[EffortName, ...] = get_args(EffortName)
 PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
 MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
 MAX_KNOWN = 40  # names in a message

@@ -18,6 +18,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
+from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
@@ -36,7 +37,7 @@ from colmap_affrect.report.run_page import write_run_page
 from colmap_affrect.stages.advice import advice
 from colmap_affrect.stages.climb import climb
 from colmap_affrect.stages.context import Context, Inputs, Resources
-from colmap_affrect.stages.escalate import escalate
+from colmap_affrect.stages.escalate import escalate, matched_again
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.map import image_names, map_images, unregistered
@@ -73,6 +74,7 @@ class RunOptions(InputOptions):
     database_descriptors: bool = False  # also into the database, as COLMAP's matchers need them
     extend: Extension | None = None  # the model that the photographs are registered into
     by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
+    effort: EffortName = "normal"  # how much is tried for photographs in need
     max_minutes: float = math.inf  # after which nothing more is tried for photographs in need
     command: tuple[str, ...] = ()  # words of the command line, for advice
 
@@ -110,9 +112,16 @@ def run(
     _check_by_hand(options.by_hand, names, mapper)
     forecast = Forecast(len(names), _num_pairs(names, options.pairs))
     until_s, workspace = time.monotonic() + 60 * options.max_minutes, Workspace(output_path)
-    given = options.by_hand, options.command
-    shown = replace(progress, forecast=forecast)
-    context = Context(workspace, options.resources, executor, shown, until_s, *given)
+    context = Context(
+        workspace,
+        options.resources,
+        executor,
+        replace(progress, forecast=forecast),
+        deadline_s=until_s,
+        effort=options.effort,
+        by_hand=options.by_hand,
+        command=options.command,
+    )
     if options.extend:
         if overwrite:
             options.extend.refuse_discarding(output_path)
@@ -215,6 +224,7 @@ def map_and_report(
     pair_inliers = {pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)}
     missing = unregistered(context, names, models, pair_inliers)
     cameras = read_camera_records(workspace.cameras)
+    again = matched_again(context)
     result = ReconstructionReport(
         images_total=len(names),
         unregistered=missing,
@@ -233,8 +243,13 @@ def map_and_report(
             for camera_id, record in cameras.items()
         ),
         extended=tuple(before),
-        advice=advice(context, missing, models, max(pair_inliers.values(), default=0)),
+        advice=advice(
+            context, missing, models, max(pair_inliers.values(), default=0), again.untried
+        ),
         by_hand=context.by_hand.texts(),
+        effort=again.effort,
+        matched_again=again.tried,
+        untried=again.untried,
     )
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
     replace_text(workspace.report, result.to_json())

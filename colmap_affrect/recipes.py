@@ -140,9 +140,6 @@ class EscalateOptions(Options):
 
     strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
     """Pairs with as many need nothing more, where their images have ``guided.min_num_tracks``."""
-    max_seconds_per_megapixel: Annotated[float, within(0.0, 1e9)] = 50.0
-    """What an image is worth, about ten times its first features and matches: pairs that would take
-    longer, for what they are likely to save, are left. Of one core, by what levels usually cost."""
 
 
 class Recipe(ExtractionOptions):

@@ -52,6 +52,7 @@ def run(options: argparse.Namespace) -> None:
         database_descriptors=bool(options.database_descriptors),
         extend=given.extension(options),
         by_hand=given.by_hand(options),
+        effort=options.effort,
         max_minutes=options.max_minutes,
         command=options.words,
         **given.inputs(options, recipe),

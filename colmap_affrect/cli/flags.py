@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_affrect.comparison import DEFAULT_METHODS
-from colmap_affrect.options import PRESETS
+from colmap_affrect.options import EFFORT_NAMES, PRESETS
 
 Settings = dict[str, Any]
 """What ``add_argument`` takes."""
@@ -106,9 +106,13 @@ FLAGS: dict[str, Settings] = {
         "one that 'recipes' lists, or the path of a TOML file (default: default)"),
     "--set": _value("SECTION.OPTION=VALUE", "change one option of the recipe, e.g. --set "
         "rectifier.tilt_radius=1.8; may be repeated", action="append", default=[]),
-    "--max-time": _value("MINUTES", "try nothing more for lost photographs after so long; the same "
-        "command goes on (default: as long as more is likely to help)", type=minutes,
-        default=math.inf, dest="max_minutes"),
+    "--effort": _value("EFFORT", "how much is tried for photographs that are missing or doubtful "
+        "in the first model: low is learned matching alone, normal adds what is likely to help for "
+        "about as long as the first model took, a minute at least, high for five times as long "
+        "(default: normal)", choices=EFFORT_NAMES, default="normal"),
+    "--max-time": _value("MINUTES", "match nothing again after so long, whatever the effort; the "
+        "same command goes on (default: no limit)", type=minutes, default=math.inf,
+        dest="max_minutes"),
     "--depth-path": _path("FOLDER",
         "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
     "--database-descriptors": _switch(

@@ -122,8 +122,8 @@ MODEL = f"--extend --refine-existing {BY_HAND} --random-seed --json --no-page"
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("all stages: photographs in, COLMAP model out",
-        f"{RESULTS} {IMAGES} {RECIPE} --max-time --depth-path --database-descriptors {NETWORKS} "
-        f"--scheduler {PAIRS} {MAPPER} {MODEL}"),
+        f"{RESULTS} {IMAGES} {RECIPE} --effort --max-time --depth-path --database-descriptors "
+        f"{NETWORKS} --scheduler {PAIRS} {MAPPER} {MODEL}"),
     "extract": ("features into features.h5 and database.db",
         f"{RESULTS} {IMAGES} {RECIPE} --depth-path --database-descriptors {NETWORKS} --scheduler"),
     "pairs": ("which images to match, into pairs.txt", f"{RESULTS} {PAIRS}"),

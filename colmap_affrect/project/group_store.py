@@ -80,15 +80,21 @@ class GroupStore:
                     for name in group:  # items() has None for what cannot be opened
                         checked(group, name)
 
-    @staticmethod
-    def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
+    @classmethod
+    def _write(cls, file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
         if key in file:
             del file[key]
         group = file.create_group(key)
         for name, values in datasets.items():
-            group.create_dataset(name, data=values).attrs[CHECKSUM] = _checksum(values)
+            cls._write_dataset(group, name, values)
         group.attrs.update(attributes)
         group.attrs["complete"] = True
+
+    @staticmethod
+    def _write_dataset(group: h5py.Group, name: str, values: Any) -> None:
+        if name in group:
+            del group[name]
+        group.create_dataset(name, data=values).attrs[CHECKSUM] = _checksum(values)
 
 
 def checked(group: h5py.Group, name: str) -> NDArray[Any]:

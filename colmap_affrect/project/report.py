@@ -67,6 +67,26 @@ class Advice:
     command: str = ""  # for a shell; empty where none does it
 
 
+LEVELS = {  # how pairs are matched again, by the kind of the level
+    "measured, warps": "more warps", "measured, all tilts": "all tilts",
+    "learned": "learned matching", "learned, warps": "learned matching of warps",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MatchedAgain:
+    """Pairs that were, or might be, matched again in one way."""
+
+    kind: str  # of the level, a key of ``LEVELS``
+    num_pairs: int
+    core_s: float  # about how many seconds of one core that takes
+
+    def text(self) -> str:
+        """Return a few words."""
+        pairs = "pair" if self.num_pairs == 1 else "pairs"
+        return f"{LEVELS.get(self.kind, self.kind)} {self.num_pairs} {pairs}"
+
+
 @dataclass(frozen=True)
 class StageReport:
     """One stage of a run."""
@@ -198,6 +218,9 @@ class ReconstructionReport:
     guided: dict[str, int] = field(default_factory=dict)
     cameras: tuple[dict[str, Any], ...] = ()  # see ``CameraRecord.to_report``
     by_hand: tuple[str, ...] = ()  # what was done otherwise than matches alone say
+    effort: str = ""  # how much was tried for images in need; empty where nothing had to be
+    matched_again: tuple[MatchedAgain, ...] = ()  # for images that were in need
+    untried: tuple[MatchedAgain, ...] = ()  # what a greater effort would try for those that are
 
     @property
     def status(self) -> str:
@@ -282,6 +305,9 @@ class ReconstructionReport:
             before, after = self.guided["matches_before"], self.guided["matches_after"]
             pairs = f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"
             lines += [f"guided      {pairs} matched again: {after} inliers, {before} before"]
+        if self.matched_again:
+            texts = [one.text() for one in self.matched_again]
+            lines += [f"again       {', '.join(texts)} (effort {self.effort})"]
         if self.cameras:
             sources = Counter(str(camera["source"]) for camera in self.cameras).most_common()
             texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]

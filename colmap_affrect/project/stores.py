@@ -3,12 +3,15 @@
 Features of the levels of escalation follow each other in the order in which they were asked for:
 those of ``levels[k]`` end at ``level_ends[k]``. Descriptors of several sizes are filled up with
 zeros, which change no distance. Matches have the attributes ``level``, whose features were matched
-together with those of level 0, and ``tried``, with a bit for each level that was tried.
+together with those of level 0, and ``tried``, with a bit for each level that was tried. Where
+levels with measured frames and learned ones were both tried for a pair, the best matches of the
+kind that has fewer inliers are kept, too: :class:`Alternative`.
 ``guided.h5`` has a group per pair that was matched again by its geometry. Files are opened for one
 image or one batch of pairs and closed again; what is written in between appears as a whole
 (:mod:`colmap_affrect.project.atomic_files`).
 """
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -37,6 +40,8 @@ STEP = "step"  # level and pairs of the step of escalation that has begun and no
 FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
 IN_VAIN = "all_features_in_vain"  # that list, and whether all features bring no more than some
 CLIMBING = "climbing_list"  # the same, of which there was a model before pairs were matched again
+COMPARED = "compared"  # [pairs learned matching was tried for, kind of matches that was chosen]
+SCORE_BEFORE = "score_before_learned_matching"  # of the models that were there then
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
@@ -52,6 +57,14 @@ class PairMatches:
     num_keypoints1: int  # number of features of the first image
     level: int = 0  # of escalation, whose features were looked at together with those of level 0
     of_some: bool = False  # only of the features with the largest responses
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Matches of a pair by the other kind of features, and what they are worth."""
+
+    matches: PairMatches
+    worth: tuple[int, int]  # inliers; where there are none, how many matches confirm each other
 
 
 @lru_cache(maxsize=8)
@@ -222,6 +235,9 @@ def pair_key(name1: str, name2: str) -> str:
     return f"{name1.replace('/', '-')}/{name2.replace('/', '-')}"
 
 
+OTHER = "other_"  # begins the names of datasets and attributes of alternatives
+
+
 def hloc_matches(pair: PairMatches) -> dict[str, NDArray[Any]]:
     """Return the datasets that hloc has for a pair; in 32 bits where 16 do not suffice."""
     matches0 = np.full(pair.num_keypoints1, -1, np.int64)
@@ -238,18 +254,72 @@ class MatchStore(GroupStore):
     format, stage = "colmap_affrect/matches", "match"
 
     def write(
-        self, pairs: Iterable[PairMatches], tried: Iterable[Names] = (), tried_level: int = 0
+        self,
+        pairs: Iterable[PairMatches],
+        tried: Iterable[Names] = (),
+        tried_level: int = 0,
+        alternatives: Iterable[Alternative] = (),
     ) -> None:
-        """Write a batch of pairs; record that a level was tried for others, which keep theirs."""
+        """Write a batch of pairs.
+
+        Args:
+            pairs: matches that take the place of what is there.
+            tried: pairs for which a level was tried, with success or without.
+            tried_level: that level.
+            alternatives: matches that are kept beside those of their pairs, in the place of others.
+        """
         with self._open("a") as file:
             for pair in pairs:
-                key = pair_key(*pair.names)
-                before = int(file[key].attrs["tried"]) if is_complete(file, key) else 0
-                known = {"level": pair.level, "tried": before | 1 << pair.level}
-                known["of_some"] = pair.of_some
-                self._write(file, key, hloc_matches(pair), **known)
+                self._write_pair(file, pair)
             for names in tried:
                 file[pair_key(*names)].attrs["tried"] |= 1 << tried_level
+            for other in alternatives:
+                self._write_alternative(file, other)
+
+    def _write_pair(self, file: h5py.File, pair: PairMatches) -> None:
+        key = pair_key(*pair.names)
+        is_there = is_complete(file, key)
+        alternative = _read_alternative(file[key], pair.names) if is_there else None
+        tried = int(file[key].attrs["tried"]) if is_there else 0
+        known = {"level": pair.level, "tried": tried | 1 << pair.level, "of_some": pair.of_some}
+        self._write(file, key, hloc_matches(pair), **known)
+        if alternative:
+            self._write_alternative(file, alternative)
+
+    def _write_alternative(self, file: h5py.File, other: Alternative) -> None:
+        group = file[pair_key(*other.matches.names)]
+        for name, values in hloc_matches(other.matches).items():
+            self._write_dataset(group, OTHER + name, values)
+        group.attrs[OTHER + "level"] = other.matches.level
+        group.attrs[OTHER + "worth"] = other.worth
+
+    def alternatives(self, pairs: Sequence[Names]) -> dict[Names, Alternative]:
+        """Return the alternatives of pairs, where there are any."""
+        found = dict[Names, Alternative]()
+        with self._open("r") as file:
+            for names in pairs:
+                alternative = _read_alternative(file[pair_key(*names)], names)
+                if alternative:
+                    found[names] = alternative
+        return found
+
+    def choose(
+        self, chosen: Mapping[Names, tuple[PairMatches, Alternative]], compared: Any = None
+    ) -> None:
+        """Let alternatives take the place of the matches of their pairs, and these theirs.
+
+        Models that were made before are not gone on from.
+
+        Args:
+            chosen: by pair, its new matches, and the alternative to them.
+            compared: what is kept as the note ``COMPARED``.
+        """
+        with self._open("a") as file:
+            file.attrs[COMPARED] = json.dumps(compared)
+            file.attrs.pop(CLIMBING, None)
+            for matches, alternative in chosen.values():
+                self._write_pair(file, matches)
+                self._write_alternative(file, alternative)
 
     def remove(self, images: Iterable[str] = (), pairs: Iterable[Names] = ()) -> None:
         """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
@@ -261,7 +331,7 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for note in (FINISHED, IN_VAIN, STEP, CLIMBING):
+            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, COMPARED, SCORE_BEFORE):
                 file.attrs.pop(note, None)
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
@@ -303,15 +373,23 @@ class MatchStore(GroupStore):
                 key = pair_key(name1, name2)
                 if not is_complete(file, key):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
-                matches0 = checked(file[key], "matches0").astype(np.int64)
-                rows = np.flatnonzero(matches0 >= 0)
-                yield PairMatches(
-                    (name1, name2),
-                    np.stack([rows, matches0[rows]], axis=1),
-                    checked(file[key], "matching_scores0")[rows].astype(np.float32),
-                    len(matches0),
-                    int(file[key].attrs["level"]),
-                )
+                yield _read_matches(file[key], (name1, name2))
+
+
+def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatches:
+    """Read the matches of a pair, or those whose datasets begin with a prefix."""
+    matches0 = checked(group, f"{prefix}matches0").astype(np.int64)
+    rows = np.flatnonzero(matches0 >= 0)
+    indices = np.stack([rows, matches0[rows]], axis=1)
+    scores = checked(group, f"{prefix}matching_scores0")[rows].astype(np.float32)
+    return PairMatches(names, indices, scores, len(matches0), int(group.attrs[f"{prefix}level"]))
+
+
+def _read_alternative(group: h5py.Group, names: Names) -> Alternative | None:
+    if f"{OTHER}level" not in group.attrs:
+        return None
+    num_inliers, num_consistent = group.attrs[f"{OTHER}worth"].tolist()
+    return Alternative(_read_matches(group, names, OTHER), (num_inliers, num_consistent))
 
 
 @dataclass(frozen=True)

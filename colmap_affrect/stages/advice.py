@@ -11,7 +11,9 @@ from colmap_affrect.errors import such_as
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
-from colmap_affrect.project.report import Advice, ModelSummary
+from colmap_affrect.options import EFFORT_NAMES
+from colmap_affrect.parallel.executor import available_cores
+from colmap_affrect.project.report import Advice, MatchedAgain, ModelSummary
 from colmap_affrect.stages.context import Context
 
 STRONGEST = "default"  # of the recipes
@@ -21,11 +23,23 @@ FITTING_PX = re.compile(rf"{FOCAL_CONTRADICTED}, .*?(\d+) px does")
 
 
 def advice(
-    context: Context, missing: Collection[str], models: Sequence[ModelSummary], strongest: int
+    context: Context,
+    missing: Collection[str],
+    models: Sequence[ModelSummary],
+    strongest: int,
+    untried: Sequence[MatchedAgain] = (),
 ) -> tuple[Advice, ...]:
     """Say what may help when images are missing or the largest model is doubtful, best first.
 
-    ``strongest`` is the largest number of inliers of a verified pair.
+    Args:
+        context: folder, photographs and options on record.
+        missing: names of the images that are not in the largest model.
+        models: what is known of the models, the largest first.
+        strongest: the largest number of inliers of a verified pair.
+        untried: what a greater effort would try.
+
+    Returns:
+        What may help, the most promising first.
     """
     num_keypoints = colmap_database.keypoint_counts(context.workspace.database)
     lost = [n for n in missing if n in num_keypoints and n not in context.by_hand.left_out]
@@ -33,11 +47,14 @@ def advice(
     doubts = "; ".join([*model.doubtful.values(), *model.taken_out.values()])
     if (missing or doubts) and sum(map(bool, num_keypoints.values())) < 2:
         return (Advice("more photographs: two that can be read and show the same make a model"),)
-    if not models and strongest >= ENOUGH:
-        return (Advice("more photographs, from other places: the matches of these show no depth"),)
-    if not (lost or doubts):
-        return ()
     found, inputs = list[Advice](), None if context.workspace.is_foreign else context.inputs
+    if untried and context.effort != EFFORT_NAMES[-1]:
+        found.append(_of_effort(context, untried))
+    if not models and strongest >= ENOUGH:
+        why = "more photographs, from other places: the matches of these show no depth"
+        return (*found, Advice(why))
+    if not (lost or doubts):
+        return tuple(found)
     may_change = inputs and not (inputs.from_database or inputs.cameras.cameras_path)
     if may_change and (fitting := FITTING_PX.search(doubts)):
         why = f"{FOCAL_CONTRADICTED}, {fitting[1]} px does"
@@ -63,9 +80,21 @@ def advice(
     if inputs and inputs.masks == MaskOptions() and any(t in doubts for t in CONTRADICTIONS):
         why = "mask what moves, repeats or is written on photographs (black, in a folder masks)"
         found.append(Advice(why, _anew(context, "--mask-path", "masks")))
-    if lost:
+    if lost and len(lost) < len(num_keypoints):
         found.append(Advice(f"more photographs, between {such_as(lost)} and the others"))
+    elif lost:
+        found.append(Advice("more photographs, from places between those of these"))
     return tuple(found)
+
+
+def _of_effort(context: Context, untried: Sequence[MatchedAgain]) -> Advice:
+    """Return the command that tries what the effort did not allow."""
+    minutes = sum(one.core_s for one in untried) / available_cores() / 60
+    levels = ", ".join(one.text() for one in untried)
+    why = f"not tried, at most about {max(1, round(minutes))} min more: {levels}"
+    greater = EFFORT_NAMES[EFFORT_NAMES.index(context.effort) + 1]
+    command = _without(_run_command(context), ["--effort", "--max-time"])
+    return Advice(why, shlex.join([*command, "--effort", greater]))
 
 
 def _of_recipe(context: Context, names: str) -> list[Advice]:
@@ -82,21 +111,34 @@ def _of_recipe(context: Context, names: str) -> list[Advice]:
 
 
 def _again(context: Context, *words: str) -> str:
-    base = context.command or (
-        "colmap-affrect",
-        "map",
-        "--output-path",
-        str(context.workspace.path),
-    )
-    return shlex.join([*base, *(() if {*words} <= {*base} else words)])
+    """Return the same command with more words, if it does not have them."""
+    path = str(context.workspace.path)
+    base = context.command or ("colmap-affrect", "map", "--output-path", path)
+    more = [] if {*words} <= {*base} else words
+    return shlex.join([*base, *more])
+
+
+def _without(command: Sequence[str], flags: Collection[str]) -> list[str]:
+    """Leave out flags and their values."""
+    before = ("", *command)
+    return [
+        word for last, word in zip(before, command, strict=False) if not {last, word} & {*flags}
+    ]
 
 
 def _anew(context: Context, *words: str) -> str:
     """Return a command for other options, which take the place of those that were given."""
-    path, photos = context.workspace.path, context.workspace.photographs() or Path("photos")
+    path = context.workspace.path
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     new = (*words, "--output-path", str(next(place for place in numbered if not place.exists())))
-    usual = ("colmap-affrect", "run", "--image-path", str(photos))
-    base = context.command if context.command[1:2] == ("run",) else usual
-    kept = [w for last, w in zip(("", *base), base, strict=False) if not {last, w} & {*new[::2]}]
-    return shlex.join([*kept, *new])
+    return shlex.join([*_without(_run_command(context), new[::2]), *new])
+
+
+def _run_command(context: Context) -> Sequence[str]:
+    """Return the words of the command that ran all stages, or the usual ones."""
+    if context.command[1:2] == ("run",):
+        return context.command
+    workspace = context.workspace
+    photos = str(workspace.photographs() or Path("photos"))
+    output = str(workspace.path)
+    return ("colmap-affrect", "run", "--image-path", photos, "--output-path", output)

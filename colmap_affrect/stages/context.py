@@ -25,7 +25,7 @@ from colmap_affrect.images.photographs import (
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.options import Options
+from colmap_affrect.options import EffortName, Options
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
@@ -215,6 +215,7 @@ class Context:
     executor: Executor | None = None  # for images and pairs, e.g. a cluster; None: threads here
     progress: Progress = SILENT  # where to show progress
     deadline_s: float = math.inf  # of time.monotonic(): from then on nothing more is tried
+    effort: EffortName = "normal"  # how much is tried for images in need
     by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
     command: tuple[str, ...] = ()  # words of the command line, for advice
 

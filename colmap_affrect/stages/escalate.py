@@ -4,11 +4,11 @@ Images get the features that a level of the recipe adds, and pairs are matched a
 (Mishkin, Matas, Perdoch, MODS, 2015). New matches take the place of the old ones only when their
 two-view geometry has more inliers, or, where neither is verified, when more of them confirm each
 other. Which pairs are matched again, and at which level, is decided anew after every step
-(:mod:`colmap_affrect.stages.expected_gain`), by what the database holds then; the step that has
+(:mod:`colmap_affrect.stages.escalation_policy`), by what the database holds then; the step that has
 begun is on record, so that a killed run goes on in the same way.
 
 Images are in need that the model before has not, or is not sure of. While there is none, those that
-have no strong pair, or few features in tracks through three; a small set is mapped when one has.
+have no strong pair, or few features in tracks through three.
 """
 
 import logging
@@ -16,21 +16,22 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from functools import cached_property
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import ImageError, such_as
 from colmap_affrect.mappers.mapping import read_summaries
-from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
-from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.stores import STEP, PairMatches
+from colmap_affrect.project.report import MatchedAgain, ModelSummary, StageReport
+from colmap_affrect.project.stores import COMPARED, SCORE_BEFORE, STEP, Alternative, PairMatches
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.expected_gain import ExpectedGain, PairState
+from colmap_affrect.stages.escalation_policy import Plan, Situation, next_step, tried, untried
+from colmap_affrect.stages.expected_gain import PairState, Step
 from colmap_affrect.stages.extract import extract_images
 from colmap_affrect.stages.match import (
     matched_at_level,
@@ -45,10 +46,29 @@ from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers,
 logger = logging.getLogger(__name__)
 
 LIKELY = 0.25  # part of a gain that counts for images that are likely right: matches mend few
+MEASURED_ONLY, LEARNED_ONLY = "measured", "learned"  # kinds of matches that models were made of
 
 
 def escalate(context: Context, options: EscalateOptions | None = None) -> StageReport:
-    """Go through the levels of the recipe, if any; count the pairs that are matched again now."""
+    """Go through the levels of the recipe, if any, without mapping in between.
+
+    Args:
+        context: folder, resources and options on record.
+        options: which pairs are strong; by default those on record.
+
+    Returns:
+        What was done; ``num_done`` counts the pairs that were matched again now.
+    """
+    escalation, report = begin(context, options)
+    while step := escalation.next_step():
+        report = escalation.taken(step, report)
+    return escalation.ended(report)
+
+
+def begin(
+    context: Context, options: EscalateOptions | None = None
+) -> tuple["Escalation", StageReport]:
+    """Bring the database up to what is stored, and return what lets pairs escalate."""
     start = time.perf_counter()
     context.resources.require_device()
     context.workspace.require("verify")
@@ -56,21 +76,7 @@ def escalate(context: Context, options: EscalateOptions | None = None) -> StageR
     context.workspace.record_options("escalate", options.to_mapping())
     escalation = Escalation(context, options)
     escalation.write()  # it may have been killed before
-    escalated: set[Pair] = set()
-    while work := escalation.next_work():
-        if time.monotonic() > context.deadline_s:
-            break
-        level, todo = work
-        escalation.match_at(todo, level)
-        escalated.update(todo)
-    warnings = dict[str, str]()
-    if not escalated or not escalation.models()[0].registered_names:  # else the next model tells
-        warnings = escalation.waiting()
-        if work:
-            warnings["time"] = "it is over; the same command without --max-time tries more"
-    for what, text in warnings.items():
-        logger.warning("%s: %s", what, text)
-    return StageReport("escalate", time.perf_counter() - start, len(escalated), warnings=warnings)
+    return escalation, StageReport("escalate", time.perf_counter() - start, 0)
 
 
 def unmeasured_pairs(context: Context) -> list[Pair]:
@@ -79,6 +85,45 @@ def unmeasured_pairs(context: Context) -> list[Pair]:
     pairs = escalation.num_inliers() if any(escalation.is_measured) else ()
     levels = escalation.matches.levels(pairs)
     return [pair for pair, level in levels.items() if not escalation.is_measured[level]]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What escalation did for a set, and what is left."""
+
+    effort: str = ""  # how much was tried; empty where nothing had to be
+    tried: tuple[MatchedAgain, ...] = ()  # pairs by level
+    untried: tuple[MatchedAgain, ...] = ()  # what a greater effort would try
+
+
+def matched_again(context: Context) -> Tried:
+    """Return what escalation did in a workspace, and what is left for images in need."""
+    workspace = context.workspace
+    if workspace.is_foreign or "escalate" not in workspace.begun:
+        return Tried()
+    escalation = Escalation(context, context.escalation)
+    models = escalation.models()
+    needs = escalation.needs(models)
+    has_stepped = escalation.matches.note(SCORE_BEFORE) is not None
+    if not (needs or has_stepped):  # large sets take long to go through
+        return Tried()
+    situation = escalation.situation(needs, models)
+    return Tried(context.effort, tuple(tried(situation)), tuple(untried(situation)))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Matches that were found for a pair at a level, beside what was there."""
+
+    found: PairMatches
+    worth: tuple[int, int]  # inliers; where there are none, how many matches confirm each other
+    before: PairState
+    other: Alternative | None  # what is kept of the other kind of features
+
+    @property
+    def is_better(self) -> bool:
+        """Whether it takes the place of what is there."""
+        return self.worth > self.before.worth
 
 
 class Escalation:
@@ -91,7 +136,6 @@ class Escalation:
         self.pairs = listed_pairs(context)
         self.features, self.matches = context.features, context.matches
         self.path = context.workspace.database
-        self.levels = context.resources.usable_levels(self.extraction)[1:]
         self.is_measured = [level.features.has_shapes for level in self.extraction.levels]
         self.left_s = 0.0  # nominal, if nothing helps any more
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
@@ -101,6 +145,19 @@ class Escalation:
         """The recipe, prepared for all images when it is needed first."""
         names, context = self.features.names(), self.context
         return prepare(self.extraction, context.resources, names, context.progress)
+
+    @property
+    def is_over_time(self) -> bool:
+        """Whether the time that the user gave is over."""
+        return time.monotonic() > self.context.deadline_s
+
+    def usable_levels(self) -> list[int]:
+        """Return the levels whose weights are here, of the kind of matches that was chosen."""
+        usable = self.context.resources.usable_levels(self.extraction)[1:]
+        _, chosen = self.matches.note(COMPARED) or (0, "")
+        if not chosen:
+            return usable
+        return [k for k in usable if self.is_measured[k] == (chosen == MEASURED_ONLY)]
 
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of pairs in the database that may be used, 0 of unverified ones."""
@@ -126,10 +183,7 @@ class Escalation:
         lost = set(names) - set(models[0].sure)
         if workspace.made_from("map") != self.context.verified_digest():
             strong, counts = self.options.strong_num_inliers, self.num_inliers()
-            insecure = lost & expected_gain.insecure_images(counts, strong, self._loose())
-            # The next model tells of what has been tied since.
-            maps_next = insecure != lost and workspace.sparse.exists() and len(names) < LARGE
-            lost = set() if maps_next else insecure
+            lost &= expected_gain.insecure_images(counts, strong, self._loose())
         likely = frozenset[str]().union(*(model.likely for model in models))
         worth = {name: LIKELY if name in likely else 1.0 for name in sorted(lost)}
         return {name: share * models[0].gains.get(name, 1.0) for name, share in worth.items()}
@@ -173,42 +227,76 @@ class Escalation:
                 known[pair] = key, num_confirming(self.features, pair, indices)
         return {pair: known[pair][1] for pair in pairs}
 
-    def next_work(self) -> tuple[int, list[Pair]] | None:
+    def situation(self, needs: Mapping[str, float], models: Sequence[ModelSummary]) -> Situation:
+        """Return what the policy decides by.
+
+        Args:
+            needs: what saving images is worth, by name.
+            models: the models that are there, the largest first.
+
+        Returns:
+            The state of all pairs and images.
+        """
+        states = self.states()
+        sizes = self.features.image_sizes()
+        ranges = {name: self.features.level_ranges(name) for name in sizes}
+        levels = self.extraction.levels
+        return Situation(
+            levels=levels,
+            usable=self.usable_levels(),
+            states=states,
+            needs=needs,
+            loose=self._loose(),
+            held=self._held(models[0], states),
+            megapixels=[
+                {name: _megapixels(size, level.max_image_size_px) for name, size in sizes.items()}
+                for level in levels
+            ],
+            lacking=[
+                {name for name in sizes if number not in ranges[name]}
+                for number in range(len(levels))
+            ],
+            registered=models[0].registered_names,
+            strong_num_inliers=self.options.strong_num_inliers,
+        )
+
+    def next_step(self) -> Step | None:
         """Return a level, and the pairs to match at it now; None when nothing is left to do.
 
         No pairs are left where a killed run has matched all of a step, but for the database.
         """
-        if step := self.matches.note(STEP):
-            level, pairs = step
-            tried = self.matches.levels(self.pairs, "tried")
-            return level, [p for p in map(tuple, pairs) if not tried.get(p, -1) >> level & 1]
-        models, sizes = self.models(), self.features.image_sizes()
-        limit_px = self.extraction.max_image_size_px
-        worth = {n: x * _megapixels(sizes[n], limit_px) for n, x in self.needs(models).items()}
-        if not worth:
+        if self.is_over_time:
             return None
-        states, loose, best = self.states(), self._loose(), (0.0, 0, list[Pair]())
-        self.left_s = 0.0
-        held = self._held(models[0], states)
-        ranges = {name: self.features.level_ranges(name) for name in sizes}
-        for number in self.levels:
-            level = self.extraction.levels[number]
-            gain = ExpectedGain(
-                states,
-                loose,
-                # Others take like for same: only for images that no measured ones hold.
-                {n: x for n, x in worth.items() if self.is_measured[number] or n not in held},
-                {name: _megapixels(size, level.max_image_size_px) for name, size in sizes.items()},
-                [k for k, is_measured in enumerate(self.is_measured) if not is_measured],
-                {name for name in sizes if number not in ranges[name]},
-                models[0].registered_names,
-            )
-            kinds = self.is_measured  # of frames, by level
-            others = sum(1 << k for k in range(number, len(kinds)) if kinds[k] == kinds[number])
-            rate, pairs, seconds = gain.best_pairs(number, level, others, self.options)
-            self.left_s += seconds / available_cores()
-            best = max(best, (rate, number, pairs), key=lambda found: found[0])
-        return best[1:] if best[0] else None
+        if begun := self.matches.note(STEP):
+            level, pairs = begun
+            tried = self.matches.levels(self.pairs, "tried")
+            return Step(level, [p for p in map(tuple, pairs) if not tried.get(p, -1) >> level & 1])
+        plan = self._plan()
+        self.left_s = plan.left_s / available_cores()
+        return plan.step if plan.step.pairs else None
+
+    def _plan(self) -> Plan:
+        models = self.models()
+        needs = self.needs(models)
+        if not needs:
+            return Plan()
+        return next_step(self.situation(needs, models), self.context.effort)
+
+    def taken(self, step: Step, report: StageReport) -> StageReport:
+        """Take a step, and return the report with its pairs and seconds."""
+        start = time.perf_counter()
+        self.match_at(step.pairs, step.level)
+        wall_s = report.wall_s + time.perf_counter() - start
+        return StageReport("escalate", wall_s, report.num_done + len(step.pairs))
+
+    def ended(self, report: StageReport) -> StageReport:
+        """Return the report with what could not be tried, which is logged, too."""
+        warnings = self.waiting()
+        if self.is_over_time:
+            warnings["time"] = "it is over; the same command without --max-time tries more"
+        for what, text in warnings.items():
+            logger.warning("%s: %s", what, text)
+        return StageReport("escalate", report.wall_s, report.num_done, warnings=warnings)
 
     def match_at(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers.
@@ -260,18 +348,32 @@ class Escalation:
     ) -> None:
         size_px = self.extraction.levels[level].max_image_size_px
         verifier, states = PairVerifier(self.path, self.verification, size_px), self.states()
+        others = self.matches.alternatives(pairs)
 
-        def judged(found: PairMatches) -> tuple[Pair, PairMatches | None]:
-            is_better = self._worth(found, verifier) > states[found.names].worth
-            return found.names, found if is_better else None
+        def judged(found: PairMatches) -> Trial:
+            names = found.names
+            return Trial(found, self._worth(found, verifier), states[names], others.get(names))
 
-        def write(batch: Sequence[tuple[Pair, PairMatches | None]]) -> None:
-            better = [chosen for _, chosen in batch if chosen]
-            tried = [names for names, _ in batch]
-            self.matches.write(better, tried, level)  # both or neither, if it is killed here
+        def write(batch: Sequence[Trial]) -> None:
+            better = [trial.found for trial in batch if trial.is_better]
+            tried = [trial.found.names for trial in batch]
+            self.matches.write(better, tried, level, self._alternatives(batch))  # all or nothing
 
         with closing(matched_at_level(self.context, pairs, self.matching, level)) as found_pairs:
             write_batches(map(judged, found_pairs), write, advance)
+
+    def _alternatives(self, batch: Sequence[Trial]) -> list[Alternative]:
+        """Return what is kept beside the matches of pairs: the best of the other kind of frames."""
+        kept = list[Alternative]()
+        for trial in batch:
+            if self.is_measured[trial.before.level] == self.is_measured[trial.found.level]:
+                continue
+            if trial.is_better:
+                (before,) = self.matches.read([trial.found.names])
+                kept.append(Alternative(before, trial.before.worth))
+            elif trial.other is None or trial.worth > trial.other.worth:
+                kept.append(Alternative(trial.found, trial.worth))
+        return kept
 
     def _worth(self, found: PairMatches, verifier: PairVerifier) -> tuple[int, int]:
         """Return the inliers of a pair, or without any how many matches confirm each other."""

@@ -1,27 +1,28 @@
 """Which pairs are matched again, and at which level: what is likely to bring most per second.
 
 A pair at a level is worth the chance that it verifies there, times the photographs that it would
-tie, in megapixels as are costs, over what it costs. The chances are logistic regressions on what is
-known of a pair, one for each kind of level, and the costs are nominal. Both are in
+tie, over what it costs. The chances are logistic regressions on what is known of a pair, one for
+each kind of level, and the costs are nominal: seconds of one core. Both are in
 ``expected_gain.json``; ``tests/benchmarks/fit_expected_gain.py`` fits the former on photographs
 whose poses are known.
 """
 
 import json
 import math
-from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Set
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 
 from colmap_affrect.colmap.verification import connected_parts, num_in_tracks
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.recipes import EscalateOptions, Level
+from colmap_affrect.recipes import Level
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")
-MAPPING_S = 0.06  # of one core, by listed pair: what follows on each step, mapping again
+MAPPING_S = 1.0  # of one core, by image: what follows on each step, mapping again
+LEARNED = "learned"  # kind of the level that matches whole photographs by networks
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,19 @@ class LevelGain:
         log_odds = sum(self.weights[name] * value for name, value in terms.items())
         return 1.0 / (1.0 + math.exp(-log_odds))
 
+    def seconds(self, images: Iterable[float], pairs: Iterable[tuple[float, float]]) -> float:
+        """Return what features of images, and matching of pairs, take on one core.
+
+        Args:
+            images: megapixels of each image that gets features.
+            pairs: megapixels of both images of each pair that is matched.
+
+        Returns:
+            Seconds of one core.
+        """
+        extraction_s = self.image_s * sum(images)
+        return extraction_s + self.pair_s * sum(max(pair) for pair in pairs)
+
 
 @cache
 def _known() -> dict[str, LevelGain]:
@@ -64,7 +78,7 @@ def kind_of(level: Level) -> str:
     warps = level.rectifier.name
     if level.features.has_shapes:
         return "measured, all tilts" if warps == "asift" else "measured, warps"
-    return "learned" if warps == "identity" else "learned, warps"
+    return LEARNED if warps == "identity" else "learned, warps"
 
 
 def gain_of(level: Level) -> LevelGain:
@@ -87,16 +101,49 @@ def terms(state: PairState, wins: int, losses: int) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
+class Candidate:
+    """A pair that a level may verify."""
+
+    pair: Pair
+    chance: float  # that it verifies, and is right
+    ties: Sequence[tuple[str | int, float]]  # images or a part of the graph, and photographs saved
+
+    @property
+    def photographs(self) -> float:
+        """How many photographs it is expected to save, if nothing else does."""
+        return self.chance * sum(value for _, value in self.ties)
+
+
+@dataclass(frozen=True)
+class Step:
+    """Pairs to match again at a level now, and what is expected of that."""
+
+    level: int = 0
+    pairs: Sequence[Pair] = ()
+    photographs: float = 0.0  # expected to be saved by these pairs
+    seconds: float = 0.0  # of one core, with the mapping that follows
+    all_photographs: float = 0.0  # by all pairs that the budget allows at this level
+    all_seconds: float = 0.0  # that these take
+    num_pairs: int = 0  # how many these are
+
+    @property
+    def rate(self) -> float:
+        """Photographs saved per second."""
+        return self.photographs / self.seconds if self.pairs else 0.0
+
+
+@dataclass(frozen=True)
 class ExpectedGain:
     """The pairs of a set as they are now, and what a level may bring to them."""
 
     states: Mapping[Pair, PairState]  # of all pairs
     loose: Set[str]  # images with few features in tracks through three images
-    needs: Mapping[str, float]  # what more matches may be worth: megapixels, of lost images all
+    needs: Mapping[str, float]  # images in need, and what saving them is worth in photographs
     megapixels: Mapping[str, float]  # of each image, as its features are extracted
     unmeasured: Collection[int]  # levels whose frames are not measured
     lacking: Collection[str]  # images without features of the level yet
     registered: Collection[str]  # images of the model before
+    strong_num_inliers: int  # pairs with as many need nothing more
 
     @cached_property
     def _parts(self) -> list[set[str]]:
@@ -108,69 +155,128 @@ class ExpectedGain:
         return {name: number for number, part in enumerate(self._parts) for name in part}
 
     @cached_property
-    def _in_vain(self) -> Counter[str]:
+    def _num_with_model(self) -> Counter[str]:
         """Count the verified pairs of each image with images of the model."""
         verified = [pair for pair, state in self.states.items() if state.num_inliers]
         both = [*verified, *(pair[::-1] for pair in verified)]
         return Counter(name for name, other in both if other in self.registered)
 
-    def _tied(self, pair: Pair) -> list[tuple[str | int, float]]:
+    def _ties(self, pair: Pair) -> list[tuple[str | int, float]]:
         """Return what would be tied by a pair, images or a part, and how many images that saves.
 
         What is apart from the largest part must be joined to others before all. Where n verified
         pairs with images of the model did not save one, another does with 1 / (n + 1), about.
+        While there is no model, each pair of images in need may begin one.
         """
         first, second = (self._part_of[name] for name in pair)
         if first == second:
-            needy = [name for name in pair if name in self.needs] if first == 0 else []
-            return [(name, self.needs[name] / (1 + self._in_vain[name])) for name in needy]
+            if first and self.registered:
+                return []
+            needy = [name for name in pair if name in self.needs]
+            return [(name, self.needs[name] / (1 + self._num_with_model[name])) for name in needy]
         smaller = max(first, second)  # parts come by size
         need = sum(self.needs.get(name, 0.0) for name in self._parts[smaller])
         return [(smaller, need)] if need else []
 
-    def best_pairs(
-        self, number: int, level: Level, others: int, options: EscalateOptions
-    ) -> tuple[float, list[Pair], float]:
-        """Return megapixels saved by second, pairs for a level now, and seconds of all worth it.
+    def _is_strong(self, pair: Pair) -> bool:
+        """Tell whether a pair needs nothing more; while there is no model, none is."""
+        is_many = self.states[pair].num_inliers >= self.strong_num_inliers
+        return is_many and bool(self.registered) and self.loose.isdisjoint(pair)
 
-        A step has the pairs that save more by second than it does as a whole. Mapping is included.
-        ``others``: bits of the levels that make this one needless.
+    def candidates(self, number: int, level: Level, others: int) -> list[Candidate]:
+        """Return the pairs that a level may verify, the most promising one first.
+
+        Args:
+            number: of the level in the recipe.
+            level: what is extracted and matched there.
+            others: bits of the levels that make this one needless where they were tried.
+
+        Returns:
+            Candidates by falling number of photographs that they are expected to save.
         """
-        gain, states = gain_of(level), self.states
-        num_tried = sum(state.tried >> number & 1 for state in states.values())
-        wins = sum(state.level == number and state.num_inliers > 0 for state in states.values())
-        found = []
-        for pair, state in states.items():
-            is_strong = state.num_inliers >= options.strong_num_inliers
-            is_done = state.tried & others or (is_strong and self.loose.isdisjoint(pair))
-            if not is_done and (tied := self._tied(pair)):
-                is_hint = not level.features.has_shapes or state.level not in self.unmeasured
-                hint = state if is_hint else replace(state, num_inliers=0)
-                known = terms(hint, wins, max(0, num_tried - wins))
-                found.append((gain.chance(known), tied, pair))
-        found.sort(key=lambda item: (-item[0] * sum(value for _, value in item[1]), item[2]))
-        left: defaultdict[str | int, float] = defaultdict(lambda: 1.0)  # chance of being lost still
-        chosen, there = list[Pair](), set[str]()
-        saved, spent_s, all_s = 0.0, MAPPING_S * len(states), MAPPING_S * len(states)
-        for chance, tied, pair in found:
-            lacking = [name for name in pair if name in self.lacking and name not in there]
-            seconds = gain.image_s * sum(self.megapixels[name] for name in lacking)
-            seconds += gain.pair_s * max(self.megapixels[name] for name in pair)
-            brought = chance * sum(value * left[key] for key, value in tied)
-            rate = brought / seconds
-            if rate * options.max_seconds_per_megapixel < 1.0:
+        gain = gain_of(level)
+        num_tried = sum(state.tried >> number & 1 for state in self.states.values())
+        wins = sum(s.level == number and s.num_inliers > 0 for s in self.states.values())
+        losses = max(0, num_tried - wins)
+        found = list[Candidate]()
+        for pair, state in self.states.items():
+            if state.tried & others or self._is_strong(pair):
                 continue
-            all_s += seconds
-            if rate * spent_s < saved:
+            ties = self._ties(pair)
+            if not ties:
                 continue
-            chosen.append(pair)
-            there.update(lacking)
-            saved, spent_s = saved + brought, spent_s + seconds
-            for key, _ in tied:
-                left[key] *= 1.0 - chance
-        if not chosen or saved * options.max_seconds_per_megapixel < spent_s:
-            return 0.0, [], 0.0
-        return saved / spent_s, chosen, all_s
+            is_hint = not level.features.has_shapes or state.level not in self.unmeasured
+            hint = state if is_hint else replace(state, num_inliers=0)
+            found.append(Candidate(pair, gain.chance(terms(hint, wins, losses)), ties))
+        found.sort(key=lambda one: (-one.photographs, one.pair))
+        return found
+
+    def best_step(self, number: int, level: Level, others: int, budget_s: float) -> Step:
+        """Return the pairs to match at a level now.
+
+        A step has the pairs that save more per second than it does as a whole, with the mapping
+        that follows.
+
+        Args:
+            number: of the level in the recipe.
+            level: what is extracted and matched there.
+            others: bits of the levels that make this one needless where they were tried.
+            budget_s: seconds of one core that the pairs may take.
+
+        Returns:
+            The step; one without pairs where there is nothing to match.
+        """
+        mapping_s = MAPPING_S * len(self.megapixels)
+        step = _Plan(self, gain_of(level), mapping_s)
+        everything = _Plan(self, gain_of(level), mapping_s)
+        for one in self.candidates(number, level, others):
+            if everything.seconds + everything.cost_of(one) - mapping_s > budget_s:
+                continue
+            everything.add(one)
+            if step.photographs * step.cost_of(one) <= step.gain_of(one) * step.seconds:
+                step.add(one)
+        return Step(
+            number,
+            step.pairs,
+            step.photographs,
+            step.seconds,
+            everything.photographs,
+            everything.seconds,
+            len(everything.pairs),
+        )
+
+
+@dataclass
+class _Plan:
+    """Pairs that are matched together, what they are expected to save, and what they take."""
+
+    gain: ExpectedGain
+    level: LevelGain
+    seconds: float  # of one core; at first that of mapping
+    photographs: float = 0.0
+    pairs: list[Pair] = field(default_factory=list)
+    _there: set[str] = field(default_factory=set)  # images that get features of the level
+    _lost: dict[str | int, float] = field(default_factory=dict)  # chance that none tied it so far
+
+    def gain_of(self, one: Candidate) -> float:
+        """Return how many photographs a pair is expected to save that no other has saved."""
+        return one.chance * sum(value * self._lost.get(key, 1.0) for key, value in one.ties)
+
+    def cost_of(self, one: Candidate) -> float:
+        """Return the seconds of a pair, and of the features that its images lack."""
+        sizes = self.gain.megapixels
+        first, second = one.pair
+        lacking = [n for n in one.pair if n in self.gain.lacking and n not in self._there]
+        return self.level.seconds([sizes[n] for n in lacking], [(sizes[first], sizes[second])])
+
+    def add(self, one: Candidate) -> None:
+        """Take a pair in."""
+        self.seconds += self.cost_of(one)
+        self.photographs += self.gain_of(one)
+        self.pairs.append(one.pair)
+        self._there.update(one.pair)
+        for key, _ in one.ties:
+            self._lost[key] = self._lost.get(key, 1.0) * (1.0 - one.chance)
 
 
 def insecure_images(

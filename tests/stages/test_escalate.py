@@ -165,7 +165,6 @@ max_image_size_px = 360
 features = { name = "rootsift", contrast_threshold = 0.01 }
 [escalate]
 strong_num_inliers = 1000000
-max_seconds_per_megapixel = 1e9
 """
 
 
@@ -234,9 +233,11 @@ def test_strong_pairs_without_a_track_of_three_escalate(
     apart = {**matches, (NAMES[1], NAMES[2]): np.arange(1, 81).reshape(40, 2)}
     monkeypatch.setattr(work, "num_inliers", lambda: chain)
     monkeypatch.setattr(escalation, "verified_inliers", lambda _: apart)
-    assert work.next_work() is None
+    assert work.next_step() is None
     monkeypatch.setattr(escalation, "verified_inliers", lambda _: matches)
-    assert work.next_work() == (1, list(chain))
+    step = work.next_step()
+    assert step
+    assert (step.level, step.pairs) == (1, list(chain))
 
 
 def test_photographs_that_are_likely_right_in_another_model_need_a_quarter(

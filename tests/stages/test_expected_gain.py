@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 
 from colmap_affrect.colmap.verification import connected_parts
-from colmap_affrect.recipes import EscalateOptions, Level, load_recipe, recipe_names
+from colmap_affrect.recipes import Level, load_recipe, recipe_names
 from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.expected_gain import (
     ExpectedGain,
     PairState,
+    Step,
     gain_of,
     insecure_images,
     terms,
@@ -19,7 +21,6 @@ from colmap_affrect.stages.expected_gain import (
 
 LEVELS = load_recipe("default").levels
 COVERS, LEARNED = LEVELS[1], LEVELS[2]
-PATIENT = EscalateOptions(max_seconds_per_megapixel=1e6)
 
 
 @pytest.mark.parametrize(("counts", "weak", "expected"), [
@@ -79,15 +80,16 @@ def gains(
     }
     sizes = dict.fromkeys("abcdef", 1.0)
     loose, lacking = set(given.get("loose", "")), set(given.get("lacking", ""))
-    registered = given.get("registered", "")
-    return ExpectedGain(states, loose, needs, sizes, [2, 4], lacking, registered)
+    registered = given.get("registered", "abc")
+    return ExpectedGain(states, loose, needs, sizes, [2, 4], lacking, registered, 100)
 
 
-def chosen(
-    found: ExpectedGain, options: EscalateOptions = PATIENT, level: Level = COVERS
-) -> list[str]:
-    _, pairs, _ = found.best_pairs(1, level, 0b10, options)
-    return ["".join(pair) for pair in pairs]
+def best(found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf) -> Step:
+    return found.best_step(1, level, 0b10, budget_s)
+
+
+def chosen(found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf) -> list[str]:
+    return ["".join(pair) for pair in best(found, level, budget_s).pairs]
 
 
 INLIERS = {"ab": 200, "ac": 150, "bc": 120, "ad": 0, "bd": 0, "cd": 0, "ae": 90, "be": 0}
@@ -101,28 +103,38 @@ def test_pairs_of_images_in_need_come_by_what_hints_at_a_surface() -> None:
     assert chosen(gains(INLIERS, {"a": 0.2})) == ["ae"]  # the others of a are strong
 
 
-def test_nothing_is_worth_more_than_it_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_step_takes_more_than_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(expected_gain, "MAPPING_S", 0.0)
-    pairs, hints = gains(INLIERS, {"d": 1.0}, {"bd": 8}), {"bd": 8}
-    rate, (best,), seconds = pairs.best_pairs(1, COVERS, 0b10, PATIENT)
-    assert seconds >= gain_of(COVERS).pair_s
-    assert best == ("b", "d")
-    just, below = (EscalateOptions(max_seconds_per_megapixel=f / rate) for f in (1.01, 0.99))
-    assert chosen(pairs, just) == ["bd"]
-    assert chosen(pairs, below) == []
-    sure = gains(INLIERS, {"d": 0.5}, hints)  # half of the need, half of the worth
-    assert chosen(sure, just) == []
+    hints = {"ad": 7, "bd": 8, "cd": 6}
+    pairs = gains(INLIERS, {"d": 1.0}, hints)
+    pair_s = gain_of(COVERS).pair_s
+    assert chosen(pairs, budget_s=1.01 * pair_s) == ["bd"]
+    assert chosen(pairs, budget_s=0.99 * pair_s) == []
+    assert chosen(pairs, LEARNED, budget_s=1.01 * pair_s) == []  # takes longer
     lacking = gains(INLIERS, {"d": 1.0}, hints, lacking="bd")  # features cost, too
-    assert chosen(lacking, just) == []
-    assert chosen(pairs, just, LEARNED) == []  # takes longer
+    with_features_s = pair_s + 2 * gain_of(COVERS).image_s
+    assert "bd" not in chosen(lacking, budget_s=0.99 * with_features_s)
+    assert chosen(lacking, budget_s=1.01 * with_features_s) == ["bd"]
+    everything = best(pairs)
+    assert everything.num_pairs == 3
+    assert everything.all_seconds == pytest.approx(3 * pair_s)
+    assert everything.photographs <= everything.all_photographs < 1.0
+
+
+def test_while_there_is_no_model_strong_pairs_and_small_parts_count_too() -> None:
+    pairs = {"ab": 200, "bc": 90, "de": 90}
+    needs = dict.fromkeys("abcde", 1.0)
+    none = best(gains(pairs, needs, registered="")).num_pairs
+    some = best(gains(pairs, needs, registered="abc")).num_pairs
+    assert (none, some) == (3, 1)
 
 
 def test_what_joins_a_part_counts_for_all_of_its_images() -> None:
     apart = {"ab": 200, "cd": 90, "ac": 0}
-    small = gains(apart, {"c": 1.0}, {"ac": 3}).best_pairs(1, COVERS, 0b10, PATIENT)
-    large = gains(apart, {"c": 1.0, "d": 1.0}, {"ac": 3}).best_pairs(1, COVERS, 0b10, PATIENT)
-    assert small[1] == large[1] == [("a", "c")]  # and not the weak pair inside of it
-    assert large[0] > 1.5 * small[0]
+    small = best(gains(apart, {"c": 1.0}, {"ac": 3}))
+    large = best(gains(apart, {"c": 1.0, "d": 1.0}, {"ac": 3}))
+    assert small.pairs == large.pairs == [("a", "c")]  # and not the weak pair inside of it
+    assert large.rate > 1.5 * small.rate
 
 
 def test_images_are_not_saved_twice() -> None:
@@ -147,11 +159,12 @@ def test_a_level_that_verified_nothing_is_less_likely_to() -> None:
 
 def test_the_more_mapping_costs_the_more_pairs_a_step_has(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs = gains(INLIERS, {"d": 1.0}, {"ad": 1, "bd": 8, "cd": 2}, lacking="c")
+    monkeypatch.setattr(expected_gain, "MAPPING_S", 0.0)
     assert chosen(pairs) == ["bd"]
-    rate = pairs.best_pairs(1, COVERS, 0b10, PATIENT)[0]
+    rate = best(pairs).rate
     monkeypatch.setattr(expected_gain, "MAPPING_S", 10.0)
     assert chosen(pairs) == ["bd", "cd", "ad"]
-    assert pairs.best_pairs(1, COVERS, 0b10, PATIENT)[0] < 0.5 * rate
+    assert best(pairs).rate < 0.5 * rate
 
 
 def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_another(
@@ -162,7 +175,7 @@ def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_anoth
     def rate(inliers: dict[str, int], registered: str = "abc") -> float:
         all_inliers = {"ab": 200, "bc": 200, **inliers}
         pairs = gains(all_inliers, {"d": 1.0}, {"ad": 5}, registered=registered)
-        return pairs.best_pairs(1, COVERS, 0b10, PATIENT)[0]
+        return best(pairs).rate
 
     lost, tied, tied_twice = (
         {"ad": 0} | more for more in ({}, {"bd": 200}, {"bd": 200, "cd": 200})

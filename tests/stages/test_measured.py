@@ -14,12 +14,13 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import PairMatches
+from colmap_affrect.project.stores import Alternative, PairMatches
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import map as stage
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, unmeasured_pairs
+from colmap_affrect.stages.expected_gain import Step
 
 RECIPE = """
 [rectifier]
@@ -28,7 +29,6 @@ name = "identity"
 features = "shapeless"
 [escalate]
 strong_num_inliers = 1000000
-max_seconds_per_megapixel = 1e9
 """
 
 
@@ -92,16 +92,19 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
 ) -> None:
     """Those of an image that no measured frames match, and not those of the others."""
     own = without_matches(context, NAMES[3])
-    options = EscalateOptions(strong_num_inliers=1, max_seconds_per_megapixel=1e6)
-    worthless = options.changed(max_seconds_per_megapixel=0.0)
-    assert Escalation(context, worthless).next_work() is None
+    options = EscalateOptions(strong_num_inliers=1)
     escalation = Escalation(context, options)
-    assert escalation.next_work() == (1, own)
+    assert escalation.next_step() == Step(1, own)
 
     written = escalation.matches.write
 
-    def killed(found: list[PairMatches], tried: list[tuple[str, str]], level: int) -> None:
-        written(found[:2], tried[:2], level)
+    def killed(
+        found: list[PairMatches],
+        tried: list[tuple[str, str]],
+        level: int,
+        alternatives: list[Alternative],
+    ) -> None:
+        written(found[:2], tried[:2], level, alternatives[:2])
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -110,10 +113,10 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
             escalation.match_at(own, 1)
     # The matches that are stored look different now; what is left of the step is not decided anew.
     escalation = Escalation(context, options)
-    assert escalation.next_work() == (1, own[2:])
+    assert escalation.next_step() == Step(1, own[2:])
     escalation.match_at(own[2:], 1)
     assert min(escalation.num_inliers()[pair] for pair in own) > 30
-    assert escalation.next_work() is None
+    assert escalation.next_step() is None
 
 
 @pytest.mark.long

@@ -1,0 +1,150 @@
+"""What is matched again next: learned matching first, then by expected gain, within a budget."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages import escalation_policy as policy
+from colmap_affrect.stages.escalation_policy import (
+    EFFORTS,
+    SMALL,
+    Situation,
+    learned_step,
+    next_step,
+    tried,
+    untried,
+)
+from colmap_affrect.stages.expected_gain import PairState, gain_of, kind_of
+
+LEVELS = load_recipe("default").levels
+KINDS = [kind_of(level) for level in LEVELS]
+LEARNED = KINDS.index("learned")
+NAMES = "abcde"
+
+
+def situation(names: str | list[str] = NAMES, **given: Any) -> Situation:
+    """A set of images of one megapixel; those in need are not registered."""
+    pairs: list[Pair] = list(itertools.combinations(names, 2))
+    needs = given.pop("needs", "de")
+    done = given.pop("tried", {})
+    sizes = dict.fromkeys(names, 1.0)
+    values: dict[str, Any] = {
+        "levels": LEVELS,
+        "usable": [1, 2, 3, 4],
+        "states": {pair: PairState(0, 3, tried=done.get("".join(pair), 1)) for pair in pairs},
+        "needs": dict.fromkeys(needs, 1.0),
+        "loose": (),
+        "held": (),
+        "megapixels": [sizes] * len(LEVELS),
+        "lacking": [set(names)] * len(LEVELS),
+        "registered": [name for name in names if name not in needs],
+    }
+    return Situation(**values | given)
+
+
+def test_learned_matching_of_a_small_set_comes_first_for_all_pairs_of_images_in_need() -> None:
+    plan = next_step(situation(), "low")
+    assert plan.step.level == LEARNED
+    assert ["".join(pair) for pair in plan.step.pairs] == ["ad", "ae", "bd", "be", "cd", "ce", "de"]
+    once = situation(tried={"ad": 1 | 1 << LEARNED})
+    assert ("a", "d") not in next_step(once, "low").step.pairs
+    assert not next_step(situation(needs=""), "high").step.pairs
+
+
+def test_strong_pairs_of_images_in_need_are_matched_by_networks_too() -> None:
+    """They may be wrong: of repeated structure, or of a flat part alone."""
+    strong = situation()
+    states = {pair: replace(state, num_inliers=500) for pair, state in strong.states.items()}
+    assert len(learned_step(replace(strong, states=states)).pairs) == 7
+
+
+def test_without_weights_other_levels_are_tried() -> None:
+    assert learned_step(situation(usable=[1, 3])).pairs == ()
+    assert next_step(situation(usable=[1, 3]), "normal").step.level in (1, 3)
+
+
+def test_learned_matching_of_a_large_set_takes_as_long_as_the_first_model() -> None:
+    names = [f"{number:03}" for number in range(SMALL + 1)]
+    large = situation(names, needs=names)
+    step = learned_step(large)
+    assert 0 < len(step.pairs) < len(large.states)
+    assert step.seconds <= large.first_model_s + len(names)
+    assert len(learned_step(situation(names[:SMALL], needs=names[:SMALL])).pairs) == 435
+
+
+def done_with_learned(**given: Any) -> Situation:
+    """All pairs of images in need were matched by networks, in vain."""
+    before = situation(**given)
+    bits = {"".join(pair): 1 | 1 << LEARNED for pair in before.states}
+    lacking = [set(NAMES)] * len(LEVELS)
+    lacking[LEARNED] = set()
+    return situation(tried=bits, lacking=lacking, **given)
+
+
+def test_afterwards_the_budget_of_the_effort_counts() -> None:
+    after = done_with_learned()
+    assert not next_step(after, "low").step.pairs
+    step = next_step(after, "normal").step
+    assert step.pairs
+    budget_s = EFFORTS["normal"].budget_s(after.first_model_s, has_model=True)
+    assert step.seconds <= budget_s + len(NAMES)
+    spent = {"".join(pair): 0b11111 for pair in after.states}
+    assert not next_step(done_with_learned() and situation(tried=spent), "high").step.pairs
+
+
+def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one() -> None:
+    normal = EFFORTS["normal"]
+    assert normal.budget_s(1.0, has_model=True) == normal.least_s == 120.0
+    assert normal.budget_s(1000.0, has_model=True) == 1000.0
+    assert normal.budget_s(1.0, has_model=False) == normal.without_model_s == 900.0
+    times = [EFFORTS[name].budget_s(1000.0, has_model=True) for name in ("low", "normal", "high")]
+    assert times == [0.0, 1000.0, 5000.0]
+
+
+def test_what_is_spent_is_counted_but_for_learned_matching_of_small_sets() -> None:
+    assert situation().spent_s() == 0.0
+    assert done_with_learned().spent_s() == 0.0
+    lacking = [set(NAMES)] * len(LEVELS)
+    lacking[1] = set("cde")
+    covers = situation(tried={"ab": 0b11}, lacking=lacking)
+    gain = gain_of(LEVELS[1])
+    assert covers.spent_s() == pytest.approx(2 * gain.image_s + gain.pair_s)
+    names = [f"{number:03}" for number in range(SMALL + 1)]
+    large = situation(names)
+    states = {pair: replace(s, tried=1 | 1 << LEARNED) for pair, s in large.states.items()}
+    large = replace(large, states=states)
+    assert large.spent_s() == pytest.approx(large.spent_on(LEARNED) - large.first_model_s)
+
+
+def test_little_hope_ends_it_but_while_nothing_is_registered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(policy, "MIN_PHOTOGRAPHS", 100.0)
+    assert not next_step(done_with_learned(), "high").step.pairs
+    assert not untried(done_with_learned())
+    nothing = done_with_learned(needs=NAMES)
+    assert not nothing.registered
+    assert next_step(nothing, "normal").step.pairs
+
+
+def test_images_that_measured_frames_hold_get_no_learned_warps() -> None:
+    warps = KINDS.index("learned, warps")
+    assert done_with_learned().best_at(warps, 1e9).pairs
+    assert not done_with_learned(held="de").best_at(warps, 1e9).pairs
+
+
+def test_what_was_tried_and_what_was_not_is_told_by_kind() -> None:
+    after = done_with_learned()
+    (one,) = tried(after)
+    assert (one.kind, one.num_pairs) == ("learned", 10)
+    assert one.core_s == pytest.approx(after.spent_on(LEARNED))
+    kinds = {one.kind: one for one in untried(after)}
+    assert "learned" not in kinds
+    assert kinds["measured, all tilts"].num_pairs == 7
+    assert kinds["measured, all tilts"].core_s > 0.0
