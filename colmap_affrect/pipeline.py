@@ -111,17 +111,8 @@ def run(
     names = inputs.names()  # refuses what cannot be read before anything is made
     _check_by_hand(options.by_hand, names, mapper)
     forecast = Forecast(len(names), _num_pairs(names, options.pairs))
-    until_s, workspace = time.monotonic() + 60 * options.max_minutes, Workspace(output_path)
-    context = Context(
-        workspace,
-        options.resources,
-        executor,
-        replace(progress, forecast=forecast),
-        deadline_s=until_s,
-        effort=options.effort,
-        by_hand=options.by_hand,
-        command=options.command,
-    )
+    workspace = Workspace(output_path)
+    context = _context_of(workspace, options, executor, replace(progress, forecast=forecast))
     if options.extend:
         if overwrite:
             options.extend.refuse_discarding(output_path)
@@ -146,6 +137,21 @@ def run(
         if options.database_descriptors:
             fill_descriptors(workspace.database, context.features)
         return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
+
+
+def _context_of(
+    workspace: Workspace, options: RunOptions, executor: Executor | None, progress: Progress
+) -> Context:
+    return Context(
+        workspace,
+        options.resources,
+        executor,
+        progress,
+        deadline_s=time.monotonic() + 60 * options.max_minutes,
+        effort=options.effort,
+        by_hand=options.by_hand,
+        command=options.command,
+    )
 
 
 def _check_by_hand(by_hand: ByHand, names: Collection[str], mapper: Mapper) -> Marks:

@@ -18,7 +18,7 @@ PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
     "lines of the longest file": 500,
     "lines of the longest function": 60,
-    "imports between folders": 165,
+    "imports between folders": 170,
     "words of ARCHITECTURE.md": 2_500,
     "words of BENCHMARKS.md": 2_500,
 }

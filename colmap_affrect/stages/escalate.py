@@ -26,7 +26,7 @@ from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain, ModelSummary, StageReport
-from colmap_affrect.project.stores import COMPARED, SCORE_BEFORE, STEP, Alternative, PairMatches
+from colmap_affrect.project.stores import SCORE_BEFORE, STEP, Alternative, PairMatches
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.context import Context
@@ -151,14 +151,6 @@ class Escalation:
         """Whether the time that the user gave is over."""
         return time.monotonic() > self.context.deadline_s
 
-    def usable_levels(self) -> list[int]:
-        """Return the levels whose weights are here, of the kind of matches that was chosen."""
-        usable = self.context.resources.usable_levels(self.extraction)[1:]
-        _, chosen = self.matches.note(COMPARED) or (0, "")
-        if not chosen:
-            return usable
-        return [k for k in usable if self.is_measured[k] == (chosen == MEASURED_ONLY)]
-
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of pairs in the database that may be used, 0 of unverified ones."""
         ids = colmap_database.image_ids(self.path)
@@ -243,7 +235,7 @@ class Escalation:
         levels = self.extraction.levels
         return Situation(
             levels=levels,
-            usable=self.usable_levels(),
+            usable=self.context.resources.usable_levels(self.extraction)[1:],
             states=states,
             needs=needs,
             loose=self._loose(),
