@@ -303,6 +303,11 @@ class MatchStore(GroupStore):
                     found[names] = alternative
         return found
 
+    def other_worths(self, pairs: Iterable[Names]) -> dict[Names, tuple[int, int]]:
+        """Return what the alternatives of pairs are worth; nothing where there is none."""
+        with self._open("r") as file:
+            return {names: _other_worth(file[pair_key(*names)]) for names in pairs}
+
     def choose(
         self, chosen: Mapping[Names, tuple[PairMatches, Alternative]], compared: Any = None
     ) -> None:
@@ -388,8 +393,12 @@ def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatc
 def _read_alternative(group: h5py.Group, names: Names) -> Alternative | None:
     if f"{OTHER}level" not in group.attrs:
         return None
-    num_inliers, num_consistent = group.attrs[f"{OTHER}worth"].tolist()
-    return Alternative(_read_matches(group, names, OTHER), (num_inliers, num_consistent))
+    return Alternative(_read_matches(group, names, OTHER), _other_worth(group))
+
+
+def _other_worth(group: h5py.Group) -> tuple[int, int]:
+    num_inliers, num_consistent = group.attrs.get(f"{OTHER}worth", (0, 0))
+    return int(num_inliers), int(num_consistent)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 import itertools
 import re
 import shlex
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
@@ -14,12 +15,45 @@ from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTE
 from colmap_affrect.options import EFFORT_NAMES
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import Advice, MatchedAgain, ModelSummary
-from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.context import Context, Inputs
 
 STRONGEST = "default"  # of the recipes
 ENOUGH = 100  # inliers of a pair that make a model wherever it shows depth
 MIN_GAIN = 0.05  # of a probability, by more matches
 FITTING_PX = re.compile(rf"{FOCAL_CONTRADICTED}, .*?(\d+) px does")
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What advice is about."""
+
+    context: Context
+    lost: Sequence[str]  # images with features that are not in the largest model
+    num_images: int  # with features
+    models: Sequence[ModelSummary]  # the largest first
+    strongest: int  # inliers of a verified pair, at most
+    untried: Sequence[MatchedAgain]  # what a greater effort would try
+
+    @property
+    def model(self) -> ModelSummary:
+        """The largest model, an empty one where there is none."""
+        return self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
+
+    @property
+    def doubts(self) -> str:
+        """Why images are doubtful or were taken out."""
+        return "; ".join([*self.model.doubtful.values(), *self.model.taken_out.values()])
+
+    @property
+    def inputs(self) -> Inputs | None:
+        """The photographs; None for the database of another program."""
+        return None if self.context.workspace.is_foreign else self.context.inputs
+
+    @property
+    def may_change_cameras(self) -> bool:
+        """Whether cameras are not taken from a database or a list."""
+        inputs = self.inputs
+        return bool(inputs and not (inputs.from_database or inputs.cameras.cameras_path))
 
 
 def advice(
@@ -43,58 +77,106 @@ def advice(
     """
     num_keypoints = colmap_database.keypoint_counts(context.workspace.database)
     lost = [n for n in missing if n in num_keypoints and n not in context.by_hand.left_out]
-    model = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
-    doubts = "; ".join([*model.doubtful.values(), *model.taken_out.values()])
-    if (missing or doubts) and sum(map(bool, num_keypoints.values())) < 2:
+    num_usable = sum(map(bool, num_keypoints.values()))
+    case = _Case(context, lost, len(num_keypoints), models, strongest, untried)
+    if (missing or case.doubts) and num_usable < 2:
         return (Advice("more photographs: two that can be read and show the same make a model"),)
-    found, inputs = list[Advice](), None if context.workspace.is_foreign else context.inputs
-    if untried and context.effort != EFFORT_NAMES[-1]:
-        found.append(_of_effort(context, untried))
+    found = _of_effort(case)
     if not models and strongest >= ENOUGH:
         why = "more photographs, from other places: the matches of these show no depth"
         return (*found, Advice(why))
-    if not (lost or doubts):
-        return tuple(found)
-    may_change = inputs and not (inputs.from_database or inputs.cameras.cameras_path)
-    if may_change and (fitting := FITTING_PX.search(doubts)):
-        why = f"{FOCAL_CONTRADICTED}, {fitting[1]} px does"
-        found.append(Advice(why, _anew(context, "--focal-length-px", fitting[1])))
-    if helped := lost or [n for n in model.doubtful if model.gains.get(n, 0.0) >= MIN_GAIN]:
-        found += _of_recipe(context, such_as(helped))
-    if lost and len(model.likely) > 1 and context.mapping.name == MAPPERS.default:
-        table, why = context.by_hand.tie_points_path, f"mark six points or more of {such_as(lost)}"
-        why += " in two photographs of the model too, at Tie points by hand in report.html"
-        if len(models) > 1:
-            why += "; seven, each in two photographs of both, join two models"
-        if table and not any(m.tie_points for m in models):
-            why = f"no point of {table.name} is seen by two photographs of one model: {why}"
-        words = ("--tie-points", str(table or "tie-points.csv"))
-        found.append(Advice(why, _again(context, *words)))
-    for name, bridge in model.bridges.items():
-        if name in model.doubtful:
-            why = f"if the matches of {name} and {bridge.by} are wrong by eye, leave them out"
-            found.append(Advice(why, _again(context, "--reject-pair", f"{name},{bridge.by}")))
-    if may_change and FOCAL_UNKNOWN in doubts:
-        why = "give lens and film, plate or sensor; if you do not know them, try a normal lens"
-        found.append(Advice(why, _anew(context, "--focal-mm", "50", "--film-width-mm", "36")))
-    if inputs and inputs.masks == MaskOptions() and any(t in doubts for t in CONTRADICTIONS):
-        why = "mask what moves, repeats or is written on photographs (black, in a folder masks)"
-        found.append(Advice(why, _anew(context, "--mask-path", "masks")))
-    if lost and len(lost) < len(num_keypoints):
-        found.append(Advice(f"more photographs, between {such_as(lost)} and the others"))
-    elif lost:
-        found.append(Advice("more photographs, from places between those of these"))
+    if lost or case.doubts:
+        for rule in RULES:
+            found += rule(case)
     return tuple(found)
 
 
-def _of_effort(context: Context, untried: Sequence[MatchedAgain]) -> Advice:
+def _of_fitting_focal(case: _Case) -> list[Advice]:
+    fitting = FITTING_PX.search(case.doubts)
+    if not (case.may_change_cameras and fitting):
+        return []
+    why = f"{FOCAL_CONTRADICTED}, {fitting[1]} px does"
+    return [Advice(why, _anew(case.context, "--focal-length-px", fitting[1]))]
+
+
+def _of_other_recipe(case: _Case) -> list[Advice]:
+    model = case.model
+    helped = case.lost or [n for n in model.doubtful if model.gains.get(n, 0.0) >= MIN_GAIN]
+    return _of_recipe(case.context, such_as(helped)) if helped else []
+
+
+def _of_tie_points(case: _Case) -> list[Advice]:
+    context = case.context
+    is_ours = context.mapping.name == MAPPERS.default
+    if not (case.lost and len(case.model.likely) > 1 and is_ours):
+        return []
+    table = context.by_hand.tie_points_path
+    why = f"mark six points or more of {such_as(case.lost)}"
+    why += " in two photographs of the model too, at Tie points by hand in report.html"
+    if len(case.models) > 1:
+        why += "; seven, each in two photographs of both, join two models"
+    if table and not any(model.tie_points for model in case.models):
+        why = f"no point of {table.name} is seen by two photographs of one model: {why}"
+    return [Advice(why, _again(context, "--tie-points", str(table or "tie-points.csv")))]
+
+
+def _of_bridges(case: _Case) -> list[Advice]:
+    found = list[Advice]()
+    for name, bridge in case.model.bridges.items():
+        if name in case.model.doubtful:
+            why = f"if the matches of {name} and {bridge.by} are wrong by eye, leave them out"
+            command = _again(case.context, "--reject-pair", f"{name},{bridge.by}")
+            found.append(Advice(why, command))
+    return found
+
+
+def _of_unknown_focal(case: _Case) -> list[Advice]:
+    if not (case.may_change_cameras and FOCAL_UNKNOWN in case.doubts):
+        return []
+    why = "give lens and film, plate or sensor; if you do not know them, try a normal lens"
+    return [Advice(why, _anew(case.context, "--focal-mm", "50", "--film-width-mm", "36"))]
+
+
+def _of_masks(case: _Case) -> list[Advice]:
+    inputs = case.inputs
+    if not (inputs and inputs.masks == MaskOptions()):
+        return []
+    if not any(text in case.doubts for text in CONTRADICTIONS):
+        return []
+    why = "mask what moves, repeats or is written on photographs (black, in a folder masks)"
+    return [Advice(why, _anew(case.context, "--mask-path", "masks"))]
+
+
+def _of_more_photographs(case: _Case) -> list[Advice]:
+    if not case.lost:
+        return []
+    if len(case.lost) == case.num_images:
+        return [Advice("more photographs, from places between those of these")]
+    return [Advice(f"more photographs, between {such_as(case.lost)} and the others")]
+
+
+RULES: Sequence[Callable[[_Case], list[Advice]]] = (
+    _of_fitting_focal,
+    _of_other_recipe,
+    _of_tie_points,
+    _of_bridges,
+    _of_unknown_focal,
+    _of_masks,
+    _of_more_photographs,
+)
+
+
+def _of_effort(case: _Case) -> list[Advice]:
     """Return the command that tries what the effort did not allow."""
-    minutes = sum(one.core_s for one in untried) / available_cores() / 60
-    levels = ", ".join(one.text() for one in untried)
+    context = case.context
+    if not case.untried or context.effort == EFFORT_NAMES[-1]:
+        return []
+    minutes = sum(one.core_s for one in case.untried) / available_cores() / 60
+    levels = ", ".join(one.text() for one in case.untried)
     why = f"not tried, at most about {max(1, round(minutes))} min more: {levels}"
     greater = EFFORT_NAMES[EFFORT_NAMES.index(context.effort) + 1]
     command = _without(_run_command(context), ["--effort", "--max-time"])
-    return Advice(why, shlex.join([*command, "--effort", greater]))
+    return [Advice(why, shlex.join([*command, "--effort", greater]))]
 
 
 def _of_recipe(context: Context, names: str) -> list[Advice]:

@@ -202,8 +202,11 @@ class Escalation:
         failed = [pair for pair, count in num_inliers.items() if not count]
         num_consistent, levels = self._num_consistent(failed), self.matches.levels
         reached, tried = levels(num_inliers), levels(num_inliers, "tried")
+        others = self.matches.other_worths(num_inliers)
         return {
-            pair: PairState(count, num_consistent.get(pair, 0), reached[pair], tried[pair])
+            pair: PairState(
+                count, num_consistent.get(pair, 0), reached[pair], tried[pair], others[pair]
+            )
             for pair, count in num_inliers.items()
         }
 

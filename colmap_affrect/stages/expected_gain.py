@@ -33,6 +33,7 @@ class PairState:
     num_consistent: int = 0  # raw matches that confirm each other
     level: int = 0  # that its matches are from
     tried: int = 1  # a bit for each level
+    other_worth: tuple[int, int] = (0, 0)  # of matches by the other kind of features
 
     @property
     def worth(self) -> tuple[int, int]:
@@ -183,6 +184,13 @@ class ExpectedGain:
         is_many = self.states[pair].num_inliers >= self.strong_num_inliers
         return is_many and bool(self.registered) and self.loose.isdisjoint(pair)
 
+    def _of_measured(self, state: PairState) -> PairState:
+        """Return what the best matches of measured frames say of a pair."""
+        if state.level not in self.unmeasured:
+            return state
+        num_inliers, num_consistent = state.other_worth
+        return replace(state, num_inliers=num_inliers, num_consistent=num_consistent)
+
     def candidates(self, number: int, level: Level, others: int) -> list[Candidate]:
         """Return the pairs that a level may verify, the most promising one first.
 
@@ -205,8 +213,7 @@ class ExpectedGain:
             ties = self._ties(pair)
             if not ties:
                 continue
-            is_hint = not level.features.has_shapes or state.level not in self.unmeasured
-            hint = state if is_hint else replace(state, num_inliers=0)
+            hint = self._of_measured(state) if level.features.has_shapes else state
             found.append(Candidate(pair, gain.chance(terms(hint, wins, losses)), ties))
         found.sort(key=lambda one: (-one.photographs, one.pair))
         return found
