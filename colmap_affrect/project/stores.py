@@ -40,8 +40,7 @@ STEP = "step"  # level and pairs of the step of escalation that has begun and no
 FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
 IN_VAIN = "all_features_in_vain"  # that list, and whether all features bring no more than some
 CLIMBING = "climbing_list"  # the same, of which there was a model before pairs were matched again
-COMPARED = "compared"  # [pairs learned matching was tried for, kind of matches that was chosen]
-SCORE_BEFORE = "score_before_learned_matching"  # of the models that were there then
+SCORES = "scores_by_kind"  # of models by one kind of matches alone, and the kind that was chosen
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
@@ -303,13 +302,18 @@ class MatchStore(GroupStore):
                     found[names] = alternative
         return found
 
-    def other_worths(self, pairs: Iterable[Names]) -> dict[Names, tuple[int, int]]:
-        """Return what the alternatives of pairs are worth; nothing where there is none."""
+    def others(self, pairs: Iterable[Names]) -> dict[Names, tuple[int, tuple[int, int]]]:
+        """Return level and worth of the alternatives of pairs; level -1 where there is none."""
+        found = {}
         with self._open("r") as file:
-            return {names: _other_worth(file[pair_key(*names)]) for names in pairs}
+            for names in pairs:
+                group = file[pair_key(*names)]
+                level = int(group.attrs.get(f"{OTHER}level", -1))
+                found[names] = level, _other_worth(group)
+        return found
 
     def choose(
-        self, chosen: Mapping[Names, tuple[PairMatches, Alternative]], compared: Any = None
+        self, chosen: Mapping[Names, tuple[PairMatches, Alternative]], scores: Any = None
     ) -> None:
         """Let alternatives take the place of the matches of their pairs, and these theirs.
 
@@ -317,10 +321,10 @@ class MatchStore(GroupStore):
 
         Args:
             chosen: by pair, its new matches, and the alternative to them.
-            compared: what is kept as the note ``COMPARED``.
+            scores: what is kept as the note ``SCORES``.
         """
         with self._open("a") as file:
-            file.attrs[COMPARED] = json.dumps(compared)
+            file.attrs[SCORES] = json.dumps(scores)
             file.attrs.pop(CLIMBING, None)
             for matches, alternative in chosen.values():
                 self._write_pair(file, matches)
@@ -336,7 +340,7 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, COMPARED, SCORE_BEFORE):
+            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, SCORES):
                 file.attrs.pop(note, None)
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))

@@ -2,14 +2,14 @@
 
 Matches of measured frames and learned ones err in different ways: where sides of a thing look
 alike, or only a flat part of a scene is tied, one kind may place photographs wrongly that the other
-places right, and mixed they may not agree at all. So where both were tried, models of each kind
-alone are made beside those of the best matches of each pair. Those count for which most relative
-poses are expected to be right.
+places right, and mixed they may not agree at all. So models of learned matches alone are made
+beside those that grow step by step. The kind is chosen for which most relative poses are expected
+to be right.
 """
 
 import shutil
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import read_summaries
@@ -17,19 +17,20 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.outputs import temporary_folder
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import COMPARED, SCORE_BEFORE, Alternative, PairMatches
+from colmap_affrect.project.stores import SCORES, Alternative, PairMatches
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import LEARNED_ONLY, MEASURED_ONLY, Escalation
-from colmap_affrect.stages.escalation_policy import SMALL
+from colmap_affrect.stages.escalate import Escalation
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.verify import verify_matches
+
+MEASURED, LEARNED = "measured", "learned"  # kinds of matches
 
 Choice = dict[Pair, tuple[PairMatches, Alternative]]
 
 
 def score(models: Sequence[ModelSummary]) -> float:
-    """Return how many relative poses to a first photograph are expected to be right.
+    """Return how many poses relative to a first image are expected to be right.
 
     >>> model = ModelSummary(("a", "b", "c"), 9, 2.0, 0.5, {"a": 1.0, "b": 1.0, "c": 0.5})
     >>> score([model]), score([model, model]), score([])
@@ -39,74 +40,88 @@ def score(models: Sequence[ModelSummary]) -> float:
     return sum(max(0.0, number) for number in expected)
 
 
-def remember_score(context: Context) -> None:
-    """Keep the score of the models that were there before learned matching."""
-    if context.matches.note(SCORE_BEFORE) is None:
-        context.matches.keep_note(SCORE_BEFORE, score(read_summaries(context.workspace.sparse)))
+@dataclass(frozen=True)
+class Scores:
+    """Scores of the models by one kind of matches alone."""
+
+    by_kind: Mapping[str, float] = field(default_factory=dict)
+    is_sure: bool = False  # whether the models of learned matches have all images, and are sure
+    chosen: str = ""  # kind that took the place of the best matches of each pair
+
+    @classmethod
+    def of(cls, context: Context) -> "Scores | None":
+        """Return what is on record; None before learned matching."""
+        known = context.matches.note(SCORES)
+        return cls(**known) if known else None
 
 
-def choose_kind(escalation: Escalation, mapper: Mapper) -> bool:
-    """Look at models of one kind of matches alone, where learned matching has been tried.
+def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
+    """Map learned matches alone, once, and keep the score on record.
 
     Args:
-        escalation: of the workspace; its models are those of the best matches of each pair.
+        escalation: of the workspace; its models are those of the first matches.
         mapper: what makes models.
+    """
+    context = escalation.context
+    models = read_summaries(context.workspace.sparse)
+    by_kind = {MEASURED: score(models)}
+    is_sure = False
+    choice = _choice(escalation, LEARNED)
+    if choice:
+        found = _models_of(context, mapper, choice)
+        by_kind[LEARNED] = score(found)
+        is_sure = bool(found) and len(found[0].sure) == len(context.features.names())
+    context.matches.keep_note(SCORES, asdict(Scores(by_kind, is_sure)))
+
+
+def choose_kind(escalation: Escalation, *, at_once: bool) -> bool:
+    """Let the matches of one kind take the place of the others if their models are better.
+
+    Args:
+        escalation: of the workspace, with the models that are there.
+        at_once: choose learned matches only if nothing is left to try with them, or nothing is
+            registered without.
 
     Returns:
         Whether other matches were chosen, so that the models must be made again.
     """
     context = escalation.context
-    matches = context.matches
-    num_tried = _num_tried(escalation)
-    num_compared, chosen = matches.note(COMPARED) or (0, "")
-    if chosen or num_tried == num_compared or len(context.features.names()) > SMALL:
+    scores = Scores.of(context)
+    if not scores or scores.chosen:
         return False
-    best_score = score(read_summaries(context.workspace.sparse))
-    best: tuple[str, Choice] = ("", {})
-    if escalation.needs(escalation.models()):
-        for kind in (LEARNED_ONLY, MEASURED_ONLY):
-            before = matches.note(SCORE_BEFORE) or 0.0
-            if kind == MEASURED_ONLY and before <= best_score:
-                continue
-            choice = _choice(escalation, kind)
-            if not choice:
-                continue
-            found = score(_models_of(context, mapper, choice))
-            if found > best_score:
-                best_score = found
-                best = kind, choice
-    kind, choice = best
-    compared = [num_tried, kind]
+    present = score(read_summaries(context.workspace.sparse))
+    if at_once:  # as it was then, also for a run that was killed since
+        present = scores.by_kind[MEASURED]
+    kind = max(scores.by_kind, key=lambda name: scores.by_kind[name])
+    if scores.by_kind[kind] <= present:
+        return False
+    if at_once and not (scores.is_sure or present == 0.0):
+        return False
+    choice = _choice(escalation, kind)
     if not choice:
-        matches.keep_note(COMPARED, compared)
         return False
-    matches.choose(choice, compared)
+    context.matches.choose(choice, asdict(replace(scores, chosen=kind)))
     escalation.write()
     return True
 
 
-def _num_tried(escalation: Escalation) -> int:
-    """Return for how many pairs a learned level has been tried."""
-    bits = sum(1 << k for k, measured in enumerate(escalation.is_measured) if not measured)
-    tried = escalation.matches.levels(escalation.num_inliers(), "tried")
-    return sum(bool(levels & bits) for levels in tried.values())
-
-
 def _choice(escalation: Escalation, kind: str) -> Choice:
     """Return the pairs that have other matches of a kind, with these and those that are there."""
-    wanted = kind == MEASURED_ONLY
+    is_measured = escalation.is_measured
+    wanted = kind == MEASURED
     states = escalation.states()
-    others = escalation.matches.alternatives(list(states))
     changed = [
         pair
-        for pair, other in others.items()
-        if escalation.is_measured[other.matches.level] == wanted
-        and escalation.is_measured[states[pair].level] != wanted
+        for pair, state in states.items()
+        if state.other_level >= 0
+        and is_measured[state.other_level] == wanted
+        and is_measured[state.level] != wanted
     ]
+    others = escalation.matches.alternatives(changed)
     found = Choice()
     for there in escalation.matches.read(changed):
-        other = others[there.names]
-        found[there.names] = other.matches, Alternative(there, states[there.names].worth)
+        names = there.names
+        found[names] = others[names].matches, Alternative(there, states[names].worth)
     return found
 
 

@@ -1,20 +1,22 @@
 """Climb: map, match again what lost and doubtful photographs need, and map on, until nothing helps.
 
 The first model says what is needed: where it is sure of all photographs, nothing more is done.
-Later models begin with those before, and so are not worse, by the evidence. Where learned matching
-was tried, models of its matches alone, and of others alone, are looked at as well
-(:mod:`colmap_affrect.stages.alternatives`).
+Later models begin with those before, and so are not worse, by the evidence. Models of learned
+matches alone are looked at as well (:mod:`colmap_affrect.stages.alternatives`): at once, if these
+leave nothing to try, and at the end.
 """
+
+import time
+from dataclasses import replace
 
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import model_folders
-from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import CLIMBING, FINISHED
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages.alternatives import choose_kind, remember_score
+from colmap_affrect.stages.alternatives import Scores, choose_kind, look_at_learned
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import begin
+from colmap_affrect.stages.escalate import Escalation, begin
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 
@@ -34,19 +36,33 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
     """
     escalation, escalated = begin(context, recipe.escalate)
     reports = _mapped_anew(context, mapper, recipe)
-    reports += _mapped_on(context, mapper, recipe)  # a run may have been killed before
-    if choose_kind(escalation, mapper):
+    escalated = _learned(escalation, mapper, escalated)
+    if choose_kind(escalation, at_once=True):
         reports += _mapped_anew(context, mapper, recipe)
-    is_small = len(context.features.names()) < LARGE
-    while step := escalation.next_step():
-        remember_score(context)
-        escalated = escalation.taken(step, escalated)
-        while not is_small and (step := escalation.next_step()):
+    while True:
+        while step := escalation.next_step():
             escalated = escalation.taken(step, escalated)
-        reports += _mapped_on(context, mapper, recipe)
-        if choose_kind(escalation, mapper):
-            reports += _mapped_anew(context, mapper, recipe)
-    return [*reports, escalation.ended(escalated)]
+        guided, mapped = _mapped_on(context, mapper, recipe)
+        reports += [guided, mapped]
+        if mapped.num_done:
+            continue
+        if not choose_kind(escalation, at_once=False):
+            return [*reports, escalation.ended(escalated)]
+        reports += _mapped_anew(context, mapper, recipe)
+
+
+def _learned(escalation: Escalation, mapper: Mapper, report: StageReport) -> StageReport:
+    """Match pairs of a small set by learned matching, once, and look at what that makes alone."""
+    if Scores.of(escalation.context) or escalation.is_over_time:
+        return report
+    step = escalation.learned_pairs()
+    if not step:
+        return report
+    start = time.perf_counter()
+    escalation.learn(step)
+    look_at_learned(escalation, mapper)
+    wall_s = report.wall_s + time.perf_counter() - start
+    return replace(report, wall_s=wall_s, num_done=report.num_done + len(step.pairs))
 
 
 def _mapped_anew(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:

@@ -8,7 +8,7 @@ other. Which pairs are matched again, and at which level, is decided anew after 
 begun is on record, so that a killed run goes on in the same way.
 
 Images are in need that the model before has not, or is not sure of. While there is none, those that
-have no strong pair, or few features in tracks through three.
+have no strong pair, or few features in tracks through three; a small set is mapped when one has.
 """
 
 import logging
@@ -23,14 +23,22 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import ImageError, such_as
 from colmap_affrect.mappers.mapping import read_summaries
+from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain, ModelSummary, StageReport
-from colmap_affrect.project.stores import SCORE_BEFORE, STEP, Alternative, PairMatches
+from colmap_affrect.project.stores import STEP, Alternative, PairMatches
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalation_policy import Plan, Situation, next_step, tried, untried
+from colmap_affrect.stages.escalation_policy import (
+    Plan,
+    Situation,
+    learned_step,
+    next_step,
+    tried,
+    untried,
+)
 from colmap_affrect.stages.expected_gain import PairState, Step
 from colmap_affrect.stages.extract import extract_images
 from colmap_affrect.stages.match import (
@@ -46,7 +54,6 @@ from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers,
 logger = logging.getLogger(__name__)
 
 LIKELY = 0.25  # part of a gain that counts for images that are likely right: matches mend few
-MEASURED_ONLY, LEARNED_ONLY = "measured", "learned"  # kinds of matches that models were made of
 
 
 def escalate(context: Context, options: EscalateOptions | None = None) -> StageReport:
@@ -104,7 +111,7 @@ def matched_again(context: Context) -> Tried:
     escalation = Escalation(context, context.escalation)
     models = escalation.models()
     needs = escalation.needs(models)
-    has_stepped = escalation.matches.note(SCORE_BEFORE) is not None
+    has_stepped = escalation.matches.note(STEP) is not None
     if not (needs or has_stepped):  # large sets take long to go through
         return Tried()
     situation = escalation.situation(needs, models)
@@ -175,7 +182,10 @@ class Escalation:
         lost = set(names) - set(models[0].sure)
         if workspace.made_from("map") != self.context.verified_digest():
             strong, counts = self.options.strong_num_inliers, self.num_inliers()
-            lost &= expected_gain.insecure_images(counts, strong, self._loose())
+            insecure = lost & expected_gain.insecure_images(counts, strong, self._loose())
+            # The next model tells of what has been tied since.
+            maps_next = insecure != lost and workspace.sparse.exists() and len(names) < LARGE
+            lost = set() if maps_next else insecure
         likely = frozenset[str]().union(*(model.likely for model in models))
         worth = {name: LIKELY if name in likely else 1.0 for name in sorted(lost)}
         return {name: share * models[0].gains.get(name, 1.0) for name, share in worth.items()}
@@ -202,10 +212,10 @@ class Escalation:
         failed = [pair for pair, count in num_inliers.items() if not count]
         num_consistent, levels = self._num_consistent(failed), self.matches.levels
         reached, tried = levels(num_inliers), levels(num_inliers, "tried")
-        others = self.matches.other_worths(num_inliers)
+        others = self.matches.others(num_inliers)
         return {
             pair: PairState(
-                count, num_consistent.get(pair, 0), reached[pair], tried[pair], others[pair]
+                count, num_consistent.get(pair, 0), reached[pair], tried[pair], *others[pair]
             )
             for pair, count in num_inliers.items()
         }
@@ -300,6 +310,47 @@ class Escalation:
         """
         if pairs:
             self.matches.keep_note(STEP, [level, list(pairs)])
+        known = self.matches.alternatives(pairs)
+        known = {p: other for p, other in known.items() if other.matches.level == level}
+        unknown = [pair for pair in pairs if pair not in known]
+        if known:
+            states = self.states()
+            trials = [
+                Trial(other.matches, other.worth, states[pair], other)
+                for pair, other in known.items()
+            ]
+            self._keep(trials, level)
+        self._match_with(unknown, level, self._keep)
+        self.write()
+        self.matches.keep_note(STEP, [])
+
+    def learned_pairs(self) -> Step | None:
+        """Return the pairs that lack learned matches, none where these were all matched.
+
+        None for sets that are large or need nothing, and where no learned level can be used.
+        """
+        models = self.models()
+        needs = self.needs(models)
+        if not needs:
+            return None
+        situation = self.situation(needs, models)
+        if situation.learned_level is None or not situation.is_small:
+            return None
+        return learned_step(situation)
+
+    def learn(self, step: Step) -> None:
+        """Match pairs with the features of a learned level, and keep that beside what is there."""
+
+        def keep(batch: Sequence[Trial], _: int) -> None:
+            others = [Alternative(trial.found, trial.worth) for trial in batch]
+            self.matches.write([], alternatives=others)
+
+        self._match_with(step.pairs, step.level, keep)
+
+    def _match_with(
+        self, pairs: Sequence[Pair], level: int, keep: Callable[[Sequence["Trial"], int], None]
+    ) -> None:
+        """Give images the features of a level that they lack, and match pairs with these."""
         images = sorted({name for pair in pairs for name in pair})
         needed = sorted({self.extraction.levels[level].base, level})
         there = {name: self.features.level_ranges(name) for name in images}
@@ -309,9 +360,7 @@ class Escalation:
         with self.context.progress.stage(title, len(missing) + len(pairs), "steps") as advance:
             self._extend(missing, advance)
             if pairs:
-                self._match_again(pairs, level, advance)
-        self.write()
-        self.matches.keep_note(STEP, None)
+                self._match_again(pairs, level, keep, advance)
 
     def waiting(self) -> dict[str, str]:
         """Say what levels that lack weights may tie, if anything is left to tie."""
@@ -339,7 +388,11 @@ class Escalation:
                 advance(1)
 
     def _match_again(
-        self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
+        self,
+        pairs: Sequence[Pair],
+        level: int,
+        keep: Callable[[Sequence[Trial], int], None],
+        advance: Callable[[int], None],
     ) -> None:
         size_px = self.extraction.levels[level].max_image_size_px
         verifier, states = PairVerifier(self.path, self.verification, size_px), self.states()
@@ -350,12 +403,16 @@ class Escalation:
             return Trial(found, self._worth(found, verifier), states[names], others.get(names))
 
         def write(batch: Sequence[Trial]) -> None:
-            better = [trial.found for trial in batch if trial.is_better]
-            tried = [trial.found.names for trial in batch]
-            self.matches.write(better, tried, level, self._alternatives(batch))  # all or nothing
+            keep(batch, level)
 
         with closing(matched_at_level(self.context, pairs, self.matching, level)) as found_pairs:
             write_batches(map(judged, found_pairs), write, advance)
+
+    def _keep(self, batch: Sequence[Trial], level: int) -> None:
+        """Write the better matches of some trials, and that all were made; all or nothing."""
+        better = [trial.found for trial in batch if trial.is_better]
+        tried = [trial.found.names for trial in batch]
+        self.matches.write(better, tried, level, self._alternatives(batch))
 
     def _alternatives(self, batch: Sequence[Trial]) -> list[Alternative]:
         """Return what is kept beside the matches of pairs: the best of the other kind of frames."""

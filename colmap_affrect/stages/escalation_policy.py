@@ -2,7 +2,8 @@
 
 1. Learned matching of whole photographs comes first, where its weights are there: it costs little
    and helps where light, age or season differ. On small sets all pairs of images in need are
-   matched by it; on others as many as take what the first model took.
+   matched by it, beside what is there (:mod:`colmap_affrect.stages.alternatives`); on others as
+   many as take what the first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
    (:mod:`colmap_affrect.stages.expected_gain`), until the budget of the effort is spent, or
    nothing is likely to help.
@@ -84,6 +85,12 @@ class Situation:
         """Tell whether the frames of a level are measured one by one."""
         return self.levels[number].features.has_shapes
 
+    def has_learned(self, state: PairState) -> bool:
+        """Tell whether there are learned matches of a pair, used or beside those that are."""
+        if not self.is_measured(state.level):
+            return True
+        return state.other_level >= 0 and not self.is_measured(state.other_level)
+
     @property
     def first_model_s(self) -> float:
         """Nominal seconds of all that comes before escalation."""
@@ -92,10 +99,14 @@ class Situation:
         matching_s = gain_of(self.levels[0]).seconds(sizes.values(), pairs)
         return matching_s + MAPPING_S * len(sizes)
 
+    def has_tried(self, state: PairState, number: int) -> bool:
+        """Tell whether a pair was matched at a level, also if the matches are not used."""
+        return bool(state.tried >> number & 1) or state.other_level == number
+
     def spent_on(self, number: int) -> float:
         """Return the nominal seconds that a level has taken so far."""
         sizes = self.megapixels[number]
-        tried = [pair for pair, state in self.states.items() if state.tried >> number & 1]
+        tried = [pair for pair, state in self.states.items() if self.has_tried(state, number)]
         images = [size for name, size in sizes.items() if name not in self.lacking[number]]
         pairs = [(sizes[first], sizes[second]) for first, second in tried]
         return gain_of(self.levels[number]).seconds(images, pairs)
@@ -150,7 +161,7 @@ def learned_step(situation: Situation) -> Step:
     pairs = [
         pair
         for pair, state in situation.states.items()
-        if not state.tried >> number & 1 and not situation.needs.keys().isdisjoint(pair)
+        if not situation.has_learned(state) and not situation.needs.keys().isdisjoint(pair)
     ]
     return Step(number, pairs)
 
@@ -184,9 +195,10 @@ def next_step(situation: Situation, effort: EffortName) -> Plan:
         return Plan()
     budget = EFFORTS[effort].budget_s(situation.first_model_s, has_model=bool(situation.registered))
     left_s = budget - situation.spent_s()
-    learned = learned_step(situation)
-    if learned.pairs:
-        return Plan(learned, max(0.0, left_s) + situation.first_model_s)
+    if not situation.is_small:
+        learned = learned_step(situation)
+        if learned.pairs:
+            return Plan(learned, max(0.0, left_s) + situation.first_model_s)
     steps = [situation.best_at(number, left_s) for number in situation.usable]
     hopeful = [step for step in steps if is_hopeful(step, situation)]
     if not hopeful:
@@ -199,7 +211,8 @@ def tried(situation: Situation) -> list[MatchedAgain]:
     """Return for how many pairs each level of escalation was tried."""
     found = list[MatchedAgain]()
     for number in range(1, len(situation.levels)):
-        pairs = [pair for pair, state in situation.states.items() if state.tried >> number & 1]
+        states = situation.states.items()
+        pairs = [pair for pair, state in states if situation.has_tried(state, number)]
         if pairs:
             kind = kind_of(situation.levels[number])
             found.append(MatchedAgain(kind, len(pairs), situation.spent_on(number)))
@@ -210,6 +223,8 @@ def untried(situation: Situation) -> list[MatchedAgain]:
     """Return what a greater effort would try for images in need, by level."""
     found = list[MatchedAgain]()
     for number in situation.usable:
+        if situation.is_small and number == situation.learned_level:
+            continue  # it was tried beside the others
         step = situation.best_at(number, math.inf)
         if is_hopeful(step, situation):
             kind = kind_of(situation.levels[number])

@@ -33,7 +33,8 @@ class PairState:
     num_consistent: int = 0  # raw matches that confirm each other
     level: int = 0  # that its matches are from
     tried: int = 1  # a bit for each level
-    other_worth: tuple[int, int] = (0, 0)  # of matches by the other kind of features
+    other_level: int = -1  # of matches by the other kind of features; -1 where there are none
+    other_worth: tuple[int, int] = (0, 0)  # of these
 
     @property
     def worth(self) -> tuple[int, int]:

@@ -32,7 +32,7 @@ from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.stores import COMPARED
+from colmap_affrect.project.stores import SCORES
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages import climb as climbing
 from colmap_affrect.stages.context import Context
@@ -133,7 +133,7 @@ def spent(context: Context) -> Row:
             for number, name in enumerate(names)
             if number
         },
-        "kind": (context.matches.note(COMPARED) or (0, ""))[1],
+        "scores": context.matches.note(SCORES),
     }
 
 

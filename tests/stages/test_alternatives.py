@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -17,13 +17,22 @@ from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import CLIMBING, COMPARED, FINISHED
+from colmap_affrect.project.stores import CLIMBING, FINISHED, SCORES, Alternative
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.stages import alternatives, climb
-from colmap_affrect.stages.alternatives import choose_kind, remember_score, score
+from colmap_affrect.stages.alternatives import (
+    LEARNED,
+    MEASURED,
+    Choice,
+    Scores,
+    choose_kind,
+    look_at_learned,
+    score,
+)
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import LEARNED_ONLY, Escalation, begin
+from colmap_affrect.stages.escalate import Escalation, begin
+from colmap_affrect.stages.expected_gain import Step
 
 RECIPE = """
 [rectifier]
@@ -53,7 +62,7 @@ def matched(photos: Path, recipe: Recipe, tmp_path_factory: pytest.TempPathFacto
     """All pairs were matched by both kinds; the learned ones have fewer features."""
     workspace = verified(photos, tmp_path_factory.mktemp("matched") / "out", recipe.name)
     escalation, _ = begin(Context(workspace), recipe.escalate)
-    escalation.match_at(escalation.pairs, 1)
+    escalation.learn(Step(1, escalation.pairs))
     return workspace
 
 
@@ -67,49 +76,75 @@ def mapper() -> Mapper:
     return MAPPERS.make(MAPPERS.options("sparse"))
 
 
+def escalation_of(context: Context) -> Escalation:
+    return Escalation(context, context.escalation)
+
+
 def levels(context: Context) -> set[int]:
-    pairs = Escalation(context, context.escalation).pairs
-    return set(context.matches.levels(pairs).values())
+    return set(context.matches.levels(escalation_of(context).pairs).values())
 
 
-def with_models(monkeypatch: pytest.MonkeyPatch, *, found: ModelSummary) -> list[dict]:
+def with_models(monkeypatch: pytest.MonkeyPatch, *, found: ModelSummary) -> list[Choice]:
     """Say what models are there, and what a copy gives; return the choices that are mapped."""
-    asked = list[dict]()
+    asked = list[Choice]()
 
-    def models_of(_: Context, __: Mapper, choice: dict) -> list[ModelSummary]:
+    def models_of(_: Context, __: Mapper, choice: Choice) -> list[ModelSummary]:
         asked.append(choice)
         return [found]
 
     monkeypatch.setattr(alternatives, "_models_of", models_of)
     monkeypatch.setattr(alternatives, "read_summaries", lambda _: [UNSURE])
-    monkeypatch.setattr(Escalation, "models", lambda _: [UNSURE])
-    monkeypatch.setattr(Escalation, "needs", lambda *_: {NAMES[0]: 1.0})
     return asked
 
 
-def test_matches_of_the_other_kind_are_kept_beside_better_ones(context: Context) -> None:
-    pairs = Escalation(context, context.escalation).pairs
+def test_learned_matches_are_kept_beside_those_that_are_there(context: Context) -> None:
+    pairs = escalation_of(context).pairs
     others = context.matches.alternatives(list(pairs))
     assert levels(context) == {0}
     assert set(others) == set(pairs)
-    states = Escalation(context, context.escalation).states()
+    states = escalation_of(context).states()
     for pair, other in others.items():
         assert other.matches.level == 1
         assert other.matches.names == pair
         assert 0 < other.worth[0] < states[pair].num_inliers
+        assert states[pair].tried == 1
+        assert (states[pair].other_level, states[pair].other_worth) == (1, other.worth)
 
 
-def test_kind_with_a_greater_score_is_chosen_and_is_what_the_database_holds(
+def test_step_takes_matches_that_are_kept_and_matches_nothing_anew(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    escalation = escalation_of(context)
+    (pair, *_) = escalation.pairs
+    (there,) = context.matches.read([pair])
+    none = replace(there, indices=there.indices[:0], scores=there.scores[:0])
+    context.matches.write([none])
+    escalation.write()
+    (other,) = context.matches.alternatives([pair]).values()
+    monkeypatch.setattr("colmap_affrect.stages.escalate.matched_at_level", None)
+    escalation.match_at([pair], 1)
+    state = escalation.states()[pair]
+    assert (state.level, state.num_inliers, state.tried) == (1, other.worth[0], 0b11)
+    assert (state.other_level, state.other_worth) == (0, (0, 0))
+
+
+def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    escalation = Escalation(context, context.escalation)
+    escalation = escalation_of(context)
     better = replace(UNSURE, probabilities=dict.fromkeys(NAMES[:2], 0.9))
     asked = with_models(monkeypatch, found=better)
     others = context.matches.alternatives(list(escalation.pairs))
     context.matches.keep_note(CLIMBING, context.matches.note(FINISHED))
-    assert choose_kind(escalation, mapper)
+    look_at_learned(escalation, mapper)
     assert len(asked) == 1
-    assert context.matches.note(COMPARED) == [len(others), LEARNED_ONLY]
+    assert not choose_kind(escalation, at_once=True)  # more may be tried without them
+    assert levels(context) == {0}
+    assert choose_kind(escalation, at_once=False)
+    scores = Scores.of(context)
+    assert scores
+    assert scores.by_kind == pytest.approx({MEASURED: 0.2, LEARNED: 0.8})
+    assert scores.chosen == LEARNED
     assert context.matches.note(CLIMBING) is None  # models that are there are not gone on from
     assert levels(context) == {1}
     ids = image_ids(context.workspace.database)
@@ -119,57 +154,61 @@ def test_kind_with_a_greater_score_is_chosen_and_is_what_the_database_holds(
             assert_array_equal(stored, other.matches.indices)
     swapped = context.matches.alternatives(list(escalation.pairs))
     assert {other.matches.level for other in swapped.values()} == {0}
-    assert not choose_kind(escalation, mapper)  # that is decided
-    assert len(asked) == 1
+    assert not choose_kind(escalation, at_once=False)  # that is decided
 
 
-def test_kind_with_no_greater_score_changes_nothing_and_is_asked_once(
+def test_learned_models_that_are_sure_of_all_are_chosen_at_once(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    escalation = Escalation(context, context.escalation)
-    asked = with_models(monkeypatch, found=UNSURE)
+    sure = replace(UNSURE, registered_names=NAMES, probabilities=dict.fromkeys(NAMES, 0.95))
+    with_models(monkeypatch, found=sure)
+    look_at_learned(escalation_of(context), mapper)
+    assert choose_kind(escalation_of(context), at_once=True)
+    assert levels(context) == {1}
+
+
+def test_any_learned_model_is_chosen_at_once_where_there_is_none(
+    context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_models(monkeypatch, found=UNSURE)
+    monkeypatch.setattr(alternatives, "read_summaries", lambda _: [])
+    look_at_learned(escalation_of(context), mapper)
+    assert choose_kind(escalation_of(context), at_once=True)
+
+
+def test_learned_models_that_are_no_better_change_nothing(
+    context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_models(monkeypatch, found=UNSURE)
     before = database_content(context.workspace.database)
-    assert not choose_kind(escalation, mapper)
-    assert not choose_kind(escalation, mapper)
-    assert len(asked) == 1
+    look_at_learned(escalation_of(context), mapper)
+    assert not choose_kind(escalation_of(context), at_once=True)
+    assert not choose_kind(escalation_of(context), at_once=False)
     assert levels(context) == {0}
     assert database_content(context.workspace.database) == before
 
 
-def test_measured_matches_alone_are_looked_at_where_models_were_better_before(
-    context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+def test_measured_matches_alone_come_back_where_models_were_better_before(
+    context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    escalation = Escalation(context, context.escalation)
-    others = context.matches.alternatives(list(escalation.pairs))
-    mixed = list(others)[:2]
-    there = {pair: escalation.states()[pair].worth for pair in mixed}
-    current = {found.names: found for found in context.matches.read(mixed)}
-    choice = {
-        pair: (others[pair].matches, alternatives.Alternative(current[pair], there[pair]))
-        for pair in mixed
-    }
-    context.matches.choose(choice)
+    escalation = escalation_of(context)
+    pairs = list(escalation.pairs)
+    before = {found.names: found for found in context.matches.read(pairs)}
+    others = context.matches.alternatives(pairs)
+    escalation.matches.choose(
+        {pair: (others[pair].matches, Alternative(before[pair], (100, 0))) for pair in pairs[:2]}
+    )
     escalation.write()
-    asked = with_models(monkeypatch, found=UNSURE)
-    remember_score(context)
-    context.matches.keep_note(alternatives.SCORE_BEFORE, score([UNSURE]) + 0.5)
-    assert not choose_kind(escalation, mapper)
-    learned, measured = asked
-    assert set(learned) == set(others) - set(mixed)
-    assert set(measured) == set(mixed)
-    assert {matches.level for matches, _ in measured.values()} == {0}
+    assert levels(context) == {0, 1}
+    with_models(monkeypatch, found=UNSURE)
+    context.matches.keep_note(SCORES, asdict(Scores({MEASURED: 0.5, LEARNED: 0.3})))
+    assert choose_kind(escalation, at_once=False)
+    assert levels(context) == {0}
+    for found in context.matches.read(pairs):
+        assert_array_equal(found.indices, before[found.names].indices)
 
 
-def test_set_of_which_the_model_is_sure_is_not_looked_at(
-    context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = with_models(monkeypatch, found=UNSURE)
-    monkeypatch.setattr(Escalation, "needs", lambda *_: {})
-    assert not choose_kind(Escalation(context, context.escalation), mapper)
-    assert not asked
-
-
-def test_score_counts_relative_poses_that_are_expected_to_be_right() -> None:
+def test_score_counts_poses_that_are_expected_to_be_right() -> None:
     pair = replace(UNSURE, probabilities={"a": 0.9, "b": 0.9})
     three = replace(UNSURE, probabilities={"a": 0.9, "b": 0.9, "c": 0.9})
     assert score([]) == 0.0
@@ -196,8 +235,16 @@ def test_run_killed_after_the_choice_maps_the_chosen_matches(
         patch.setattr(Escalation, "write", interrupted_at_second_call())
         with pytest.raises(KeyboardInterrupt):
             climb.climb(killed, mapper, recipe)
-    assert killed.matches.note(COMPARED)[1] == LEARNED_ONLY
+    goes_on = list[bool]()
+    map_images = climb.map_images
+
+    def watched(context: Context, mapper: Mapper, **how: bool) -> object:
+        goes_on.append(how.get("goes_on", False))
+        return map_images(context, mapper, **how)
+
+    monkeypatch.setattr(climb, "map_images", watched)
     climb.climb(killed, mapper, recipe)
+    assert goes_on[0] is False
     for context in (whole, killed):
         assert levels(context) == {1}
     contents = [database_content(space.database) for space in spaces]

@@ -48,13 +48,23 @@ def situation(names: str | list[str] = NAMES, **given: Any) -> Situation:
     return Situation(**values | given)
 
 
-def test_learned_matching_of_a_small_set_comes_first_for_all_pairs_of_images_in_need() -> None:
-    plan = next_step(situation(), "low")
-    assert plan.step.level == LEARNED
-    assert ["".join(pair) for pair in plan.step.pairs] == ["ad", "ae", "bd", "be", "cd", "ce", "de"]
-    once = situation(tried={"ad": 1 | 1 << LEARNED})
-    assert ("a", "d") not in next_step(once, "low").step.pairs
+def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need() -> None:
+    step = learned_step(situation())
+    assert step.level == LEARNED
+    assert ["".join(pair) for pair in step.pairs] == ["ad", "ae", "bd", "be", "cd", "ce", "de"]
+    assert not learned_step(situation(needs="")).pairs
     assert not next_step(situation(needs=""), "high").step.pairs
+
+
+def test_pairs_that_have_learned_matches_used_or_not_get_no_others() -> None:
+    before = situation()
+    states = dict(before.states)
+    states["a", "d"] = PairState(0, 3, level=LEARNED, tried=1 | 1 << LEARNED)
+    states["a", "e"] = PairState(0, 3, other_level=LEARNED)
+    states["b", "d"] = PairState(0, 3, level=LEARNED, tried=0b111, other_level=1)
+    after = replace(before, states=states)
+    found = {"".join(pair) for pair in learned_step(after).pairs}
+    assert found == {"be", "cd", "ce", "de"}
 
 
 def test_strong_pairs_of_images_in_need_are_matched_by_networks_too() -> None:
@@ -79,12 +89,12 @@ def test_learned_matching_of_a_large_set_takes_as_long_as_the_first_model() -> N
 
 
 def done_with_learned(**given: Any) -> Situation:
-    """All pairs of images in need were matched by networks, in vain."""
+    """All pairs were matched by networks, beside what is there."""
     before = situation(**given)
-    bits = {"".join(pair): 1 | 1 << LEARNED for pair in before.states}
     lacking = [set(NAMES)] * len(LEVELS)
     lacking[LEARNED] = set()
-    return situation(tried=bits, lacking=lacking, **given)
+    states = {p: replace(s, other_level=LEARNED) for p, s in before.states.items()}
+    return replace(before, lacking=lacking, states=states)
 
 
 def test_afterwards_the_budget_of_the_effort_counts() -> None:
@@ -95,7 +105,12 @@ def test_afterwards_the_budget_of_the_effort_counts() -> None:
     budget_s = EFFORTS["normal"].budget_s(after.first_model_s, has_model=True)
     assert step.seconds <= budget_s + len(NAMES)
     spent = {"".join(pair): 0b11111 for pair in after.states}
-    assert not next_step(done_with_learned() and situation(tried=spent), "high").step.pairs
+    assert not next_step(situation(tried=spent), "high").step.pairs
+
+
+def test_learned_level_of_a_large_set_is_a_step_of_its_own() -> None:
+    names = [f"{number:03}" for number in range(SMALL + 1)]
+    assert next_step(situation(names, needs=names), "low").step.level == LEARNED
 
 
 def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one() -> None:

@@ -94,7 +94,9 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
     own = without_matches(context, NAMES[3])
     options = EscalateOptions(strong_num_inliers=1)
     escalation = Escalation(context, options)
-    assert escalation.next_step() == Step(1, own)
+    step = escalation.next_step()
+    assert step
+    assert (step.level, step.pairs) == (1, own)
 
     written = escalation.matches.write
 
