@@ -42,7 +42,7 @@ def thermal(picture: Picture, drawn: np.random.Generator) -> Picture:
 
 def evening(picture: Picture, drawn: np.random.Generator) -> Picture:
     """Low warm light from one side, deep shadows."""
-    height, width = picture.shape[:2]
+    width = picture.shape[1]
     across = np.linspace(0.3, 1.1, width)[None, :, None]
     across = across if drawn.random() < 0.5 else across[:, ::-1]
     warm = np.array([0.45, 0.75, 1.1])
@@ -64,7 +64,8 @@ def main() -> None:
     target.mkdir(parents=True, exist_ok=True)
     for number, path in enumerate(sorted(source.iterdir())):
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        look = LOOKS[number % len(LOOKS)]
+        turn = number + number // len(LOOKS)  # every second photograph has all looks, too
+        look = LOOKS[turn % len(LOOKS)]
         changed = look(picture, np.random.default_rng(number))
         cv2.imwrite(str(target / f"{path.stem}.jpg"), changed, [cv2.IMWRITE_JPEG_QUALITY, 90])
 
