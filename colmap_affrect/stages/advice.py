@@ -12,6 +12,7 @@ from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.project.report import Advice, ModelSummary
+from colmap_affrect.project.tables import as_row
 from colmap_affrect.stages.context import Context
 
 STRONGEST = "default"  # of the recipes
@@ -56,7 +57,7 @@ def advice(
     for name, bridge in model.bridges.items():
         if name in model.doubtful:
             why = f"if the matches of {name} and {bridge.by} are wrong by eye, leave them out"
-            found.append(Advice(why, _again(context, "--reject-pair", f"{name},{bridge.by}")))
+            found.append(Advice(why, _again(context, "--reject-pair", as_row([name, bridge.by]))))
     if may_change and FOCAL_UNKNOWN in doubts:
         why = "give lens and film, plate or sensor; if you do not know them, try a normal lens"
         found.append(Advice(why, _anew(context, "--focal-mm", "50", "--film-width-mm", "36")))
