@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
 
-from colmap_affrect.errors import EXIT_INTERRUPTED, INTERRUPTED, say
+from colmap_affrect.errors import EXIT_INTERRUPTED, INTERRUPTED, MEMORY_HINT, lacks_memory, say
 from colmap_affrect.parallel.subprocesses import end_with
 
 PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
@@ -21,6 +21,7 @@ SIGNALS = {signal.SIGINT, signal.SIGTERM}
 
 def main() -> NoReturn:
     """Run the command line in a process of its own, where the system can do that, and end."""
+    _open_standard_streams()
     if sys.platform != "linux":  # elsewhere libraries of the system do not survive a fork
         _work()
     signals: list[int] = []
@@ -47,6 +48,18 @@ def main() -> NoReturn:
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     sys.exit(_exit_code(os.waitstatus_to_exitcode(status), signals))
+
+
+def _open_standard_streams() -> None:
+    """Give the process those of the first three files that it was started without.
+
+    Else the next files that are opened, results perhaps, would be taken for them.
+    """
+    for number, flags in enumerate((os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, flags)  # the lowest number that is free: this one
 
 
 def _handle(handler: Callable[[int, object], None]) -> None:
@@ -98,10 +111,14 @@ def _work() -> NoReturn:
         code = end.code
     except (KeyboardInterrupt, Exception) as error:
         # Libraries turn a KeyboardInterrupt in their callbacks into errors of their own.
-        if not (signals or isinstance(error, KeyboardInterrupt)):
+        if signals or isinstance(error, KeyboardInterrupt):
+            say(INTERRUPTED)
+            code = EXIT_INTERRUPTED
+        elif lacks_memory(error):  # already for loading what is needed
+            say(f"error: {MEMORY_HINT}")
+            code = 1
+        else:
             raise
-        say(INTERRUPTED)
-        code = EXIT_INTERRUPTED
     if code == EXIT_INTERRUPTED:  # threads may be in the middle of something long
         os._exit(code)
     for number in SIGNALS:  # too late to change anything

@@ -21,6 +21,7 @@ MEMORY_HINT = (
 NO_MEMORY = (
     "insufficient memory", "out of memory", "can't allocate memory", "cannot allocate memory",
     "bad_alloc", "can't start new thread", "failed to allocate", "unable to allocate",
+    "failed to map segment", "cannot map zero-fill pages",
 )  # fmt: skip
 
 

@@ -225,6 +225,8 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
     if not is_file and name not in recipe_names():
         raise OptionError(f"unknown recipe '{name}'{suggestion(name, recipe_names())}")
     path = Path(name) if is_file else recipe_folder() / f"{name}.toml"
+    if path.exists() and not path.is_file():  # a pipe would be read only once
+        raise OptionError(f"recipe {path}: is not a file; give the path of a TOML file")
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:

@@ -1,6 +1,7 @@
 """Command line: parse, call one library function, print its result."""
 
 import argparse
+import errno
 import logging
 import os
 import sys
@@ -11,6 +12,7 @@ from typing import TextIO
 
 from colmap_affrect import __version__, errors
 from colmap_affrect.cli.parser import build_parser
+from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.workspace import Workspace
 
@@ -34,6 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # who reads what is printed has seen enough, as head has
         return 0
     except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename:
+            return _fail(str(cannot_write(Path(error.filename), error)))
         return _fail(
             f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
             "run the same command again: what was done before is kept"
@@ -68,7 +72,11 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
         workspace.require_own(options.image_path or options.dataset_path)
         log_path = workspace.log
     log_path.parent.mkdir(parents=True, exist_ok=True)
-    terminal = os.fdopen(os.dup(2), "w", buffering=1, encoding="utf-8", errors="replace")
+    try:
+        shown_on = os.dup(2)
+    except OSError:  # it is closed, and whoever closed it wants to see nothing
+        shown_on = os.open(os.devnull, os.O_WRONLY)
+    terminal = os.fdopen(shown_on, "w", buffering=1, encoding="utf-8", errors="replace")
     log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
     with terminal, closing(log), redirect_stderr(terminal):
         shown = logging.StreamHandler(terminal)

@@ -3,7 +3,9 @@
 What :mod:`.given` makes an options class of has the field as destination, as ``cameras.mode``.
 """
 
+import csv
 import math
+from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +39,18 @@ def minutes(text: str) -> float:
     return number
 
 
+def _fields(text: str, wanted: str) -> list[str]:
+    """Split at commas as a table does: a name with a comma stands in double quotes."""
+    fields = next(csv.reader([text], strict=True))
+    if len(fields) != wanted.count(",") + 1:
+        raise ArgumentTypeError(
+            f"{text!r}: give {wanted}, a name that holds a comma in double quotes"
+        )
+    return fields
+
+
 def pair(text: str) -> tuple[str, str]:
-    first, second = text.split(",")
+    first, second = _fields(text, "A,B")
     return first, second
 
 
@@ -47,7 +59,7 @@ def words(text: str) -> tuple[str, ...]:
 
 
 def distance(text: str) -> tuple[str, str, float]:
-    first, second, metres = text.split(",")
+    first, second, metres = _fields(text, "A,B,METRES")
     return first, second, float(metres)
 
 
@@ -146,7 +158,8 @@ FLAGS: dict[str, Settings] = {
         "point,photograph,x,y in px from the upper left corner, as the page of a run saves it; "
         "six or more join a lost photograph, or models", dest="tie_points_path"),
     "--reject-pair": _value("A,B", "do not use the matches of these two photographs, which are "
-        "wrong; may be repeated; without it they are used again", type=pair, action="append",
+        "wrong; may be repeated; without it they are used again; a name with a comma in double "
+        "quotes", type=pair, action="append",
         default=[], dest="rejected"),
     "--leave-out": _value("NAME", "do not map this photograph; may be repeated; without it it is "
         "mapped again", action="append", default=[], dest="left_out"),
@@ -202,7 +215,8 @@ FLAGS: dict[str, Settings] = {
         "point,image,px,py, and x,y,z of control points in metres (px, py: from the upper left "
         "corner)"),
     "--distance": _value("A,B,METRES", "a known distance, of two photographs or two points of "
-        "--points: gives the scale alone; may be repeated", type=distance, action="append",
+        "--points: gives the scale alone; may be repeated; a name with a comma in double quotes",
+        type=distance, action="append",
         default=[]),
     # looking into things
     "image": _path("IMAGE", "the photograph"),

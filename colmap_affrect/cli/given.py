@@ -20,6 +20,7 @@ from colmap_affrect.options import Options, flat
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe, with_settings
 from colmap_affrect.stages.context import Context, Resources
@@ -35,7 +36,7 @@ def over(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOpt
         place, _, field = settings.get("dest", "").rpartition(".")
         value = getattr(options, f"{place}.{field}", None)
         if place == section and value is not None:
-            given[field] = str(value.resolve()) if isinstance(value, Path) else value
+            given[field] = str(resolved(value)) if isinstance(value, Path) else value
             flags.append(flag)
     return known.from_mapping(given, ", ".join(flags))
 

@@ -3,6 +3,7 @@
 import argparse
 import re
 import sys
+from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any, NoReturn
 
@@ -62,7 +63,8 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; names of flags may have underscores, and an unknown one is refused."""
-        words = [_with_hyphens(word) for word in (sys.argv[1:] if args is None else args)]
+        given = list(sys.argv[1:] if args is None else args)
+        words = self._with_values([_with_hyphens(word) for word in given])
         found, unknown = super().parse_known_args(words, namespace)
         if unknown:
             name = next((word for word in unknown if word.startswith("-")), unknown[0])
@@ -70,6 +72,20 @@ class Parser(argparse.ArgumentParser):
             meant = f" (did you mean {close[0]}?)" if close else ""
             self.error(f"unknown argument {name}{meant}")
         return found, unknown
+
+    def _with_values(self, words: Sequence[str]) -> list[str]:
+        """Join flags and values that begin with a hyphen, as names of photographs may."""
+        joined: list[str] = []
+        is_name = re.compile(r"-[^-].*")
+        for word in words:
+            before = joined[-1] if joined else ""
+            action = self._option_string_actions.get(before)
+            takes_value = action is not None and action.nargs is None and before.startswith("--")
+            if takes_value and is_name.fullmatch(word) and word not in self._option_string_actions:
+                joined[-1] = f"{before}={word}"
+            else:
+                joined.append(word)
+        return joined
 
 
 def _with_hyphens(word: str) -> str:

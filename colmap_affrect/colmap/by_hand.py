@@ -18,6 +18,7 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.paths import TakesPaths
+from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.tables import read_table
 
 SIGMA_PX = 3.0  # standard deviation of a mark by hand
@@ -68,7 +69,7 @@ class ByHand(TakesPaths):
             return ""
         found = hashlib.sha256(repr((sorted(self.rejected), sorted(self.left_out))).encode())
         if self.tie_points_path and self.tie_points_path.is_file():
-            found.update(self.tie_points_path.read_bytes())
+            found.update(read_regular(self.tie_points_path))
         return found.hexdigest()
 
     def copy_database(self, source: Path, target: Path) -> Indices:

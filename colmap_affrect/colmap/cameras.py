@@ -19,6 +19,7 @@ from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_agai
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import Options
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.tables import read_table
 
@@ -70,7 +71,7 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     with damage(path, made_again("verify", path.parent), WorkspaceError):
         if not path.exists():
             return {}
-        return _RECORDS.validate_json(path.read_bytes())
+        return _RECORDS.validate_json(read_regular(path))
 
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:

@@ -17,6 +17,7 @@ from colmap_affrect.errors import DatabaseError
 from colmap_affrect.geometry import conventions
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.regular_files import NotAFileError, require_regular
 from colmap_affrect.project.stores import FeatureStore
 
 BYTES_PER_ROW = 4096
@@ -27,12 +28,15 @@ BYTES_OF_EMPTY_DATABASE = 1 << 19  # what :func:`require_database_space` reckons
 def open_database(path: Path) -> Iterator[pycolmap.Database]:
     """Open a database and close it again; pycolmap's failures become errors of one line."""
     try:
+        require_regular(path)
         # A Ctrl-C while pycolmap converts a Path would become a TypeError.
         database = pycolmap.Database.open(str(path))
+    except NotAFileError as error:
+        raise DatabaseError(f"{path}: {error}; give a COLMAP database") from error
     except RuntimeError as error:
+        require_space(path, BYTES_OF_EMPTY_DATABASE)
         raise DatabaseError(
-            f"{path}: not a usable COLMAP database, in use by another program, or the disk is full "
-            f"({error})"
+            f"{path}: not a usable COLMAP database, or in use by another program ({error})"
         ) from error
     try:
         with closing(database):

@@ -1,5 +1,6 @@
 """Copies of COLMAP databases, made by SQLite: COLMAP migrates a database as soon as it opens it."""
 
+import re
 import sqlite3
 import tempfile
 from collections.abc import Callable, Collection, Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database, write_frame
-from colmap_affrect.colmap.tables import open_read_only
+from colmap_affrect.colmap.tables import DIGESTED, open_read_only
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.outputs import temporary_folder
 
@@ -42,6 +43,15 @@ def refuse_newer(path: Path) -> int:
     return version
 
 
+OWN_INDEXES = {
+    "index_name", "rig_ref_sensor_assignment", "rig_sensor_assignment", "frame_sensor_assignment",
+    "pose_prior_data_assignment",
+}  # fmt: skip
+"""That COLMAP makes; those of SQLite have no text."""
+OF_EXPRESSIONS = -2  # what SQLite has in the place of the column of an index
+PLAIN_DEFAULT = re.compile(r"-?[0-9.]+|NULL|'[^']*'", re.IGNORECASE)
+"""Values of columns that are numbers or texts, and not computed."""
+
 Change = Callable[[pycolmap.Database], None]
 
 
@@ -64,10 +74,34 @@ def copy_database(
         new = folder / target.name
         with open_read_only(source) as original, closing(sqlite3.connect(new)) as copy:
             original.backup(copy)
+            _keep_tables_only(copy, source)
         with open_database(new) as database:  # COLMAP migrates it
             if change:
                 change(database)
         new.replace(target)
+
+
+def _keep_tables_only(copy: sqlite3.Connection, source: Path) -> None:
+    """Remove what would act on its own in a copy: triggers, views, indexes that COLMAP has not.
+
+    They could fill the disk with each row that is written. Raises DatabaseError for a table of
+    COLMAP with columns that are computed, or whose defaults are.
+    """
+    made = "SELECT type, name FROM sqlite_master WHERE type != 'table' AND sql IS NOT NULL"
+    for kind, name in copy.execute(made).fetchall():
+        quoted = '"' + name.replace('"', '""') + '"'
+        columns = [row[1] for row in copy.execute(f"PRAGMA index_xinfo({quoted})")]
+        if name not in OWN_INDEXES or kind != "index" or OF_EXPRESSIONS in columns:
+            copy.execute(f"DROP {kind} {quoted}")
+    for table in DIGESTED:
+        for row in copy.execute(f"PRAGMA table_xinfo({table})"):
+            name, default, kind = row[1], row[4], row[6]
+            if kind or (isinstance(default, str) and not PLAIN_DEFAULT.fullmatch(default)):
+                raise DatabaseError(
+                    f"{source}: the column {name} of the table {table} is computed, which COLMAP "
+                    "has nowhere; copy its rows into a database that COLMAP has made"
+                )
+    copy.commit()
 
 
 def copy_without_features(source: Path, target: Path) -> None:

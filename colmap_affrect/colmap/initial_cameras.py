@@ -34,7 +34,7 @@ from colmap_affrect.colmap.database import (
     require_database_space,
     write_frame,
 )
-from colmap_affrect.errors import OptionError, such_as
+from colmap_affrect.errors import OptionError, lacks_memory, such_as
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
@@ -43,8 +43,8 @@ from colmap_affrect.images.exif import (
     exif_focal,
     read_camera_tags,
 )
-from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.images.reading import is_too_large
+from colmap_affrect.images.photographs import CameraOptions, require_folder
+from colmap_affrect.images.reading import why_unusable
 from colmap_affrect.project.outputs import database_files, remove_own, temporary_folder
 
 MAX_LINES = 5  # that are logged; report.json says all
@@ -252,12 +252,17 @@ def import_images(
     with temporary_folder(path.parent) as folder:
         new, read = folder / "new.db" if is_new else path, folder / "read.db"
         missing = sorted(set(names) - set(image_ids(new)))
-        missing = [name for name in missing if not is_too_large(initial.size(name))]
+        missing = [name for name in missing if not why_unusable(image_path / name)]
         if missing:
             require_database_space(new, 2 * len(missing))
             image_ids(read)  # makes it
             mode = pycolmap.CameraMode.PER_IMAGE
-            run_cancellable(lambda _: pycolmap.import_images(read, image_path, mode, missing))
+            try:
+                run_cancellable(lambda _: pycolmap.import_images(read, image_path, mode, missing))
+            except (RuntimeError, ValueError) as error:
+                if lacks_memory(error) or image_path.is_dir():
+                    raise
+                require_folder(image_path)  # it is gone, as with a drive
             with open_database(read) as found, open_database(new) as database:
                 _take_over(initial, found, database)
         if is_new:

@@ -4,7 +4,6 @@ pycolmap's reader never ends, takes all memory or ends the process where a count
 So every record is followed to its end first. Models of ours have digests of files beside them.
 """
 
-import hashlib
 import json
 import struct
 from collections import Counter
@@ -18,8 +17,14 @@ import numpy as np
 
 from colmap_affrect import errors
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.native_writes import native_writes
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.project.atomic_files import cannot_write
+from colmap_affrect.project.regular_files import (
+    read_regular,
+    require_regular,
+    sha256_of_regular,
+)
 
 Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
 Poses = dict[str, Pose]  # poses by image name
@@ -110,7 +115,7 @@ OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")  # of COLMAP before 
 def _read_records(path: Path) -> list[Any]:
     """Read all records of a file; StoreError unless they end where it ends."""
     with errors.damage(path, _mend(path.parent)):
-        reader, record = _Reader(path.read_bytes()), RECORDS[path.name]
+        reader, record = _Reader(read_regular(path)), RECORDS[path.name]
         try:
             records = [record(reader) for _ in range(reader.take("Q")[0])]
         except EOFError:
@@ -154,7 +159,7 @@ def _is_binary(folder: Path) -> bool:
 def kept_digests(folder: Path) -> dict[str, str]:
     """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
-        known = json.loads((folder / SUMMARY).read_bytes())["model"]
+        known = json.loads(read_regular(folder / SUMMARY))["model"]
     except errors.DAMAGE:
         return {}
     return known if isinstance(known, dict) else {}
@@ -164,15 +169,16 @@ def file_digests(folder: Path) -> dict[str, str]:
     """Return the sha256 of each file of a model that can be read."""
     found = {}
     for name in RECORDS:
-        with suppress(OSError), (folder / name).open("rb") as file:
-            found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+        with suppress(OSError):
+            found[name] = sha256_of_regular(folder / name)
     return found
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     """Write a model into a new folder; pycolmap does not say when the disk is full."""
-    folder.mkdir()
-    model.write(folder)
+    with native_writes(folder):
+        folder.mkdir()
+        model.write(folder)
     try:
         registered_names(folder)
     except errors.StoreError as error:
@@ -187,6 +193,9 @@ def read_given_model(folder: Path, option: str = "") -> pycolmap.Reconstruction:
     wanted = "give the folder that holds cameras, images and points3D as .bin or .txt"
     if not folder.is_dir():
         raise errors.OptionError(f"{option}{folder}: no such folder; {wanted}")
+    for path in sorted(folder.glob("*.[bt][ix][nt]")):
+        with errors.damage(path, wanted):
+            require_regular(path)
     if _is_binary(folder) or kept_digests(folder):
         require_intact(folder)
         with errors.damage(folder, _mend(folder)):

@@ -13,6 +13,8 @@ from typing import Any
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import flat, suggestion
 
+MAX_NUM_THREADS = 1024  # COLMAP starts them all, and waits for ever for those that it cannot have
+
 Plain = bool | int | float | str
 
 OWNED = {"image_path": "it is the one that extract was given", "random_seed": "use --random-seed"}
@@ -55,7 +57,14 @@ def resolve(
         if key not in plain:
             raise OptionError(f"{where}: cannot be given, it is of type {kind.__name__}")
         try:
-            set_values(options, {key: _parsed(value, known[key])})
+            parsed = _parsed(value, known[key])
+            if _name(key) == "num_threads" and parsed > MAX_NUM_THREADS:
+                raise OptionError(
+                    f"{where}={value}: at most {MAX_NUM_THREADS}, or -1 for all cores"
+                )
+            set_values(options, {key: parsed})
+        except OptionError:
+            raise
         except (TypeError, ValueError, RuntimeError) as error:
             names = getattr(kind, "__members__", ("true", "false") if kind is bool else ())
             expected = f"one of {', '.join(names)}" if names else kind.__name__

@@ -10,7 +10,7 @@ from colmap_affrect.colmap.database import fill_descriptors, open_database
 from colmap_affrect.colmap.database_copy import copy_database, read_names
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
-from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.outputs import new_results, temporary_folder
 from colmap_affrect.project.stores import FeatureStore
 
 MAPPER_OPTIONS = (
@@ -31,8 +31,11 @@ def export_database(source: Path, target: Path, features: FeatureStore | None = 
     longitude and altitude, or in metres. DatabaseError when the source cannot be used or has a
     camera model that COLMAP 3.8 does not know, OptionError when the target exists.
     """
-    with new_results(target, names=read_names(source)) as (old,):
-        new = old.with_name("new.db")
+    with (
+        new_results(target, names=read_names(source)) as (old,),
+        temporary_folder(old.parent) as folder,  # in which no name is the user's
+    ):
+        new = folder / "new.db"
         copy_database(source, new, FATAL)
         if features:
             fill_descriptors(new, features)

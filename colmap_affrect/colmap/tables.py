@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.project.regular_files import NotAFileError, read_regular, require_regular
 
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
 HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
@@ -29,9 +30,14 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
 
     Without a write-ahead log or a journal as immutable: SQLite makes no files beside it then.
     """
+    wal, journal, index = (path.with_name(path.name + end) for end in ("-wal", "-journal", "-shm"))
+    for file in (path, wal, journal, index):
+        try:
+            require_regular(file)
+        except NotAFileError as error:
+            raise OptionError(f"{file}: {error}; give a COLMAP database") from error
     if not path.is_file():
         raise OptionError(f"{path}: no such file; give a COLMAP database")
-    wal, journal = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
     mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
     address = f"{path.resolve().as_uri()}?{mode}"
     try:
@@ -43,7 +49,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
                 )
             yield connection
     except DAMAGED as error:
-        if journal.exists() and journal.read_bytes()[:8] == HOT_JOURNAL:
+        if journal.exists() and read_regular(journal)[:8] == HOT_JOURNAL:
             raise DatabaseError(
                 f"{path}: a program that was writing to it was killed, or is still at work, and "
                 f"{journal.name} undoes the half of it; wait, or open it once with a program that "

@@ -50,6 +50,7 @@ def compare(
     image_path, output_path = as_path(image_path), as_path(output_path)
     options = options or CompareOptions()
     Workspace(output_path).require_own(image_path)
+    Workspace(output_path).refuse_run()
     methods = parse_methods(options.methods)
     inputs, names = _checked(image_path, options)
     listed = options.pairs.match_list_path

@@ -37,6 +37,7 @@ from colmap_affrect.progress import SILENT, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_bytes, replace_text
 from colmap_affrect.project.outputs import new_results, remove_own, temporary_folder
 from colmap_affrect.project.record import first_difference
+from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
@@ -130,7 +131,7 @@ class MethodRun:
     def result(self) -> MethodResult:
         """What is done of the method, as it is on disk."""
         with suppress(FileNotFoundError, ValidationError):  # of a version before: features stay
-            return RESULT.validate_json((self.workspace.path / "result.json").read_bytes())
+            return RESULT.validate_json(read_regular(self.workspace.path / "result.json"))
         return MethodResult(
             self.method.label,
             summary=self.method.summary,
@@ -153,7 +154,7 @@ class MethodRun:
         if self.method.escalates:  # verification of this seed decides
             asked["seed"] = self.options.seeds[0]
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
-        known = json.loads(record.read_bytes()) if record.exists() else {}
+        known = json.loads(read_regular(record)) if record.exists() else {}
         if folder.exists() and (difference := first_difference(known, asked)):
             raise StoreError(
                 f"{folder}: {self.method.label} was run there with {difference}; use "

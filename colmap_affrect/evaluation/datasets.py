@@ -3,8 +3,8 @@
 import json
 import logging
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -24,6 +24,7 @@ from colmap_affrect.images.reading import IMAGE_SUFFIXES
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.project.outputs import leads_outside
+from colmap_affrect.project.regular_files import require_regular
 
 logger = logging.getLogger(__name__)
 
@@ -177,8 +178,11 @@ def stem(name: str) -> str:
     return path.with_suffix("").as_posix() if is_image else name
 
 
-def _damaged(path: Path) -> AbstractContextManager[None]:
-    return damage(path, "see docs/own-evaluation-set.md for the format")
+@contextmanager
+def _damaged(path: Path) -> Iterator[None]:
+    with damage(path, "see docs/own-evaluation-set.md for the format"):
+        require_regular(path)
+        yield
 
 
 def _lines(path: Path) -> list[str]:

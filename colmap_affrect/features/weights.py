@@ -64,10 +64,25 @@ def find(key: str, weights_path: Path | None = None) -> Path | None:
     if key not in WEIGHT_FILES:
         raise OptionError(f"unknown weights '{key}'{suggestion(key, WEIGHT_FILES)}")
     variable = os.environ.get(ENVIRONMENT_VARIABLE)
-    given = Path(variable).expanduser() if variable else None
+    given = _expanded(Path(variable)) if variable else None
     folders = [folder for folder in (weights_path, given, cache_folder()) if folder]
     paths = [folder / name for folder in folders for name in WEIGHT_FILES[key].names]
-    return next((path for path in [*paths, *_installed(key)] if path.is_file()), None)
+    return next((path for path in [*paths, *_installed(key)] if _is_there(path)), None)
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # in a folder of somebody else, as a cache may be in a container
+        return False
+
+
+def _expanded(path: Path) -> Path | None:
+    """Return a path with the home in the place of ``~``; None where nobody knows that."""
+    try:
+        return path.expanduser()
+    except RuntimeError:  # a container's user has none
+        return None
 
 
 def _installed(key: str) -> list[Path]:
@@ -112,9 +127,15 @@ def fetch(
     be had and those that are not the published ones, after the others.
     """
     target = folder or cache_folder()
+    keys, failures = list(keys), {}
+    if not keys:
+        return {}
+    if target is None:
+        raise OptionError(
+            "--weights: give a folder, there is no home for a cache of files (TORCH_HOME names one)"
+        )
     if target.exists() and not target.is_dir():
         raise OptionError(f"--weights {target}: not a folder; give the folder of the weights")
-    keys, failures = list(keys), {}
     lacking = [WEIGHT_FILES[key] for key in keys if not find(key)]  # before anything is written
     for key in keys:
         path = target / WEIGHT_FILES[key].file_name
@@ -126,7 +147,7 @@ def fetch(
     if texts:
         raise AffrectError(
             f"{'; '.join(texts)}; {install_hint(lacking)}put the files into the folder of "
-            f"--weights, that of {ENVIRONMENT_VARIABLE}, or {cache_folder()}, or use a recipe that "
+            f"--weights, that of {ENVIRONMENT_VARIABLE}, or {target}, or use a recipe that "
             f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
         )
     return {key: target / WEIGHT_FILES[key].file_name for key in keys}
@@ -203,8 +224,12 @@ def load_state_dict(path: Path) -> dict[str, Any]:
     return dict(content)
 
 
-def cache_folder() -> Path:
-    """Return torch's folder of weights (``torch.hub.get_dir``) without loading torch."""
+def cache_folder() -> Path | None:
+    """Return torch's folder of weights (``torch.hub.get_dir``) without loading torch.
+
+    None where it would be in the home of a user who has none.
+    """
     caches = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache"))
     home = Path(os.environ.get("TORCH_HOME", caches / "torch"))
-    return home.expanduser() / "hub" / "checkpoints"
+    known = _expanded(home)
+    return known / "hub" / "checkpoints" if known else None

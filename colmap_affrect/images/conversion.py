@@ -1,22 +1,35 @@
-"""Photographs in formats that COLMAP cannot read, as PNG: JPEG 2000, WebP, AVIF, HEIC, pages."""
+"""Photographs in formats that COLMAP cannot read, as PNG: JPEG 2000, WebP, AVIF, HEIC, pages.
+
+Whatever is copied has been decoded first: what only has the name of a photograph may be anything,
+also a link to what nobody should see.
+"""
 
 import io
-import shutil
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
+from itertools import count
+from pathlib import Path, PurePosixPath
 
 from PIL import Image, UnidentifiedImageError
 
 from colmap_affrect.errors import ImageError
-from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files, require_folder
-from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format, pages
+from colmap_affrect.geometry.arrays import Bytes
+from colmap_affrect.images import reading
+from colmap_affrect.images.photographs import (
+    TIFF_SUFFIXES,
+    folders_left_out,
+    photograph_files,
+    require_folder,
+)
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, PNG, pages
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import cannot_write
-from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.outputs import LONGEST_NAME, fitting_name, new_results
 
 AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
+JPEG = b"\xff\xd8"
 
 
 @dataclass
@@ -25,13 +38,19 @@ class ConversionReport:
 
     written: dict[str, list[str]] = field(default_factory=dict)  # files made, by the converted one
     copied: list[str] = field(default_factory=list)  # files that COLMAP can read as they are
+    renamed: dict[str, str] = field(default_factory=dict)  # new names, by those that were taken
     failures: dict[str, str] = field(default_factory=dict)  # why files cannot be read
+    left_out: dict[str, str] = field(default_factory=dict)  # why folders were passed over
 
     def summary(self) -> str:
-        """Return one line, and one for each file that failed."""
+        """Return one line, and one for each file that failed or has another name than usual."""
         made = sum(len(names) for names in self.written.values())
         line = f"{len(self.written)} files converted into {made} PNG, {len(self.copied)} copied"
-        return "\n".join([line, *(f"not {n}: {why}" for n, why in self.failures.items())])
+        named = [f"{new}: instead of {old}" for old, new in self.renamed.items()]
+        folders = [f"{name}: {why}" for name, why in self.left_out.items()]
+        return "\n".join(
+            [line, *named, *folders, *(f"not {n}: {w}" for n, w in self.failures.items())]
+        )
 
 
 def convert_images(
@@ -40,58 +59,143 @@ def convert_images(
     """Make a new folder with the photographs of another one, all in formats that COLMAP reads.
 
     Pages of a file become a file each, ``scan.tif-page2.png``. EXIF, its orientation too, stays.
-    Raises ImageError when there are no photographs, OptionError when their folder is not there, or
-    the new one is there already or inside it.
+    What cannot be decoded is left out, and no file takes the place of another one.
+
+    Args:
+        image_path: folder of the photographs, searched with its sub-folders.
+        output_path: folder to be made.
+        progress: where to show progress.
+
+    Returns:
+        What became of each file.
+
+    Raises:
+        ImageError: there are no photographs.
+        OptionError: their folder is not there, or the new one is there already or inside it.
+        WorkspaceError: the new folder cannot be written.
     """
     require_folder(image_path)
     with suppress(ImportError):  # of the extra "heic"
         from pillow_heif import register_heif_opener
 
         register_heif_opener()
-    names, report = photograph_files(image_path), ConversionReport()
+    names = photograph_files(image_path)
     if not names:
         raise ImageError(f"{image_path}: holds no photographs")
     with (
         new_results(output_path, names=names) as (folder,),
         progress.stage("convert", len(names), "images") as advance,
     ):
+        conversion = _Conversion(image_path, folder, output_path, names)
         for name in names:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            try:
-                _convert(image_path / name, folder, name, report)
-            except ImageError as error:
-                report.failures[name] = str(error)
-            except OSError as error:
-                raise cannot_write(output_path, error) from error
+            conversion.add(name)
             advance(1)
-    return report
+    return conversion.report
 
 
-def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:
-    suffix = path.suffix.lower()
-    numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
-    if suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]:
-        shutil.copy2(path, folder / name)
-        report.copied.append(name)
+class _Conversion:
+    """The photographs of a folder on their way into another one."""
+
+    def __init__(
+        self, image_path: Path, folder: Path, output_path: Path, names: Sequence[str]
+    ) -> None:
+        """Take both folders, the name that the new one will have, and the photographs to come."""
+        self.image_path = image_path
+        self.folder = folder
+        self.output_path = output_path
+        self.report = ConversionReport(left_out=folders_left_out(image_path))
+        self._of_copies = set(names)  # which they keep wherever they can
+
+    def add(self, name: str) -> None:
+        """Copy or convert a photograph, or report why it cannot be decoded."""
+        path = self.image_path / name
+        suffix = path.suffix.lower()
+        written: list[str] = []
+        try:
+            data = reading.read_photograph(path)
+            numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
+            is_readable = suffix in IMAGE_SUFFIXES and not reading.foreign_format(data)
+            if is_readable and numbers == [0]:
+                _require_picture(path, data)
+                made = self._write(name, data.tobytes(), is_copy=True)
+                with suppress(OSError):  # times are not worth a failure
+                    os.utime(self.folder / made, ns=_times(path))
+                self.report.copied.append(made)
+                return
+            ends = [f"-page{k}" for k in range(1, len(numbers) + 1)] if len(numbers) > 1 else [""]
+            for end, content in zip(ends, _as_png(path, data, numbers), strict=True):
+                # The suffix stays: a.jp2 may lie beside a.png.
+                written.append(self._write(f"{name}{end}.png", content))
+            self.report.written[name] = written
+        except ImageError as error:
+            for page in written:
+                (self.folder / page).unlink()
+            self.report.failures[name] = str(error)
+
+    def _write(self, name: str, content: bytes, *, is_copy: bool = False) -> str:
+        """Write a file that is not there yet; return its name, another one where that is taken."""
+        for new in _possible_names(name):
+            if not is_copy and new in self._of_copies:
+                continue
+            target = self.folder / new
+            try:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with target.open("xb") as file:
+                    file.write(content)
+            except FileExistsError:  # names may differ in what the file system does not keep
+                continue
+            except OSError as error:
+                raise cannot_write(self.output_path, error) from error
+            if new != name:
+                self.report.renamed[name] = new
+            return new
+        raise AssertionError
+
+
+def _possible_names(name: str) -> Iterator[str]:
+    """Yield the name of a file and others that are like it; as short as file systems want them."""
+    path = PurePosixPath(name)
+    for number in count(1):
+        stem = path.stem if number == 1 else f"{path.stem}-{number}"
+        yield path.with_name(fitting_name(stem, path.suffix, LONGEST_NAME)).as_posix()
+
+
+def _times(path: Path) -> tuple[int, int]:
+    there = path.stat()
+    return there.st_atime_ns, there.st_mtime_ns
+
+
+def _require_picture(path: Path, data: Bytes) -> None:
+    """Refuse what cannot be decoded to its end; ImageError.
+
+    OpenCV fills up what is missing of a JPEG or PNG; Pillow says so.
+    """
+    reading.require_possible(path)
+    reading.decoded(data.copy(), path)
+    if not data[:8].tobytes().startswith((JPEG, PNG)):
         return
-    ends = [f"-page{k}" for k in range(1, len(numbers) + 1)] if len(numbers) > 1 else [""]
-    made = [f"{name}{end}.png" for end in ends]  # the suffix stays: a.jp2 may lie beside a.png
-    for page, content in zip(made, _as_png(path, numbers), strict=True):
-        (folder / page).write_bytes(content)
-    report.written[name] = made
+    try:
+        with reading.opened(io.BytesIO(data.data)) as image:
+            image.load()
+    except Exception as error:  # damaged files raise nearly anything in Pillow
+        raise ImageError(f"{path}: is damaged ({error})") from error
 
 
-def _as_png(path: Path, numbers: Sequence[int]) -> Iterator[bytes]:
+def _as_png(path: Path, data: Bytes, numbers: Sequence[int]) -> Iterator[bytes]:
     """Yield pages of a file as PNG; ImageError if it is damaged, or of no format that is known."""
     try:
         # By its name Pillow maps a file into memory, and garbles gray pages that lie on their side.
-        with path.open("rb") as opened, Image.open(opened) as image:
+        with Image.open(io.BytesIO(data.data)) as image:
             for number in numbers:
                 image.seek(number)
+                if reading.is_too_large(image.size):
+                    raise ImageError(f"{path}: claims to be {image.width} x {image.height} px")
                 page = image if image.mode in AS_STORED else image.convert("RGB")
                 file = io.BytesIO()
                 page.save(file, "PNG", exif=image.getexif())
                 yield file.getvalue()
+    except ImageError:
+        raise
     except UnidentifiedImageError as error:
         heic = path.suffix.lower() in (".heic", ".heif")
         hint = "; HEIC needs: pip install pillow-heif" if heic else ""

@@ -3,6 +3,7 @@
 import os
 import posixpath
 import unicodedata
+from collections import defaultdict, deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -16,9 +17,19 @@ from colmap_affrect.images import reading
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.outputs import is_output_folder
+from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.stores import pair_key
 
 TIFF_SUFFIXES = (".tif", ".tiff")
+THUMBNAILS = "thumbnails that a NAS or another system keeps, not photographs"
+DELETED = "what was deleted, or was there before"
+FOLDERS_OF_SYSTEMS = {
+    "@eaDir": THUMBNAILS, "@__thumb": THUMBNAILS, "__MACOSX": THUMBNAILS,
+    "#recycle": DELETED, "@Recycle": DELETED, "$RECYCLE.BIN": DELETED,
+    "#snapshot": DELETED, "@Recently-Snapshot": DELETED,
+}  # fmt: skip
+"""What folders hold that are beside photographs, but nobody has put there, by their names."""
+LINKED_TWICE = "a link to a folder that is looked through anyway, or holds that of the photographs"
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 
 
@@ -68,10 +79,15 @@ class Photographs:
             raise OptionError(f"--camera-mask-path {self.masks.camera_path}: no such file")
 
     def mask(self, name: str) -> Mask | None:
-        """Return an image's (H, W) mask, if any; ImageError if it is unreadable or does not fit."""
+        """Return an image's (H, W) mask, if any; ImageError if it is unreadable or does not fit.
+
+        Where an image has no file of its own for it, its alpha channel is its mask.
+        """
         paths = [path for path in self._mask_paths(name) if path.is_file()][:1]
+        alpha = None if paths else reading.alpha_mask(self.folder / name)
         paths += [Path(self.masks.camera_path)] if self.masks.camera_path else []
-        size, masks = reading.header_size(self.folder / name), list[Mask]()
+        size = reading.header_size(self.folder / name)
+        masks = [] if alpha is None else [alpha]
         for path in paths:
             found = reading.header_size(path)
             if not size or found in (None, size):
@@ -86,7 +102,11 @@ class Photographs:
         return np.logical_and.reduce(masks) if masks else None
 
     def without_mask(self, names: Sequence[str]) -> list[str]:
-        """Return the images without a mask, if masks are given; OptionError when none has one."""
+        """Return the images without a mask, if masks are given.
+
+        OptionError when none has one, or the mask of one is itself a photograph of these names.
+        """
+        self._refuse_photographs(names)
         paths = {name: self._mask_paths(name) for name in names if self.masks.path}
         found = [name for name in paths if not any(path.is_file() for path in paths[name])]
         if found and len(found) == len(names):
@@ -95,6 +115,23 @@ class Photographs:
                 f"{paths[found[0]][0]}"
             )
         return found
+
+    def _refuse_photographs(self, names: Sequence[str]) -> None:
+        """Refuse masks that are photographs, as in the folder of the photographs; OptionError."""
+        given = {"--mask-path": self.masks.path, "--camera-mask-path": self.masks.camera_path}
+        if not any(given.values()):
+            return
+        photographs = {(self.folder / name).resolve() for name in names}
+        for option, where in given.items():
+            paths = [Path(where)] if where else []
+            if option == "--mask-path":
+                paths = [path for name in names for path in self._mask_paths(name)]
+            for path in paths:
+                if path.resolve() in photographs:
+                    raise OptionError(
+                        f"{option} {where}: {path.name} is one of the photographs in "
+                        f"{self.folder}; give the masks a folder of their own, outside of that"
+                    )
 
     def _mask_paths(self, name: str) -> list[Path]:
         """Return where the mask of an image may be, the first that is there counts."""
@@ -108,16 +145,12 @@ class Photographs:
         paths = [self.folder / name, *self._mask_paths(name)]
         if self.masks.camera_path:
             paths.append(Path(self.masks.camera_path))
-        return [path for path in paths if path.is_file()]
+        return [path for path in paths if reading.may_be_photograph(path)]
 
     def why_impossible(self, name: str) -> str:
-        """Say which of these files claims more pixels than photographs have; empty if none does."""
-        try:
-            for path in self.files(name):
-                reading.require_possible(path)
-        except ImageError as error:
-            return str(error)
-        return ""
+        """Say which of these files is none, or claims more pixels than photographs have."""
+        paths = [self.folder / name, *self.files(name)]
+        return next(filter(None, map(reading.why_unusable, paths)), "")
 
 
 def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:
@@ -147,8 +180,8 @@ def require_folder(image_path: Path) -> None:
 def left_out(image_path: Path) -> dict[str, str]:
     """Return why photographs in a folder are passed over: for their format, names, or as pages."""
     found: dict[str, list[str]] = {}
-    notes: dict[str, str] = {}
-    for name in photograph_files(image_path, (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS)):
+    files, notes = _walk(image_path, (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS))
+    for name in sorted(files):
         suffix = _suffix(name)
         if suffix not in IMAGE_SUFFIXES:
             found.setdefault(f"*{suffix}", []).append(name)
@@ -182,13 +215,60 @@ def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
 def photograph_files(
     folder: Path, suffixes: Collection[str] = (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES)
 ) -> list[str]:
-    """Return the sorted names of all photographs below a folder, without hidden ones and output."""
+    """Return the sorted names of all photographs below a folder, without hidden ones and output.
+
+    Folders that are linked count, each folder once.
+    """
+    return sorted(_walk(folder, suffixes)[0])
+
+
+def folders_left_out(folder: Path) -> dict[str, str]:
+    """Return why folders below that of the photographs are passed over, by what is said of them."""
+    return _walk(folder, ())[1]
+
+
+def _walk(folder: Path, suffixes: Collection[str]) -> tuple[list[str], dict[str, str]]:
+    """Return the names of the files below a folder that end so, and notes of what is left out.
+
+    Links are followed after all else, so that a folder that is here and linked has its own name.
+    """
     found: list[str] = []
-    for path, inner, files in os.walk(folder):
-        inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(Path(path, n))]
-        below = "" if path == str(folder) else f"{Path(path).relative_to(folder).as_posix()}/"
-        found += (below + n for n in files if n[0] != "." and _suffix(n) in suffixes)
-    return sorted(found)
+    left_out: defaultdict[str, list[str]] = defaultdict(list)
+    seen = {_identity(path) for path in folder.resolve().parents}
+    ahead = deque([folder])
+    linked = deque[Path]()
+    while ahead or linked:
+        path = ahead.popleft() if ahead else linked.popleft()
+        below = "" if path == folder else f"{path.relative_to(folder).as_posix()}/"
+        try:
+            identity = _identity(path)
+            entries = sorted(os.scandir(path), key=lambda entry: entry.name)
+        except OSError as error:
+            left_out[f"cannot be read ({error.strerror}); permit reading"].append(below)
+            continue
+        if identity in seen:
+            if path.is_symlink():
+                left_out[LINKED_TWICE].append(below)
+            continue
+        seen.add(identity)
+        for entry in entries:
+            if entry.name.startswith("."):
+                continue
+            if not entry.is_dir():
+                if _suffix(entry.name) in suffixes:
+                    found.append(below + entry.name)
+            elif entry.name in FOLDERS_OF_SYSTEMS:
+                left_out[FOLDERS_OF_SYSTEMS[entry.name]].append(f"{below}{entry.name}/")
+            elif not is_output_folder(path / entry.name):
+                (linked if entry.is_symlink() else ahead).append(path / entry.name)
+    return found, {
+        such_as(map(one_line, names)): f"left out: {why}" for why, names in left_out.items()
+    }
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    there = path.stat()
+    return there.st_dev, there.st_ino
 
 
 def _suffix(name: str) -> str:
@@ -211,7 +291,7 @@ def _odd(name: str) -> str:
 
 def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
     try:
-        lines = image_list_path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_regular_text(image_list_path, "utf-8-sig").splitlines()
     except OSError as error:
         raise OptionError(f"{image_list_path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:

@@ -23,8 +23,14 @@ from PIL.TiffImagePlugin import TiffImageFile
 from colmap_affrect.data import ColorImage, GrayImage, Mask
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
+from colmap_affrect.project.regular_files import (
+    NotAFileError,
+    open_regular,
+    require_regular,
+)
 
 MAX_NUM_PX = 1 << 29  # of a photograph; those of the largest cameras have 400 megapixels
+MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
 ONE_AT_A_TIME = Lock()  # filters of warnings are of the process: threads would mix them up
 PNG = b"\x89PNG\r\n\x1a\n"
 READERS = {
@@ -43,10 +49,8 @@ Found = TypeVar("Found")
 
 def read_header(path: Path, read: Callable[[BinaryIO], Found]) -> Found | None:
     """Return what a function reads of a file, None if that fails in any way, or for a pipe."""
-    if not path.is_file():  # a pipe would wait for ever
-        return None
     try:
-        with ONE_AT_A_TIME, warnings.catch_warnings(), path.open("rb") as file:
+        with ONE_AT_A_TIME, warnings.catch_warnings(), open_regular(path) as file:
             warnings.simplefilter("ignore")  # Pillow warns of broken EXIF
             return read(file)
     except Exception:  # noqa: BLE001 - damaged files raise nearly anything in Pillow
@@ -96,6 +100,62 @@ def _claimed_size(file: BinaryIO) -> tuple[int, int]:
     return stored_size(opened(file))
 
 
+def why_unusable(path: Path) -> str:
+    """Say why a file should not even be opened as a photograph; empty if it may be one.
+
+    What is no regular file, claims more pixels than photographs have or is longer than any: for
+    readers that open files by their names and take what these claim.
+    """
+    try:
+        _require_photograph(path)
+        require_possible(path)
+    except ImageError as error:
+        return str(error)
+    return ""
+
+
+def _require_photograph(path: Path) -> int:
+    """Return the size of a file in bytes; ImageError for what cannot be one of a photograph."""
+    try:
+        require_regular(path)
+        num_bytes = path.stat().st_size
+    except OSError as error:
+        raise cannot_read(path, error) from error
+    if num_bytes > MAX_NUM_BYTES:
+        raise ImageError(
+            f"{path}: is {num_bytes / 1e9:.0f} GB long, and {MAX_NUM_BYTES / 1e9:.0f} are the most "
+            "that are read; shrink it"
+        )
+    return num_bytes
+
+
+def may_be_photograph(path: Path) -> bool:
+    """Return whether a regular file is there that is not longer than those of photographs."""
+    try:
+        _require_photograph(path)
+    except ImageError:
+        return False
+    return True
+
+
+def read_photograph(path: Path) -> Bytes:
+    """Return the bytes of a file, (N,) uint8; ImageError for what cannot be one of a photograph."""
+    num_bytes = _require_photograph(path)
+    data = np.empty(num_bytes, np.uint8)
+    try:
+        with open_regular(path) as file:
+            return data[: file.readinto(data.data)]
+    except OSError as error:
+        raise cannot_read(path, error) from error
+
+
+def cannot_read(path: Path, error: OSError) -> ImageError:
+    """Return the error that says why a file cannot be read."""
+    if isinstance(error, NotAFileError):
+        return ImageError(f"{path}: {error}")
+    return ImageError(f"{path}: cannot be read ({error.strerror or error})")
+
+
 def is_too_large(size: tuple[int, int] | None) -> bool:
     """Return whether a header claims more pixels than photographs have."""
     return size is not None and size[0] * size[1] > MAX_NUM_PX
@@ -134,6 +194,7 @@ FOREIGN_FORMATS = {
 TONE_PERCENTILES = (0.5, 99.5)  # black and white of a stretched photograph but for dust and glints
 MIN_TONE_RANGE = 0.5  # a photograph whose tones fill less of the range of its file is stretched
 MAX_TONE_STEP = 16  # neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
+FLOAT_RANGE = (-0.5, 2.0)  # of floats that are meant from 0 to 1: filters and highlights go beyond
 NUM_TONES = 250_000  # about so many pixels are looked at
 FRAME_FRAC = 0.1  # along each border is passed over: scans have frames and captions there
 BIG_TIFF = 43  # what files of more than 4 GiB have in the place of 42, with offsets of 64 bits
@@ -160,11 +221,9 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
 
 def tones(image: NDArray[Any]) -> tuple[float, float] | None:
     """Return what is to be black and white of an (H, W[, 3]) image, None to leave it as it is."""
-    height, width = image.shape[:2]
-    y, x = int(FRAME_FRAC * height), int(FRAME_FRAC * width)
-    inner = image[y : height - y, x : width - x]
-    step = max(1, round(math.sqrt(inner.size / NUM_TONES)))
-    low, high = np.nanpercentile(inner[::step, ::step], TONE_PERCENTILES)
+    if range_of_floats(image):
+        return None  # these fill the range anyway
+    low, high = np.nanpercentile(_sample(image), TONE_PERCENTILES)
     whole_numbers = np.issubdtype(image.dtype, np.integer)
     white = np.iinfo(image.dtype).max if whole_numbers else 1.0
     finest = 255 / MAX_TONE_STEP if whole_numbers else 0.0
@@ -173,12 +232,44 @@ def tones(image: NDArray[Any]) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
+def _sample(image: NDArray[Any]) -> NDArray[Any]:
+    """Return some pixels of an (H, W[, 3]) image, from all over it but its frame."""
+    height, width = image.shape[:2]
+    y, x = int(FRAME_FRAC * height), int(FRAME_FRAC * width)
+    inner = image[y : height - y, x : width - x]
+    step = max(1, round(math.sqrt(inner.size / NUM_TONES)))
+    return inner[::step, ::step]
+
+
+def range_of_floats(image: NDArray[Any]) -> tuple[float, float] | None:
+    """Return what is black and white of floats that are not from 0 to 1; None for all else.
+
+    Programs of measurement write floats of any range, and an image that is clipped to 0 to 1 would
+    be black or white all over.
+    """
+    if not np.issubdtype(image.dtype, np.floating):
+        return None
+    sample = _sample(image)
+    values = sample[np.isfinite(sample)]
+    if not values.size:
+        return None
+    low, high = np.percentile(values, TONE_PERCENTILES)
+    if low >= FLOAT_RANGE[0] and high <= FLOAT_RANGE[1]:
+        return None
+    return float(low), float(max(high, low + np.finfo(np.float32).eps * max(abs(low), 1.0)))
+
+
 def in_eight_bits(image: NDArray[Any], black_and_white: tuple[float, float] | None = None) -> Bytes:
-    """Return an image of 8 or 16 bits or of floats from 0 to 1 in 8 bits."""
+    """Return an image of 8 or 16 bits or of floats in 8 bits.
+
+    Floats are from 0 to 1; those of another range are stretched (:func:`range_of_floats`).
+    """
+    black_and_white = black_and_white or range_of_floats(image)
     if black_and_white:
         low, high = black_and_white
-        values = np.clip((image.astype(np.float32) - low) * (255.0 / (high - low)), 0.0, 255.0)
-        image = np.nan_to_num(values).round()
+        with np.errstate(all="ignore"):  # floats may be anything
+            values = (image.astype(np.float32) - low) * (255.0 / (high - low))
+            image = np.nan_to_num(np.clip(values, 0.0, 255.0)).round()
     elif image.dtype == np.uint16:
         image = image // np.uint16(257)
     elif image.dtype != np.uint8:
@@ -194,14 +285,13 @@ def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
 
 def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
     """Read an image, by default as gray in the type it is stored in; ImageError if it is none."""
-    if path.exists() and not path.is_file():
-        raise ImageError(f"{path}: is not a file")
     require_possible(path)
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
-    if name := foreign_format(path):
+    return decoded(read_photograph(path), path, flags)
+
+
+def decoded(data: Bytes, path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
+    """Decode the bytes of a photograph, which may change them; see :func:`decode`."""
+    if name := foreign_format(data):
         raise ImageError(
             f"{path}: is of the format {name}, which COLMAP cannot read; convert it to PNG or "
             "JPEG (colmap-affrect convert)"
@@ -216,10 +306,9 @@ def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def foreign_format(path: Path) -> str:
-    """Return the format of a file that COLMAP cannot read, whatever its suffix, else nothing."""
-    with path.open("rb") as file:
-        beginning = file.read(16)
+def foreign_format(data: Bytes) -> str:
+    """Return the format of data that COLMAP cannot read, whatever the suffix, else nothing."""
+    beginning = data[:16].tobytes()
     matching = (n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL))
     return next(matching, "")
 
@@ -256,6 +345,28 @@ def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
 def read_mask(path: Path) -> Mask:
     """Read a mask, black pixels False (COLMAP's convention); ImageError when that fails."""
     return np.asarray(decode(path) != 0)
+
+
+def alpha_mask(path: Path) -> Mask | None:
+    """Return where a photograph is not transparent, (H, W); None where it is nowhere, or all over.
+
+    Half transparent is transparent: edges are mixed with what was cut off. An alpha channel that is
+    0 all over is one that a program has left empty. ImageError when the file cannot be read.
+    """
+    if not read_header(path, _has_alpha):
+        return None
+    image = decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 3 or image.shape[2] != 4:
+        return None
+    alpha = image[:, :, 3]
+    half = np.iinfo(alpha.dtype).max / 2 if np.issubdtype(alpha.dtype, np.integer) else 0.5
+    mask = np.asarray(alpha > half)
+    return mask if mask.any() and not mask.all() else None
+
+
+def _has_alpha(file: BinaryIO) -> bool:
+    image = opened(file)
+    return image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
 
 
 def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:

@@ -12,9 +12,10 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import triangulated
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.colmap.model_files import read_given_model, write_model
+from colmap_affrect.colmap.model_files import write_model
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.interop.finished_models import read_finished_model
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.paths import PathLike, TakesPaths, as_path
@@ -68,7 +69,7 @@ def align(model_path: PathLike, output_path: PathLike, reference: Reference) -> 
     model_path, output_path = as_path(model_path), as_path(output_path)
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
-    model, origin = read_given_model(model_path), tuple[float, ...]()
+    model, origin = read_finished_model(model_path), tuple[float, ...]()
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     old = {name: image.projection_center() for name, image in images.items()}
     true, is_on_earth, marked = Places(), False, Places()

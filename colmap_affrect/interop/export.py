@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_cancellable
-from colmap_affrect.colmap.model_files import read_given_model
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.colmap.model_files import read_given_model, write_model
+from colmap_affrect.colmap.native_writes import native_writes, why_not_written
+from colmap_affrect.errors import ImageError, OptionError, StoreError
+from colmap_affrect.interop.finished_models import read_finished_model
+from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
@@ -60,7 +62,7 @@ def export(
     if image_path is not None and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
     photographs = image_path or Workspace(model_path.resolve().parent.parent).photographs()
-    source = Source(model_path, read_given_model(model_path), photographs)
+    source = Source(model_path, read_finished_model(model_path), photographs)
     chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
     names = dict.fromkeys(made for _, made in chosen.values())
     targets = [output_path / name for name in names]
@@ -73,18 +75,34 @@ def export(
 
 def _points(source: Source, folder: Path) -> Path:
     path = folder / "points3D.ply"
-    source.model.export_PLY(path)
+    with native_writes(path):
+        source.model.export_PLY(path)
     return path
 
 
 def _text(source: Source, folder: Path) -> Path:
     path = folder / "text"
     for image in source.images():
-        if not image.name or not image.name.isprintable():
-            raise OptionError(f"text: cannot hold the image name {image.name!r}; rename it")
-    path.mkdir()
-    source.model.write_text(path)
+        if why := _not_in_text(image.name):
+            raise OptionError(
+                f"text: cannot hold the image name {image.name!r} ({why}); rename the photograph, "
+                "or leave that format out (--format ply,cameras)"
+            )
+    with native_writes(path):
+        path.mkdir()
+        source.model.write_text(path)
     return path
+
+
+def _not_in_text(name: str) -> str:
+    """Say why COLMAP could not read a name back out of a file of text; empty if it can."""
+    if not name:
+        return "it is empty"
+    if name.startswith("#"):
+        return "it begins as a comment does"
+    if name.split() != [name]:
+        return "COLMAP ends names at a blank"
+    return "" if name.isprintable() else "it has characters that do not print"
 
 
 def _undistorted(source: Source, folder: Path) -> Path:
@@ -100,11 +118,10 @@ def _undistorted(source: Source, folder: Path) -> Path:
             )
         if not (photographs / image.name).is_file():
             raise ImageError(f"{photographs / image.name}: no such photograph; give --image-path")
-    run_cancellable(
-        lambda token: pycolmap.undistort_images(
-            path, source.path, photographs, cancellation_token=token
-        )
-    )
+    given = folder.parent / "model"  # a run may remove that of its folder meanwhile
+    if not given.exists():
+        write_model(source.model, given)
+    undistort(path, given, photographs)
     for image in source.images():
         if not (picture := path / "images" / image.name).is_file():
             raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
@@ -114,7 +131,10 @@ def _undistorted(source: Source, folder: Path) -> Path:
 def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
-    flat = Source(path, pycolmap.Reconstruction(path / "sparse"), None)
+    try:
+        flat = Source(path, read_given_model(path / "sparse"), None)
+    except (OptionError, StoreError) as error:  # which COLMAP does not say when it writes
+        raise why_not_written(path / "sparse", error) from error
     frames = []
     for image in flat.images():
         camera, pose = flat.model.cameras[image.camera_id], np.eye(4)
@@ -127,9 +147,10 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
             "cx": camera.principal_point_x, "cy": camera.principal_point_y,
             "w": camera.width, "h": camera.height,
         })  # fmt: skip
-    flat.model.export_PLY(path / "points3D.ply")
-    (path / "sparse" / "0").mkdir(exist_ok=True)  # where Gaussian splatting looks
-    flat.model.write(path / "sparse" / "0")
+    with native_writes(path):
+        flat.model.export_PLY(path / "points3D.ply")
+        (path / "sparse" / "0").mkdir(exist_ok=True)  # where Gaussian splatting looks
+        flat.model.write(path / "sparse" / "0")
     content = {
         "camera_model": "OPENCV", "ply_file_path": "points3D.ply", **_place(flat), "frames": frames,
     }  # fmt: skip

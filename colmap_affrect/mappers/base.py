@@ -57,7 +57,8 @@ class MappingTask:
     @property
     def colors_path(self) -> Path:
         """A folder that exists, as pycolmap needs one also where there are no photographs."""
-        return self.image_path or self.database_path.parent
+        photographs = self.image_path
+        return photographs if photographs and photographs.is_dir() else self.database_path.parent
 
     def all_given(self, options: MapperOptions) -> tuple[bool, bool]:
         """Tell whether no focal length, and no distortion, is to be refined: the user gave all."""

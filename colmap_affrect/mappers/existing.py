@@ -18,6 +18,7 @@ from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.project.paths import TakesPaths
+from colmap_affrect.project.regular_files import read_regular
 
 SAME_POSE = 1e-6  # largest difference of elements of two poses that are the same: quaternions round
 
@@ -41,7 +42,7 @@ class Extension(TakesPaths):
         """Return a sha256 of the files of the model and of how it is extended."""
         found = hashlib.sha256(str(self.refine_existing).encode())
         for path in sorted(self.model_path.glob("*.[bt][ix][nt]")):
-            found.update(path.read_bytes())
+            found.update(read_regular(path))
         return found.hexdigest()
 
 

@@ -21,6 +21,7 @@ from colmap_affrect.mappers.snapshots import with_snapshots
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
+from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import DOUBTFUL, ModelSummary
 
 
@@ -48,7 +49,7 @@ def read_summary(folder: Path) -> ModelSummary:
     again = made_again("map", folder.parent.parent)
     mend = f"if you have edited the model, copy it to a folder of its own; then {again}"
     with damage(folder / SUMMARY, mend):
-        return _KEPT.validate_json((folder / SUMMARY).read_bytes()).summary
+        return _KEPT.validate_json(read_regular(folder / SUMMARY)).summary
 
 
 def read_summaries(sparse_path: Path) -> list[ModelSummary]:

@@ -1,6 +1,7 @@
 """Lists of pairs: all, by sequence or place, the most similar; their order, and their files."""
 
 import difflib
+import io
 import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -15,6 +16,7 @@ from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Bools
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.regular_files import open_regular
 
 Pair = tuple[str, str]  # names of two photographs, in order
 
@@ -166,7 +168,7 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
                 problems.append((count, line.strip()))
 
     try:
-        with path.open(encoding="utf-8-sig") as file:
+        with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
             found = np.fromiter(codes(file), np.int64)
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror})") from error

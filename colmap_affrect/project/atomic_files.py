@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from colmap_affrect.errors import WorkspaceError
+from colmap_affrect.project.regular_files import open_regular, read_regular
 
 logger = logging.getLogger(__name__)
 
@@ -87,10 +88,11 @@ def _sync_folder(path: Path) -> None:
             os.close(number)
 
 
-def require_space(path: Path, num_bytes: int) -> None:
+def require_space(path: Path, num_bytes: int, named: Path | None = None) -> None:
     """Make sure that there is room for a file of so many bytes beside ``path``.
 
-    For files that are written by libraries which do not survive a full disk: else WorkspaceError.
+    For files that are written by libraries which do not survive a full disk: else WorkspaceError,
+    which may name another file for which the room is needed.
     """
     try:
         if shutil.disk_usage(path.parent).free < num_bytes:
@@ -98,7 +100,7 @@ def require_space(path: Path, num_bytes: int) -> None:
         with _new_beside(path) as (file, _), suppress(AttributeError):  # not on all systems
             os.posix_fallocate(file.fileno(), 0, num_bytes)  # which a quota may not allow
     except OSError as error:
-        raise cannot_write(path, error) from error
+        raise cannot_write(named or path, error) from error
 
 
 def cannot_write(path: Path, error: Exception) -> WorkspaceError:
@@ -146,7 +148,7 @@ class FileTransaction(io.RawIOBase):
         super().__init__()
         apply_journal(path)
         self._path = path
-        self._stored = path.open("rb") if path.exists() else io.BytesIO()
+        self._stored = open_regular(path) if path.exists() else io.BytesIO()
         self._kept_size = self._size = self._stored.seek(0, os.SEEK_END)
         self._position = 0
         self._pages: dict[int, bytearray] = {}
@@ -234,7 +236,9 @@ def apply_journal(path: Path) -> None:
     journal = journal_of(path)
     if not journal.exists():
         return
-    content, digest = (whole := journal.read_bytes())[:-SHA256_BYTES], whole[-SHA256_BYTES:]
+    whole = read_regular(journal)
+    content = whole[:-SHA256_BYTES]
+    digest = whole[-SHA256_BYTES:]
     kept_size = size = sys.maxsize
     if hashlib.sha256(content).digest() == digest and content.startswith(JOURNAL_MARK):
         _, kept_size, size = JOURNAL_HEADER.unpack_from(content)

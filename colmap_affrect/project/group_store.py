@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.errors import StoreError, damage, made_again
 from colmap_affrect.project import atomic_files
+from colmap_affrect.project.regular_files import require_regular
 
 CHECKSUM = "crc32"  # of the values of a dataset, its attribute
 
@@ -50,6 +51,7 @@ class GroupStore:
         mend = f"unless another program has it open, {made_again(self.stage, self.path.parent)}"
         with damage(self.path, mend):
             atomic_files.apply_journal(self.path)
+            require_regular(self.path)
             with h5py.File(where, mode) as file:
                 if mode == "w":
                     file.attrs.update(format=self.format, pixel_origin="center")

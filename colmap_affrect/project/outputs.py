@@ -4,6 +4,7 @@ What is made stands in a hidden folder beside its place until all of it is whole
 then. So there is never half of it under a name of the user's, also when the program is killed.
 """
 
+import hashlib
 import os
 import shutil
 from collections.abc import Collection, Iterable, Iterator
@@ -15,10 +16,14 @@ from filelock import FileLock, Timeout
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.project.atomic_files import cannot_write, require_space, uninterrupted
+from colmap_affrect.project.regular_files import NotAFileError, open_regular, require_regular
 
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
+RESULTS = "results"  # folder of these in such a folder, whose names are the user's
 LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works there
 MARKS = {"config.toml": b"format_version", "run.log": b"colmap-affrect"}  # files of ours begin so
+LONGEST_NAME = 255  # bytes that file systems take
+MAX_NAME_BYTES = LONGEST_NAME - 35  # there has to be room for what is beside it meanwhile
 SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
 BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}  # in folders that look empty
@@ -27,7 +32,7 @@ OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}  # in folders that look 
 def is_output_folder(path: Path) -> bool:
     """Return whether this program has written its record or its log into a folder."""
     for name, mark in MARKS.items():
-        with suppress(OSError), (path / name).open("rb") as file:
+        with suppress(OSError), open_regular(path / name) as file:
             if mark in file.read(BYTES_OF_MARK):
                 return True
     return False
@@ -69,6 +74,15 @@ def refuse_photographs(target: Path, names: Collection[str]) -> None:
                 )
 
 
+def refuse_what_waits(path: Path) -> None:
+    """Refuse a pipe, a socket or a device where a file of ours should be; OptionError."""
+    try:
+        if not path.is_dir():
+            require_regular(path)
+    except NotAFileError as error:
+        raise OptionError(f"{path}: {error}; remove it, or give another folder") from error
+
+
 @contextmanager
 def new_results(
     *targets: Path, names: Collection[str] = (), replaces: bool = False
@@ -93,10 +107,15 @@ def new_results(
     with ExitStack() as stack:
         parents = dict.fromkeys(target.parent for target in targets)
         folders = {parent: stack.enter_context(temporary_folder(parent)) for parent in parents}
-        made = [folders[target.parent] / target.name for target in targets]
+        for temporary in folders.values():  # what is beside it may have any name
+            try:
+                (temporary / RESULTS).mkdir()
+            except OSError as error:
+                raise cannot_write(temporary, error) from error
+        made = [folders[target.parent] / RESULTS / target.name for target in targets]
         yield made
-        for temporary in folders.values():  # native writers say nothing of a full disk
-            require_space(temporary / "rest", SPARE_BYTES)
+        for target in targets:  # native writers say nothing of a full disk
+            require_space(folders[target.parent] / "rest", SPARE_BYTES, target)
         with uninterrupted():
             for target in () if replaces else targets:  # somebody may have made one meanwhile
                 _refuse_existing(target)
@@ -143,3 +162,18 @@ def remove_own(paths: Iterable[Path]) -> None:
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
+
+
+def fitting_name(stem: str, suffix: str, most: int = MAX_NAME_BYTES) -> str:
+    """Return the name of a file; where file systems take none so long, its beginning and a digest.
+
+    >>> fitting_name("a", ".png"), len(fitting_name("b" * 300, ".png"))
+    ('a.png', 220)
+    """
+    name = f"{stem}{suffix}"
+    encoded = os.fsencode(name)
+    if len(encoded) <= most:
+        return name
+    end = f"-{hashlib.sha256(encoded).hexdigest()[:8]}{suffix}"
+    start = os.fsencode(stem)[: most - len(os.fsencode(end))]
+    return f"{start.decode('utf-8', 'ignore')}{end}"

@@ -18,6 +18,12 @@ def as_path(given: PathLike) -> Path:
         raise OptionError(f"{given!r}: give a path as str or os.PathLike, not {kind}") from error
 
 
+def resolved(path: Path) -> Path:
+    """Return a path without links; that of a pipe, which has no other name, as it is."""
+    whole = path.resolve()
+    return path.absolute() if path.exists() and not whole.exists() else whole
+
+
 class TakesPaths:
     """Base of dataclasses whose fields of paths may be given as text."""
 

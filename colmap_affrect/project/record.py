@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 from colmap_affrect.errors import WorkspaceError, damage
 from colmap_affrect.options import flat
+from colmap_affrect.project.regular_files import read_regular_text, sha256_of_regular
 
 
 class Content(NamedTuple):
@@ -33,8 +34,7 @@ def file_sha256(path: Path) -> str:
 
 @lru_cache(maxsize=64)
 def _sha256(path: Path, _: str) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256_of_regular(path)
 
 
 def _stamp(path: Path) -> str:
@@ -99,7 +99,7 @@ def read_record(path: Path) -> dict[str, Any]:
         return {}
     other = f"use another --output-path than {path.parent}"
     with damage(path, f"restore it, or {other}", WorkspaceError):
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(read_regular_text(path))
         if values.pop("format_version", None) != FORMAT_VERSION:
             raise WorkspaceError(
                 f"{path.parent}: was made by another version of colmap-affrect, which cannot be "

@@ -1,11 +1,24 @@
 """Tables that the user gives: CSV files with a header."""
 
 import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import suggestion
+from colmap_affrect.project.regular_files import read_regular_text
+
+
+def as_row(cells: Sequence[str]) -> str:
+    """Return cells as a row of a table: joined by commas, in quotes where they hold one.
+
+    >>> as_row(["a.png", "b,c.png"])
+    'a.png,"b,c.png"'
+    """
+    row = io.StringIO()
+    csv.writer(row, lineterminator="").writerow(cells)
+    return row.getvalue()
 
 
 def read_table(
@@ -18,7 +31,9 @@ def read_table(
     leave that out: then its first line names no column.
     """
     try:
-        reader = csv.reader(path.read_text("utf-8-sig").splitlines(), skipinitialspace=True)
+        reader = csv.reader(
+            read_regular_text(path, "utf-8-sig").splitlines(), skipinitialspace=True
+        )
         lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error

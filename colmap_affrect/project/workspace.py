@@ -4,7 +4,7 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -84,6 +84,14 @@ class Workspace:
         made._write_record({**self.recorded(), "begun": self._begun_before("verify")})
         return made
 
+    def refuse_run(self) -> None:
+        """Refuse the folder of a run for results of another kind; OptionError."""
+        if self.config.exists():
+            raise OptionError(
+                f"{self.path}: has the results of a run, some of which would be replaced; use "
+                "another --output-path"
+            )
+
     def require_own(self, photographs: Path | None = None) -> None:
         """Refuse a folder that is not empty and not ours, and links that would be followed.
 
@@ -98,6 +106,7 @@ class Workspace:
             for path in paths:
                 if path.name.partition(".")[0] in OWN_STEMS or path.name == outputs.LOCK:
                     outputs.refuse_link(path)
+                    outputs.refuse_what_waits(path)
             foreign = [path.name for path in paths if not _may_be_ours(path)]
             if foreign and not outputs.is_output_folder(self.path):
                 raise OptionError(
@@ -140,6 +149,30 @@ class Workspace:
         self._record = None
         with lock:
             yield self
+
+    @contextmanager
+    def locked_if_possible(self) -> Iterator[None]:
+        """Keep other runs out of a folder that is only read; on a read-only disk there are none."""
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(self.locked())
+            except WorkspaceError as error:
+                if isinstance(error.__cause__, Timeout):
+                    raise
+            yield
+
+    def is_in_use(self) -> bool:
+        """Return whether another process works in the folder just now."""
+        lock = self.path / outputs.LOCK
+        if not lock.is_file():
+            return False
+        try:
+            with FileLock(lock).acquire(timeout=0):
+                return False
+        except Timeout:
+            return True
+        except OSError:  # of a disk that is read-only: nobody works there
+            return False
 
     def recorded(self) -> Mapping[str, Any]:
         """Return the record, see :func:`~colmap_affrect.project.record.read_record`."""

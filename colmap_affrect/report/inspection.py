@@ -19,7 +19,7 @@ from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.project.atomic_files import replace_bytes
-from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.outputs import fitting_name, new_results
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.one_image import ImageExtractor
 
@@ -199,7 +199,8 @@ def inspect_image(
     workspace.begin()
     lines = []
     suffixes = [f"-level-{number}" if number else "" for number in numbers]
-    sheets = [output_path / f"{path.stem}-inspection{suffix}.png" for suffix in suffixes]
+    ends = [f"-inspection{suffix}.png" for suffix in suffixes]
+    sheets = [output_path / fitting_name(path.stem, end) for end in ends]
     with new_results(*sheets, replaces=True) as new_sheets:
         for number, photograph, sheet in zip(numbers, read, new_sheets, strict=True):
             level = inspect_level(extractor, photograph, number)

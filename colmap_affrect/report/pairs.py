@@ -28,8 +28,9 @@ from colmap_affrect.geometry.conventions import pixel_from_colmap, resized_from_
 from colmap_affrect.images.reading import read_color, shrink_to
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_bytes
-from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.outputs import fitting_name, new_results
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport
+from colmap_affrect.project.tables import as_row
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import inspection as sheets
 from colmap_affrect.report.pictures import Picture
@@ -162,12 +163,13 @@ def draw_pair(
     with TemporaryDirectory() as folder:
         copy = Path(folder) / "database.db"
         copy_database(workspace.database, copy, FATAL)
-        with workspace.locked() if is_run else nullcontext():
+        with workspace.locked_if_possible() if is_run else nullcontext():
             pair = PairReader(copy, Context(workspace)).read(names)
     if not (image_path := image_path or workspace.photographs()):
         raise OptionError("--image-path: give the folder of the photographs")
     stem = "--".join(name.replace("/", "-").rpartition(".")[0] for name in names)
-    target = picture_path or (path / "pairs" / f"{stem}.png" if is_run else Path())
+    usual = path / "pairs" / fitting_name(stem, ".png") if is_run else Path()
+    target = picture_path or usual
     if target.suffix != ".png":
         raise OptionError("--output-path: give the name of a new file that ends in .png")
     text = f"{names[0]} and {names[1]}: {pair.text}"
@@ -196,7 +198,7 @@ def pairs_of_page(
     photograph = cache(lambda name: read_color(folder / name, SIDE_PX))
     for names, why in _chosen(reader, report, verified).items():
         with suppress(AffrectError):  # unreadable, or rejected by hand and never matched
-            pair, option = reader.read(names), shlex.join(["--reject-pair", ",".join(names)])
+            pair, option = reader.read(names), shlex.join(["--reject-pair", as_row(names)])
             drawn = draw_matches(pair, [photograph(name) for name in names])
             one = {"names": names, "why": why, "text": pair.text, "option": option}
             found.append({**one, "picture": Picture.of(shrink_to(drawn, 2 * SIDE_PX))})

@@ -15,6 +15,7 @@ from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTE
 from colmap_affrect.options import EFFORT_NAMES
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import Advice, MatchedAgain, ModelSummary
+from colmap_affrect.project.tables import as_row
 from colmap_affrect.stages.context import Context, Inputs
 
 STRONGEST = "default"  # of the recipes
@@ -125,7 +126,7 @@ def _of_bridges(case: _Case) -> list[Advice]:
     for name, bridge in case.model.bridges.items():
         if name in case.model.doubtful:
             why = f"if the matches of {name} and {bridge.by} are wrong by eye, leave them out"
-            command = _again(case.context, "--reject-pair", f"{name},{bridge.by}")
+            command = _again(case.context, "--reject-pair", as_row([name, bridge.by]))
             found.append(Advice(why, command))
     return found
 

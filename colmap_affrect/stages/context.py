@@ -30,7 +30,7 @@ from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.outputs import database_files
-from colmap_affrect.project.paths import TakesPaths
+from colmap_affrect.project.paths import TakesPaths, resolved
 from colmap_affrect.project.record import Content, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
@@ -58,7 +58,7 @@ class Inputs(Options):
     def of(cls, image_path: Path, **given: Any) -> Self:
         """Build from paths, which are made absolute, and options; None is what is not given."""
         values: dict[str, Any] = {
-            key: str(value.resolve()) if isinstance(value, Path) else value
+            key: str(resolved(value)) if isinstance(value, Path) else value
             for key, value in {"image_path": image_path, **given}.items()
             if value is not None
         }

@@ -99,7 +99,9 @@ def _extract_missing(
 ) -> dict[str, str]:
     """Extract images one by one; return why some cannot be used, and add to the warnings."""
     store, images = context.features, [(name, 0) for name in names]
-    failures, faded = dict[str, str](), list[str]()
+    failures = dict[str, str]()
+    faded = list[str]()
+    white = list[str]()
     with (
         context.progress.stage("extract", len(names), "images") as advance,
         closing(extract_images(context, inputs, extractor, images)) as found_images,
@@ -115,6 +117,8 @@ def _extract_missing(
                     warnings[name] = found.warning
                 if found.stretched:
                     faded.append(name)
+                if found.mask_is_white:
+                    white.append(name)
                 store.write(name, found.features, found.image_size, contents[name])
             advance(1)
     if faded:
@@ -123,6 +127,12 @@ def _extract_missing(
             "was stretched (--set stretch_contrast=false leaves it as it is)"
         )
         logger.warning("contrast: %s", warnings["contrast"])
+    if white:
+        warnings["white masks"] = (
+            f"{len(white)} masks are white all over, such as that of {one_line(white[0])}, and "
+            "leave out nothing; black is where features are not wanted"
+        )
+        logger.warning("white masks: %s", warnings["white masks"])
     return failures
 
 

@@ -19,6 +19,7 @@ from colmap_affrect.errors import AffrectError
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.record import stamp_of
+from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation
@@ -84,7 +85,7 @@ def _why_lost(workspace: Workspace) -> str:
         return "is missing" if "verify" in begun else ""
     sealed = list[str]()
     with suppress(OSError, UnicodeDecodeError):
-        sealed = workspace.seal.read_text(encoding="utf-8").splitlines()
+        sealed = read_regular_text(workspace.seal).splitlines()
     if not begun or _stamp(path) in sealed:
         return ""
     try:

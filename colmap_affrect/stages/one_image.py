@@ -38,6 +38,7 @@ class ExtractedImage:
     image_size: tuple[int, int]  # (width, height) of the stored image in px
     warning: str = ""  # why it was not rectified or not on the GPU; empty if all went well
     stretched: bool = False  # whether its contrast was low and was stretched
+    mask_is_white: bool = False  # whether it has a mask, which leaves out nothing
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class ImageExtractor:
                 f"{path}: is {size[0]} x {size[1]} px, and its camera in the database "
                 f"{expected[0]} x {expected[1]} px; give the images that the database is of"
             )
-        return found
+        return replace(found, mask_is_white=mask is not None and bool(mask.all()))
 
     def extract_file(
         self,

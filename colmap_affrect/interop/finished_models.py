@@ -1,0 +1,26 @@
+"""Models of runs that may be at work: what a run is about to replace is not called damaged."""
+
+from pathlib import Path
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.errors import OptionError, StoreError, WorkspaceError
+from colmap_affrect.project.workspace import Workspace
+
+
+def read_finished_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a model of a run or of another program.
+
+    Raises WorkspaceError where a run has taken its model away to write the next one, and what
+    :func:`~colmap_affrect.colmap.model_files.read_given_model` raises.
+    """
+    try:
+        return read_given_model(folder)
+    except (OptionError, StoreError):
+        workspace = Workspace(folder.resolve().parent.parent)
+        if workspace.is_in_use():
+            raise WorkspaceError(
+                f"{folder}: another colmap-affrect is writing this model; wait for it, and run the "
+                "same command again"
+            ) from None
+    return read_given_model(folder)  # the run may have ended just now
