@@ -21,6 +21,7 @@ from colmap_affrect.interop.pycolmap_api import match_spatial as match_spatial
 from colmap_affrect.interop.pycolmap_api import verify as verify
 from colmap_affrect.interop.pycolmap_api import verify_matches as verify_matches
 from colmap_affrect.mappers.existing import Extension as Extension
+from colmap_affrect.mappers.global_mapper import GlobalOptions as GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalOptions as IncrementalOptions
 from colmap_affrect.mappers.sparse import SparseOptions as SparseOptions
 from colmap_affrect.matchers.nearest import NearestOptions as NearestOptions

@@ -109,13 +109,12 @@ def run(
     recipe, mapper = options.recipe, MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
+    _check_extension(options.extend, mapper, output_path, overwrite=overwrite)
     _check_by_hand(options.by_hand, names, mapper)
     forecast = Forecast(len(names), _num_pairs(names, options.pairs))
     workspace = Workspace(output_path)
     context = _context_of(workspace, options, executor, replace(progress, forecast=forecast))
     if options.extend:
-        if overwrite:
-            options.extend.refuse_discarding(output_path)
         existing_names(options.extend.model_path, names)
     recipe.extraction.check_depth()
     resolve(recipe.required_weights, options.resources.weights_path, progress=progress)
@@ -163,6 +162,18 @@ def _check_by_hand(by_hand: ByHand, names: Collection[str], mapper: Mapper) -> M
     return marks
 
 
+def _check_extension(
+    extend: Extension | None, mapper: Mapper, output_path: Path, *, overwrite: bool
+) -> None:
+    """Refuse a model that the mapper cannot extend, or that would be discarded before."""
+    if not extend:
+        return
+    if not mapper.options.can_extend:
+        raise OptionError(f"--extend: the {mapper.options.name} mapper cannot; use --mapper sparse")
+    if overwrite:
+        extend.refuse_discarding(output_path)
+
+
 def _num_pairs(names: Sequence[str], options: PairOptions) -> int:
     """Return about how many pairs there will be."""
     if options.match_list_path:
@@ -193,9 +204,8 @@ def map_from_database(
     database_path, output_path = as_path(database_path), as_path(output_path)
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
     schema_version(database_path)  # refuses what is no database before anything is made
+    _check_extension(extend, mapper, output_path, overwrite=overwrite)
     if extend:
-        if overwrite:
-            extend.refuse_discarding(output_path)
         read_given_model(extend.model_path, "--extend ")
     _check_by_hand(by_hand, read_names(database_path), mapper)
     context = Context(Workspace(output_path), progress=progress, by_hand=by_hand)
@@ -220,8 +230,7 @@ def map_and_report(
     if not workspace.is_foreign and (gone := set(context.features.names()) - set(names)):
         path = context.inputs.image_path
         raise ImageError(f"{path}: {min(gone)} has features, and is gone; run extract again")
-    if extend and overwrite:
-        extend.refuse_discarding(workspace.path)
+    _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
     marks = _check_by_hand(context.by_hand, names, mapper)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)

@@ -145,7 +145,7 @@ FLAGS: dict[str, Settings] = {
     "--preset": _value("NAME", "options of two-view geometry and mapping: ours for few "
         "photographs, or COLMAP's defaults (default: sparse)", choices=PRESETS),
     "--mapper": _value("NAME", "sparse (ours: adjustments that know what is known of the cameras), "
-        "or COLMAP's incremental or global (default: sparse)"),
+        "or COLMAP's incremental or global, in one thread (default: sparse)"),
     "--mapper-options": _value("KEY=VALUE", "options of pycolmap's IncrementalPipelineOptions or "
         "GlobalPipelineOptions, e.g. ba_refine_principal_point=true "
         "mapper.abs_pose_min_num_inliers=10; they win over the preset. With num_threads other "

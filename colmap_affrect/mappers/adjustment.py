@@ -29,6 +29,10 @@ UNKNOWN_SIGMA = 1e6  # of parameters that have no prior
 DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one
 MIN_LONG_TRACKS = 100  # of three images, that each image needs to do without tracks of two
 FAST, MEDIUM, FINAL = 15, 50, 300  # iterations on the way, of models to compare, and at last
+FIRST_STEPS = 3  # of an adjustment: they say nothing of those that follow
+SMALL_STEP, NUM_SMALL = 0.001, 3
+"""Steps in a row that bring less than this part of what the cost is above another one: the rest
+changes that by less than other numbers of iterations do, four per cent."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,46 @@ class FocalPrior:
         if not self.sigma:
             return 0.0
         return 0.5 * (math.log(max(focal_px, 1e-9) / self.focal_px) / self.sigma) ** 2
+
+
+class Settled(pyceres.IterationCallback):  # type: ignore[misc]
+    """Ends an adjustment once it is clear how far its cost stays above that of another one.
+
+    That is so where the excess hardly shrinks any more, and where even all iterations that are left
+    would not bring the cost down to ``enough`` times the other one.
+    """
+
+    def __init__(self, other_cost: float, enough: float, max_iterations: int) -> None:
+        """Begin.
+
+        Args:
+            other_cost: what the cost is compared with, in nats.
+            enough: factor from which on it does not matter how much higher the cost is.
+            max_iterations: of the adjustment.
+        """
+        super().__init__()
+        self.other_cost = other_cost
+        self.enough = enough
+        self.max_iterations = max_iterations
+        self.noise_px = 1.0  # by which the solver's costs are scaled; an adjuster says it
+        self._num_small = 0  # steps in a row that brought little
+
+    def __call__(self, step: Any) -> Any:
+        """See Ceres' IterationCallback."""
+        is_settled = step.iteration >= FIRST_STEPS and self._is_settled(step)
+        types = pyceres.CallbackReturnType
+        return types.SOLVER_TERMINATE_SUCCESSFULLY if is_settled else types.SOLVER_CONTINUE
+
+    def _is_settled(self, step: Any) -> bool:
+        if not step.step_is_successful:
+            return False
+        cost = step.cost / self.noise_px**2
+        change = step.cost_change / self.noise_px**2
+        excess = cost - self.other_cost
+        self._num_small = self._num_small + 1 if change <= SMALL_STEP * excess else 0
+        num_left = max(0, self.max_iterations - step.iteration)
+        is_enough = cost - num_left * change >= self.enough * self.other_cost
+        return is_enough or self._num_small >= NUM_SMALL
 
 
 def priors_of(
@@ -85,10 +129,12 @@ class Adjuster:
         model: pycolmap.Reconstruction,
         max_iterations: int,
         image_ids: Iterable[int] | None = None,
+        settled: Settled | None = None,
     ) -> float:
         """Adjust poses, points and cameras in place; return the cost, infinite if that fails.
 
         Of some images only, the others stay, and the cameras that they share. The cost is in nats.
+        ``settled`` may end it before.
         """
         self.tie_points.observe(model)
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
@@ -125,6 +171,9 @@ class Adjuster:
         kinds = pyceres.LinearSolverType
         is_small = len(images) <= DENSE_LIMIT
         solver.linear_solver_type = kinds.DENSE_SCHUR if is_small else kinds.SPARSE_SCHUR
+        if settled:
+            settled.noise_px = self.noise_px
+            solver.callbacks = [settled]
         summary = pyceres.SolverSummary()
         pyceres.solve(solver, problem, summary)
         model.update_point_3d_errors()

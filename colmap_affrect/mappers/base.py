@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol
 
 from pydantic import Field
 
@@ -34,6 +34,7 @@ class MapperOptions(PartOptions, PresetOptions):
     mapper_options: dict[str, Any] = Field(default_factory=dict)
     """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
     over those above."""
+    can_extend: ClassVar[bool] = True  # register images into a finished model
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +113,7 @@ MAPPERS: Registry[Mapper] = Registry(
     built_in={
         "sparse": "colmap_affrect.mappers.sparse:SparseMapper",
         "incremental": "colmap_affrect.mappers.incremental:IncrementalMapper",
+        "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },
     default="sparse",
 )

@@ -26,6 +26,7 @@ from colmap_affrect.mappers.adjustment import (
     NOISE_PX,
     Adjuster,
     FocalPrior,
+    Settled,
     priors_of,
 )
 from colmap_affrect.mappers.base import MappedModel, MappingTask
@@ -47,6 +48,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 FREE_SIGMA = 1.0  # of the logarithm of a focal length that is given, where it is freed
 MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing
+MAX_GROWTH = 1.0  # as of known focal lengths: more makes no photograph surer
 MIN_TOLD = 0.03  # of it where a model tells a focal length: of parts of photographs it is 0.15
 MIN_MOVE = 0.1  # of the logarithm of a given focal length that is told from another
 NUM_ITERATIONS = 100  # of a trial: three times as many change growths by 4 % at most
@@ -117,7 +119,7 @@ TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
         lambda m: f"only {m.num_three} of its points are seen by two other photographs",
     ),
     "focal length": Term(
-        lambda m: math.log(min(max(m.focal_growth, MIN_GROWTH), 1.0)),
+        lambda m: math.log(min(max(m.focal_growth, MIN_GROWTH), MAX_GROWTH)),
         lambda _: f"{FOCAL_UNKNOWN}, and the place of the camera depends on that",
     ),
     "given focal length": Term(
@@ -322,7 +324,9 @@ def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int
             trial = pycolmap.Reconstruction(sparse)
             for camera in map(trial.camera, keys):
                 camera.params[list(camera.focal_length_idxs())] *= factor
-            least = min(least, held.adjust(trial, NUM_ITERATIONS) / max(cost, 1e-9))
+            settled = Settled(max(cost, 1e-9), 1.0 + MAX_GROWTH, NUM_ITERATIONS)
+            grown = held.adjust(trial, NUM_ITERATIONS, settled=settled)
+            least = min(least, grown / max(cost, 1e-9))
             if least - 1.0 <= MIN_GROWTH:
                 break
         return least - 1.0

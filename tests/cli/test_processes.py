@@ -59,17 +59,24 @@ def test_interrupt_ends_with_130_and_a_later_run_completes(
     assert done.stdout.startswith("registered  3 of 3 images")
 
 
-ENDLESS = ["ba_global_max_refinements=1000000000", "ba_global_max_refinement_change=0"]
+ENDLESS = {
+    "incremental": [
+        "ba_global_max_refinements=1000000000", "ba_global_max_refinement_change=0",
+    ],
+    "global": ["max_num_irls_iterations=1000000000", "irls_step_convergence_threshold=-1"],
+}  # fmt: skip
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
-    verified: Path, tmp_path: Path
+    verified: Path, tmp_path: Path, mapper: str
 ) -> None:
     out = Path(shutil.copytree(verified, tmp_path / "out"))
-    arguments = ["map", "--output-path", str(out), "--mapper", "incremental", "--overwrite"]
-    with start(*arguments, "--mapper-options", *ENDLESS) as process:
-        assert process.stderr.readline() == "map: 2/3 images\n"
+    arguments = ["map", "--output-path", str(out), "--mapper", mapper, "--overwrite"]
+    with start(*arguments, "--mapper-options", *ENDLESS[mapper]) as process:
+        if mapper == "incremental":
+            assert process.stderr.readline() == "map: 2/3 images\n"
         while not (out / "sparse.partial" / "raw").exists():
             assert process.poll() is None, process.stderr.read()
             time.sleep(0.01)
@@ -82,7 +89,7 @@ def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
     done = run_in_process_of_its_own(*arguments, "-q")
     assert (done.code, done.stderr) == (0, [])
     assert done.stdout.startswith("registered  3 of 3 images\n")
-    assert "preset      sparse, incremental mapper\n" in done.stdout
+    assert f"preset      sparse, {mapper} mapper\n" in done.stdout
 
 
 AS_PROCESS = """

@@ -1,22 +1,35 @@
-"""Mapping: what is passed on to pycolmap, its two mappers, several models, and interruptions."""
+"""Mapping: what is passed on to pycolmap, its mappers, several models, and interruptions."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import pytest
-from mapping_tasks import NOTHING_KNOWN, SEED, mapper_of, synthesize, task_with_given_cameras
+from mapping_tasks import (
+    NOTHING_KNOWN,
+    SEED,
+    WHOLE,
+    mapper_of,
+    synthesize,
+    task_with_given_cameras,
+)
 from small_scene import NAMES, write_photographs
 from verified import verified
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers.base import MAPPERS, Mapper
+from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
+from colmap_affrect.mappers.existing import Extension
+from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
-from colmap_affrect.pipeline import map_and_report
+from colmap_affrect.pipeline import map_and_report, map_from_database
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
@@ -50,14 +63,75 @@ def reconstruct(path: Path, mapper: Mapper) -> tuple[list[ModelSummary], int]:
     return found, sum(shown)
 
 
-def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("incremental", "ba_global_function_tolerance"), ("global", "function_tolerance")],
+)
+def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(
+    tmp_path: Path, name: str, key: str
+) -> None:
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=3, num_points3D=150)
-    wrong = mapper_of("incremental", mapper_options={"ba_global_function_tolerance": -1})
-    with pytest.raises(AffrectError, match=r"incremental mapper failed: .*tolerance") as error:
+    wrong = mapper_of(name, mapper_options={key: -1})
+    with pytest.raises(AffrectError, match=rf"{name} mapper failed: .*tolerance") as error:
         reconstruct(path, wrong)
     assert "\n" not in str(error.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
+
+
+def test_global_mapper_registers_all_images_in_place_and_repeatably(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path, num_rigs=5, num_points3D=60)
+    files = []
+    for _ in range(2):
+        (model,), num_shown = reconstruct(path, mapper_of("global"))
+        assert len(model.registered_names) == num_shown == 5
+        assert min(model.probabilities.values()) > 0.9  # judged as all models are
+        files.append((tmp_path / "sparse" / "0" / "images.bin").read_bytes())
+    assert files[0] == files[1]
+    found = read_poses(tmp_path / "sparse" / "0")
+    true = model_poses(truth)
+    for first, second in combinations(sorted(found), 2):
+        estimated = relative_pose(found[first], found[second])
+        errors_deg = pose_errors(estimated, relative_pose(true[first], true[second]))
+        assert max(errors_deg) < 0.1
+
+
+def test_global_mapper_counts_tracks_of_two_images_by_our_preset_only(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=2, num_points3D=120)
+    (model,), num_shown = reconstruct(path, mapper_of("global"))
+    assert len(model.registered_names) == num_shown == 2
+    assert reconstruct(path, GlobalMapper(GlobalOptions.preset("colmap"))) == ([], 0)
+    assert list((tmp_path / "sparse").iterdir()) == []
+
+
+def test_global_mapper_keeps_one_given_camera_among_others(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=4, num_points3D=60)
+    given = replace(WHOLE, focal_px=1290.0)
+    with open_database(path) as database:
+        camera = database.read_camera(2)
+        params = camera.params
+        params[0] = 1290.0
+        camera.params = params
+        database.update_camera(camera)
+    task = MappingTask(path, None, cameras={2: given})
+    (model,) = map_database(mapper_of("global"), task, tmp_path / "sparse", lambda _: None)
+    assert len(model.registered_names) == 4
+    cameras = pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras
+    assert cameras[2].params.tolist() == params.tolist()
+    assert abs(cameras[1].params[0] - 1280.0) < 10.0
+
+
+def test_mapper_that_cannot_extend_says_so_before_anything_is_made(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=2, num_points3D=60)
+    with pytest.raises(OptionError, match=r"the global mapper cannot; use .*mapper sparse"):
+        map_from_database(
+            path, tmp_path / "out", mapping=GlobalOptions(), extend=Extension(tmp_path / "model")
+        )
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])

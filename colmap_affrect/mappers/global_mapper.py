@@ -1,0 +1,125 @@
+"""COLMAP's global mapper: all rotations first, then all positions, then one adjustment."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cancellable import run_cancellable
+from colmap_affrect.colmap.database import cameras_of_images, open_database
+from colmap_affrect.colmap.native_options import Plain, resolve, set_values
+from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, priors_of
+from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
+
+FLAG = "--mapper-options"
+TRACK_LENGTHS = (
+    "mapper.track_min_num_views_per_track",
+    "mapper.global_positioning.min_num_view_per_track",
+    "mapper.bundle_adjustment.min_track_length",
+)
+"""COLMAP's 3 leaves out the tracks of two images, of which sparse sets have most."""
+SEEDED_SECTIONS = (
+    "",
+    "mapper.",
+    "mapper.rotation_averaging.",
+    "mapper.global_positioning.",
+    "mapper.retriangulation.",
+)
+THREADED_SECTIONS = ("", "mapper.", "mapper.bundle_adjustment.ceres.solver_options.")
+
+
+class GlobalOptions(MapperOptions):
+    """Global mapping."""
+
+    name: Literal["global"] = "global"
+    can_extend: ClassVar[bool] = False
+
+    COLMAP: ClassVar[Mapping[str, Any]] = {
+        "ignore_two_view_tracks": True,
+        "min_model_size": 3,
+        "keep_given_intrinsics": False,
+    }
+
+
+class GlobalMapper:
+    """COLMAP's, in one thread: with several threads results vary from run to run.
+
+    Tracks of two images count in all steps or in none: triangulated at the end only, they would
+    make points that bundle adjustment has not seen. COLMAP refines all cameras or none, so those
+    that are to stay get their parameters back, and the model is adjusted to them.
+    """
+
+    Options: ClassVar[type[GlobalOptions]] = GlobalOptions
+
+    def __init__(self, options: GlobalOptions) -> None:
+        """Check the options for pycolmap."""
+        native = pycolmap.GlobalPipelineOptions()
+        resolved = resolve(native, options.mapper_options, FLAG)
+        self.options = options.changed(mapper_options=resolved)
+
+    def map(
+        self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
+    ) -> list[MappedModel]:
+        """See :class:`colmap_affrect.mappers.base.Mapper`; all images register at once."""
+        if task.extend:
+            raise OptionError("--extend: the global mapper cannot; use --mapper sparse")
+        native = self.native(task, random_seed)
+
+        def call(_: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
+            found = pycolmap.global_mapping(
+                task.database_path, task.colors_path, output_path, options=native
+            )
+            return list(found.values())
+
+        try:
+            models = run_cancellable(call, task.cancellation)
+        except (RuntimeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise AffrectError(f"COLMAP's global mapper failed: {reason}") from error
+        for model in models:
+            self._hold_cameras(model, task, native.mapper.bundle_adjustment)
+        show(max((model.num_reg_images() for model in models), default=0))
+        return [MappedModel(model) for model in models]
+
+    def native(self, task: MappingTask, random_seed: int) -> pycolmap.GlobalPipelineOptions:
+        """Translate the options into pycolmap's, with what of a task's cameras is refined."""
+        options = self.options
+        focals_given, all_given = task.all_given(options)
+        values: dict[str, Plain] = {
+            "min_model_size": options.min_model_size,
+            "mapper.retriangulation.ignore_two_view_tracks": options.ignore_two_view_tracks,
+            "mapper.bundle_adjustment.refine_focal_length": not focals_given,
+            "mapper.bundle_adjustment.refine_extra_params": not all_given,
+        }
+        if not options.ignore_two_view_tracks:
+            values |= dict.fromkeys(TRACK_LENGTHS, 2)
+        for section in THREADED_SECTIONS:
+            values[f"{section}num_threads"] = 1
+        for section in SEEDED_SECTIONS:
+            values[f"{section}random_seed"] = random_seed
+        native = pycolmap.GlobalPipelineOptions()
+        set_values(native, values | options.mapper_options)
+        return native
+
+    def _hold_cameras(
+        self,
+        model: pycolmap.Reconstruction,
+        task: MappingTask,
+        options: pycolmap.BundleAdjustmentOptions,
+    ) -> None:
+        """Give the cameras that are to stay their parameters back, and adjust all else."""
+        constant = task.constant_cameras(self.options) & set(model.cameras)
+        if not constant:
+            return
+        with open_database(task.database_path) as database:
+            given = {c.camera_id: c.params for c in cameras_of_images(database).values()}
+        has_moved = False
+        for key in constant:
+            camera = model.cameras[key]
+            if camera.params.tolist() != given[key].tolist():
+                camera.params = given[key].tolist()
+                has_moved = True
+        if has_moved:
+            priors = priors_of(model.cameras.values(), task.cameras)
+            Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(model, FINAL)
