@@ -226,8 +226,9 @@ def num_long_tracks(model: pycolmap.Reconstruction, same_view: Mapping[int, int]
 def seen_points(image: pycolmap.Image) -> Indices:
     """Return the id of the point that each keypoint sees, -1 for none, (N,)."""
     seen = np.full(image.num_points2D(), -1, np.int64)
+    keypoints = image.points2D
     for index in image.get_observation_point2D_idxs():
-        seen[index] = image.points2D[index].point3D_id
+        seen[index] = keypoints[index].point3D_id
     return seen
 
 

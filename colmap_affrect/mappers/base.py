@@ -90,6 +90,8 @@ class MappedModel:
     bridges: Mapping[str, Bridge] = field(default_factory=dict)
     """By the names of images that came in by one verified pair, not by tracks of three images."""
     moves: tuple[str, ...] = ()  # what made the model, in the words of a report
+    finish: Callable[[], None] | None = None
+    """Gives the reconstruction its last points and colours; called once, after it is judged."""
 
 
 class Mapper(Protocol):

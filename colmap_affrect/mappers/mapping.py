@@ -107,6 +107,8 @@ def map_database(
         kept.sort(key=lambda found: -found[0].reconstruction.num_points3D())
         kept.sort(key=lambda found: -found[0].reconstruction.num_reg_images())
         for index, (model, sure, taken) in enumerate(kept):
+            if model.finish:
+                model.finish()
             write_model(model.reconstruction, partial / str(index))
             summaries.append(_summary(model, sure, taken, task))
             write_summary(summaries[-1], partial / str(index))

@@ -99,11 +99,12 @@ class PairGraph:
 
     def without(self, ids: Collection[Ids]) -> Self:
         """Leave out some pairs; itself where there are none."""
-        kept = [pair for pair in self._verified if pair.ids not in ids]
+        kept = [pair for pair in self.verified if pair.ids not in ids]
         return self._with(kept, self.cache) if ids else self
 
     @property
-    def _verified(self) -> Pairs:
+    def verified(self) -> Pairs:
+        """All pairs, also those that have no say."""
         return self.pairs + self.weak
 
     @cached_property
@@ -117,14 +118,14 @@ class PairGraph:
         camera_of = {name: key for key, record in records.items() for name in record.names}
         cache = _empty_copy(self.cache, camera_of)
         cameras = {i: cache.cameras[image.camera_id] for i, image in cache.images.items()}
-        return replace(self._with(self._verified, cache), cameras={**self.cameras, **cameras})
+        return replace(self._with(self.verified, cache), cameras={**self.cameras, **cameras})
 
     def thinned(self) -> Self:
         """Leave out tracks where the others tell the poses as well; itself where they are few.
 
         See :mod:`colmap_affrect.mappers.thinning`.
         """
-        pairs = self._verified
+        pairs = self.verified
         numbers = {i: len(points) for i, points in self.keypoints.items()}
         kept = matches_of_best_tracks([(pair.ids, pair.matches) for pair in pairs], numbers)
         if 2 * sum(map(np.sum, kept)) > sum(map(len, kept)):

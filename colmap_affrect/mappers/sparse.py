@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,7 @@ from colmap_affrect.colmap.cameras import with_shared_cameras
 from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, priors_of
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
+from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
 from colmap_affrect.mappers.search import Search, with_own_images
@@ -75,10 +77,24 @@ class SparseMapper(IncrementalMapper):
             best = self._best(task, graph, native, shown)
             for model in best:
                 model.reconstruction.normalize()  # as COLMAP does
-        if native.extract_colors and task.image_path:
-            for model in best:
-                model.reconstruction.extract_colors_for_all_images(task.image_path)
-        return best
+        if task.extend:
+            for mapped in best:
+                _extract_colors(mapped.reconstruction, task, native)
+            return best
+        finish = partial(self._finish, task, graph, native)
+        return [replace(m, finish=partial(finish, m.reconstruction)) for m in best]
+
+    def _finish(
+        self,
+        task: MappingTask,
+        graph: PairGraph,
+        native: pycolmap.IncrementalPipelineOptions,
+        model: pycolmap.Reconstruction,
+    ) -> None:
+        """Give a model the points of all tracks, and their colours."""
+        tie_points = tie_points_of(task, graph)
+        complete_points(model, graph, native, self.options.noise_px, tie_points)
+        _extract_colors(model, task, native)
 
     def _search(
         self,
@@ -153,6 +169,15 @@ class SparseMapper(IncrementalMapper):
         if not best and is_sharing:
             return self._best(replace(task, may_share=False), own[0], native, show)
         return _joined_by_hand(search, graph, best)
+
+
+def _extract_colors(
+    model: pycolmap.Reconstruction,
+    task: MappingTask,
+    native: pycolmap.IncrementalPipelineOptions,
+) -> None:
+    if native.extract_colors and task.image_path:
+        model.extract_colors_for_all_images(task.image_path)
 
 
 def _joined_by_hand(
