@@ -3,9 +3,8 @@
 Features of the levels of escalation follow each other in the order in which they were asked for:
 those of ``levels[k]`` end at ``level_ends[k]``. Descriptors of several sizes are filled up with
 zeros, which change no distance. Matches have the attributes ``level``, whose features were matched
-together with those of level 0, and ``tried``, with a bit for each level that was tried. Where
-levels with measured frames and learned ones were both tried for a pair, the best matches of the
-kind that has fewer inliers are kept, too: :class:`Alternative`.
+together with those of level 0, and ``tried``, with a bit for each level that was tried. Beside
+them a pair may have matches of one kind of features that are not in use: :class:`Alternative`.
 ``guided.h5`` has a group per pair that was matched again by its geometry. Files are opened for one
 image or one batch of pairs and closed again; what is written in between appears as a whole
 (:mod:`colmap_affrect.project.atomic_files`).
@@ -17,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -58,12 +57,23 @@ class PairMatches:
     of_some: bool = False  # only of the features with the largest responses
 
 
+Kind = Literal["measured", "learned"]  # of features: whether their frames are measured one by one
+MEASURED: Kind = "measured"
+LEARNED: Kind = "learned"
+Worth = tuple[int, int]  # inliers; where there are none, how many matches confirm each other
+
+
 @dataclass(frozen=True)
 class Alternative:
-    """Matches of a pair by the other kind of features, and what they are worth."""
+    """Matches of a pair that are kept beside those in use, and what they are worth.
 
+    Learned ones are those of the first learned level; measured ones the best that there were before
+    learned ones took their place.
+    """
+
+    kind: Kind
     matches: PairMatches
-    worth: tuple[int, int]  # inliers; where there are none, how many matches confirm each other
+    worth: Worth
 
 
 @lru_cache(maxsize=8)
@@ -234,9 +244,6 @@ def pair_key(name1: str, name2: str) -> str:
     return f"{name1.replace('/', '-')}/{name2.replace('/', '-')}"
 
 
-OTHER = "other_"  # begins the names of datasets and attributes of alternatives
-
-
 def hloc_matches(pair: PairMatches) -> dict[str, NDArray[Any]]:
     """Return the datasets that hloc has for a pair; in 32 bits where 16 do not suffice."""
     matches0 = np.full(pair.num_keypoints1, -1, np.int64)
@@ -278,56 +285,57 @@ class MatchStore(GroupStore):
     def _write_pair(self, file: h5py.File, pair: PairMatches) -> None:
         key = pair_key(*pair.names)
         is_there = is_complete(file, key)
-        alternative = _read_alternative(file[key], pair.names) if is_there else None
+        kept = _read_alternatives(file[key], pair.names) if is_there else []
         tried = int(file[key].attrs["tried"]) if is_there else 0
         known = {"level": pair.level, "tried": tried | 1 << pair.level, "of_some": pair.of_some}
         self._write(file, key, hloc_matches(pair), **known)
-        if alternative:
+        for alternative in kept:
             self._write_alternative(file, alternative)
 
     def _write_alternative(self, file: h5py.File, other: Alternative) -> None:
         group = file[pair_key(*other.matches.names)]
         for name, values in hloc_matches(other.matches).items():
-            self._write_dataset(group, OTHER + name, values)
-        group.attrs[OTHER + "level"] = other.matches.level
-        group.attrs[OTHER + "worth"] = other.worth
+            self._write_dataset(group, f"{other.kind}_{name}", values)
+        group.attrs[f"{other.kind}_level"] = other.matches.level
+        group.attrs[f"{other.kind}_worth"] = other.worth
 
-    def alternatives(self, pairs: Sequence[Names]) -> dict[Names, Alternative]:
-        """Return the alternatives of pairs, where there are any."""
+    def alternatives(self, pairs: Sequence[Names], kind: Kind) -> dict[Names, Alternative]:
+        """Return the matches of a kind that are kept beside those in use, where there are any."""
         found = dict[Names, Alternative]()
         with self._open("r") as file:
             for names in pairs:
-                alternative = _read_alternative(file[pair_key(*names)], names)
-                if alternative:
-                    found[names] = alternative
+                for other in _read_alternatives(file[pair_key(*names)], names, [kind]):
+                    found[names] = other
         return found
 
-    def others(self, pairs: Iterable[Names]) -> dict[Names, tuple[int, tuple[int, int]]]:
-        """Return level and worth of the alternatives of pairs; level -1 where there is none."""
+    def worths(self, pairs: Iterable[Names], kind: Kind) -> dict[Names, tuple[int, Worth]]:
+        """Return level and worth of such matches by pair, without reading them."""
         found = {}
         with self._open("r") as file:
             for names in pairs:
                 group = file[pair_key(*names)]
-                level = int(group.attrs.get(f"{OTHER}level", -1))
-                found[names] = level, _other_worth(group)
+                if f"{kind}_level" in group.attrs:
+                    found[names] = int(group.attrs[f"{kind}_level"]), _worth(group, kind)
         return found
 
     def choose(
-        self, chosen: Mapping[Names, tuple[PairMatches, Alternative]], scores: Any = None
+        self, chosen: Iterable[PairMatches], kept: Iterable[Alternative], scores: Any = None
     ) -> None:
-        """Let alternatives take the place of the matches of their pairs, and these theirs.
+        """Let other matches take the place of those of their pairs, all or none.
 
         Models that were made before are not gone on from.
 
         Args:
-            chosen: by pair, its new matches, and the alternative to them.
+            chosen: matches that are used from now on.
+            kept: what is kept beside them, of those before.
             scores: what is kept as the note ``SCORES``.
         """
         with self._open("a") as file:
             file.attrs[SCORES] = json.dumps(scores)
             file.attrs.pop(CLIMBING, None)
-            for matches, alternative in chosen.values():
-                self._write_pair(file, matches)
+            for pair in chosen:
+                self._write_pair(file, pair)
+            for alternative in kept:
                 self._write_alternative(file, alternative)
 
     def remove(self, images: Iterable[str] = (), pairs: Iterable[Names] = ()) -> None:
@@ -394,15 +402,19 @@ def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatc
     return PairMatches(names, indices, scores, len(matches0), int(group.attrs[f"{prefix}level"]))
 
 
-def _read_alternative(group: h5py.Group, names: Names) -> Alternative | None:
-    if f"{OTHER}level" not in group.attrs:
-        return None
-    return Alternative(_read_matches(group, names, OTHER), _other_worth(group))
+def _read_alternatives(
+    group: h5py.Group, names: Names, kinds: Iterable[Kind] = (MEASURED, LEARNED)
+) -> list[Alternative]:
+    there = [kind for kind in kinds if f"{kind}_level" in group.attrs]
+    return [
+        Alternative(kind, _read_matches(group, names, f"{kind}_"), _worth(group, kind))
+        for kind in there
+    ]
 
 
-def _other_worth(group: h5py.Group) -> tuple[int, int]:
-    num_inliers, num_consistent = group.attrs.get(f"{OTHER}worth", (0, 0))
-    return int(num_inliers), int(num_consistent)
+def _worth(group: h5py.Group, kind: Kind) -> Worth:
+    num_inliers, num_consistent = group.attrs[f"{kind}_worth"].tolist()
+    return num_inliers, num_consistent
 
 
 @dataclass(frozen=True)

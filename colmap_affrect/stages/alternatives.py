@@ -13,20 +13,22 @@ from dataclasses import asdict, dataclass, field, replace
 
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import read_summaries
-from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.outputs import temporary_folder
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import SCORES, Alternative, PairMatches
+from colmap_affrect.project.stores import (
+    LEARNED,
+    MEASURED,
+    SCORES,
+    Alternative,
+    Kind,
+    PairMatches,
+)
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.verify import verify_matches
-
-MEASURED, LEARNED = "measured", "learned"  # kinds of matches
-
-Choice = dict[Pair, tuple[PairMatches, Alternative]]
 
 
 def score(models: Sequence[ModelSummary]) -> float:
@@ -44,7 +46,7 @@ def score(models: Sequence[ModelSummary]) -> float:
 class Scores:
     """Scores of the models by one kind of matches alone."""
 
-    by_kind: Mapping[str, float] = field(default_factory=dict)
+    by_kind: Mapping[Kind, float] = field(default_factory=dict)
     is_sure: bool = False  # whether the models of learned matches have all images, and are sure
     chosen: str = ""  # kind that took the place of the best matches of each pair
 
@@ -64,10 +66,10 @@ def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
     """
     context = escalation.context
     models = read_summaries(context.workspace.sparse)
-    by_kind = {MEASURED: score(models)}
+    by_kind: dict[Kind, float] = {MEASURED: score(models)}
     is_sure = False
     choice = _choice(escalation, LEARNED)
-    if choice:
+    if choice.matches:
         found = _models_of(context, mapper, choice)
         by_kind[LEARNED] = score(found)
         is_sure = bool(found) and len(found[0].sure) == len(context.features.names())
@@ -98,31 +100,37 @@ def choose_kind(escalation: Escalation, *, at_once: bool) -> bool:
     if at_once and not (scores.is_sure or present == 0.0):
         return False
     choice = _choice(escalation, kind)
-    if not choice:
+    if not choice.matches:
         return False
-    context.matches.choose(choice, asdict(replace(scores, chosen=kind)))
+    chosen = asdict(replace(scores, chosen=kind))
+    context.matches.choose(choice.matches, choice.kept, chosen)
     escalation.write()
     return True
 
 
-def _choice(escalation: Escalation, kind: str) -> Choice:
-    """Return the pairs that have other matches of a kind, with these and those that are there."""
-    is_measured = escalation.is_measured
-    wanted = kind == MEASURED
+@dataclass(frozen=True)
+class Choice:
+    """Matches of one kind for pairs that use others."""
+
+    matches: Sequence[PairMatches]
+    kept: Sequence[Alternative]  # measured matches that were in use
+
+
+def _choice(escalation: Escalation, kind: Kind) -> Choice:
+    """Return what changes if all pairs use the matches of a kind that are kept beside others."""
     states = escalation.states()
-    changed = [
-        pair
-        for pair, state in states.items()
-        if state.other_level >= 0
-        and is_measured[state.other_level] == wanted
-        and is_measured[state.level] != wanted
-    ]
-    others = escalation.matches.alternatives(changed)
-    found = Choice()
-    for there in escalation.matches.read(changed):
-        names = there.names
-        found[names] = others[names].matches, Alternative(there, states[names].worth)
-    return found
+    others = escalation.matches.alternatives(list(states), kind)
+    matches = list[PairMatches]()
+    kept = list[Alternative]()
+    for there in escalation.matches.read(list(others)):
+        other = others[there.names]
+        is_measured = escalation.is_measured[there.level]
+        if (kind == MEASURED and is_measured) or there.level == other.matches.level:
+            continue
+        matches.append(other.matches)
+        if is_measured:
+            kept.append(Alternative(MEASURED, there, states[there.names].worth))
+    return Choice(matches, kept)
 
 
 def _models_of(context: Context, mapper: Mapper, choice: Choice) -> list[ModelSummary]:
@@ -133,7 +141,7 @@ def _models_of(context: Context, mapper: Mapper, choice: Choice) -> list[ModelSu
         branch.matches.unlink()  # a link perhaps
         shutil.copy(workspace.matches, branch.matches)
         other = replace(context, workspace=branch, progress=SILENT)
-        other.matches.choose(choice)
+        other.matches.choose(choice.matches, choice.kept)
         verify_matches(other, context.verification)
         guide(other, context.guiding)
         return map_images(other, mapper)[1]

@@ -27,7 +27,14 @@ from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain, ModelSummary, StageReport
-from colmap_affrect.project.stores import STEP, Alternative, PairMatches
+from colmap_affrect.project.stores import (
+    LEARNED,
+    MEASURED,
+    STEP,
+    Alternative,
+    PairMatches,
+    Worth,
+)
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.context import Context
@@ -53,6 +60,7 @@ from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers,
 
 logger = logging.getLogger(__name__)
 
+NO_MATCHES: tuple[int, Worth] = (-1, (0, 0))  # level and worth of those that are not there
 LIKELY = 0.25  # part of a gain that counts for images that are likely right: matches mend few
 
 
@@ -123,9 +131,8 @@ class Trial:
     """Matches that were found for a pair at a level, beside what was there."""
 
     found: PairMatches
-    worth: tuple[int, int]  # inliers; where there are none, how many matches confirm each other
+    worth: Worth
     before: PairState
-    other: Alternative | None  # what is kept of the other kind of features
 
     @property
     def is_better(self) -> bool:
@@ -212,10 +219,16 @@ class Escalation:
         failed = [pair for pair, count in num_inliers.items() if not count]
         num_consistent, levels = self._num_consistent(failed), self.matches.levels
         reached, tried = levels(num_inliers), levels(num_inliers, "tried")
-        others = self.matches.others(num_inliers)
+        measured = self.matches.worths(num_inliers, MEASURED)
+        learned = self.matches.worths(num_inliers, LEARNED)
         return {
             pair: PairState(
-                count, num_consistent.get(pair, 0), reached[pair], tried[pair], *others[pair]
+                count,
+                num_consistent.get(pair, 0),
+                reached[pair],
+                tried[pair],
+                measured_worth=measured.get(pair, NO_MATCHES)[1],
+                learned_level=learned.get(pair, NO_MATCHES)[0],
             )
             for pair, count in num_inliers.items()
         }
@@ -310,14 +323,13 @@ class Escalation:
         """
         if pairs:
             self.matches.keep_note(STEP, [level, list(pairs)])
-        known = self.matches.alternatives(pairs)
+        known = self.matches.alternatives(pairs, LEARNED)
         known = {p: other for p, other in known.items() if other.matches.level == level}
         unknown = [pair for pair in pairs if pair not in known]
         if known:
             states = self.states()
             trials = [
-                Trial(other.matches, other.worth, states[pair], other)
-                for pair, other in known.items()
+                Trial(other.matches, other.worth, states[pair]) for pair, other in known.items()
             ]
             self._keep(trials, level)
         self._match_with(unknown, level, self._keep)
@@ -342,7 +354,7 @@ class Escalation:
         """Match pairs with the features of a learned level, and keep that beside what is there."""
 
         def keep(batch: Sequence[Trial], _: int) -> None:
-            others = [Alternative(trial.found, trial.worth) for trial in batch]
+            others = [Alternative(LEARNED, trial.found, trial.worth) for trial in batch]
             self.matches.write([], alternatives=others)
 
         self._match_with(step.pairs, step.level, keep)
@@ -396,11 +408,10 @@ class Escalation:
     ) -> None:
         size_px = self.extraction.levels[level].max_image_size_px
         verifier, states = PairVerifier(self.path, self.verification, size_px), self.states()
-        others = self.matches.alternatives(pairs)
 
         def judged(found: PairMatches) -> Trial:
             names = found.names
-            return Trial(found, self._worth(found, verifier), states[names], others.get(names))
+            return Trial(found, self._worth(found, verifier), states[names])
 
         def write(batch: Sequence[Trial]) -> None:
             keep(batch, level)
@@ -415,19 +426,19 @@ class Escalation:
         self.matches.write(better, tried, level, self._alternatives(batch))
 
     def _alternatives(self, batch: Sequence[Trial]) -> list[Alternative]:
-        """Return what is kept beside the matches of pairs: the best of the other kind of frames."""
+        """Return the best measured matches of pairs that use learned ones."""
         kept = list[Alternative]()
         for trial in batch:
-            if self.is_measured[trial.before.level] == self.is_measured[trial.found.level]:
-                continue
-            if trial.is_better:
+            was_measured = self.is_measured[trial.before.level]
+            is_measured = self.is_measured[trial.found.level]
+            if was_measured and not is_measured and trial.is_better:
                 (before,) = self.matches.read([trial.found.names])
-                kept.append(Alternative(before, trial.before.worth))
-            elif trial.other is None or trial.worth > trial.other.worth:
-                kept.append(Alternative(trial.found, trial.worth))
+                kept.append(Alternative(MEASURED, before, trial.before.worth))
+            elif is_measured and not was_measured and trial.worth > trial.before.measured_worth:
+                kept.append(Alternative(MEASURED, trial.found, trial.worth))
         return kept
 
-    def _worth(self, found: PairMatches, verifier: PairVerifier) -> tuple[int, int]:
+    def _worth(self, found: PairMatches, verifier: PairVerifier) -> Worth:
         """Return the inliers of a pair, or without any how many matches confirm each other."""
         names, (first, second) = found.names, map(self.features.read_frames, found.names)
         if count := len(verifier.inliers(names, (first, second), found.indices)):

@@ -87,9 +87,7 @@ class Situation:
 
     def has_learned(self, state: PairState) -> bool:
         """Tell whether there are learned matches of a pair, used or beside those that are."""
-        if not self.is_measured(state.level):
-            return True
-        return state.other_level >= 0 and not self.is_measured(state.other_level)
+        return state.learned_level >= 0 or not self.is_measured(state.level)
 
     @property
     def first_model_s(self) -> float:
@@ -101,7 +99,7 @@ class Situation:
 
     def has_tried(self, state: PairState, number: int) -> bool:
         """Tell whether a pair was matched at a level, also if the matches are not used."""
-        return bool(state.tried >> number & 1) or state.other_level == number
+        return bool(state.tried >> number & 1) or state.learned_level == number
 
     def spent_on(self, number: int) -> float:
         """Return the nominal seconds that a level has taken so far."""

@@ -18,6 +18,7 @@ from pathlib import Path
 from colmap_affrect.colmap.verification import connected_parts, num_in_tracks
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.stores import Worth
 from colmap_affrect.recipes import Level
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")
@@ -33,11 +34,11 @@ class PairState:
     num_consistent: int = 0  # raw matches that confirm each other
     level: int = 0  # that its matches are from
     tried: int = 1  # a bit for each level
-    other_level: int = -1  # of matches by the other kind of features; -1 where there are none
-    other_worth: tuple[int, int] = (0, 0)  # of these
+    measured_worth: Worth = (0, 0)  # of the measured matches that learned ones took the place of
+    learned_level: int = -1  # of learned matches that are kept beside those in use; -1: none
 
     @property
-    def worth(self) -> tuple[int, int]:
+    def worth(self) -> Worth:
         """Its inliers; where there are none, how many matches are consistent."""
         return self.num_inliers, self.num_consistent
 
@@ -189,7 +190,7 @@ class ExpectedGain:
         """Return what the best matches of measured frames say of a pair."""
         if state.level not in self.unmeasured:
             return state
-        num_inliers, num_consistent = state.other_worth
+        num_inliers, num_consistent = state.measured_worth
         return replace(state, num_inliers=num_inliers, num_consistent=num_consistent)
 
     def candidates(self, number: int, level: Level, others: int) -> list[Candidate]:

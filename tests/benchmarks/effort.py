@@ -123,7 +123,7 @@ def spent(context: Context) -> Row:
     """Return what escalation has taken so far, in nominal seconds, and what it was."""
     escalation = Escalation(context, Recipe().escalate)
     models = escalation.models()
-    situation = escalation.situation({}, models)
+    situation = escalation.situation(escalation.needs(models), models)
     names = [level.name for level in situation.levels]
     return {
         "first_model_s": round(situation.first_model_s, 1),
@@ -133,6 +133,9 @@ def spent(context: Context) -> Row:
             for number, name in enumerate(names)
             if number
         },
+        "hope": round(
+            max((situation.best_at(k, math.inf).all_photographs for k in situation.usable)), 3
+        ),
         "scores": context.matches.note(SCORES),
     }
 

@@ -17,13 +17,18 @@ from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import CLIMBING, FINISHED, SCORES, Alternative
+from colmap_affrect.project.stores import (
+    CLIMBING,
+    FINISHED,
+    LEARNED,
+    MEASURED,
+    SCORES,
+    Alternative,
+)
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.stages import alternatives, climb
 from colmap_affrect.stages.alternatives import (
-    LEARNED,
-    MEASURED,
     Choice,
     Scores,
     choose_kind,
@@ -99,16 +104,16 @@ def with_models(monkeypatch: pytest.MonkeyPatch, *, found: ModelSummary) -> list
 
 def test_learned_matches_are_kept_beside_those_that_are_there(context: Context) -> None:
     pairs = escalation_of(context).pairs
-    others = context.matches.alternatives(list(pairs))
+    others = context.matches.alternatives(list(pairs), LEARNED)
     assert levels(context) == {0}
     assert set(others) == set(pairs)
+    assert not context.matches.alternatives(list(pairs), MEASURED)
     states = escalation_of(context).states()
     for pair, other in others.items():
         assert other.matches.level == 1
         assert other.matches.names == pair
         assert 0 < other.worth[0] < states[pair].num_inliers
-        assert states[pair].tried == 1
-        assert (states[pair].other_level, states[pair].other_worth) == (1, other.worth)
+        assert (states[pair].tried, states[pair].learned_level) == (1, 1)
 
 
 def test_step_takes_matches_that_are_kept_and_matches_nothing_anew(
@@ -120,12 +125,14 @@ def test_step_takes_matches_that_are_kept_and_matches_nothing_anew(
     none = replace(there, indices=there.indices[:0], scores=there.scores[:0])
     context.matches.write([none])
     escalation.write()
-    (other,) = context.matches.alternatives([pair]).values()
+    (other,) = context.matches.alternatives([pair], LEARNED).values()
     monkeypatch.setattr("colmap_affrect.stages.escalate.matched_at_level", None)
     escalation.match_at([pair], 1)
     state = escalation.states()[pair]
     assert (state.level, state.num_inliers, state.tried) == (1, other.worth[0], 0b11)
-    assert (state.other_level, state.other_worth) == (0, (0, 0))
+    assert (state.measured_worth, state.learned_level) == ((0, 0), 1)
+    (measured,) = context.matches.alternatives([pair], MEASURED).values()
+    assert len(measured.matches.indices) == 0
 
 
 def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
@@ -134,7 +141,7 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     escalation = escalation_of(context)
     better = replace(UNSURE, probabilities=dict.fromkeys(NAMES[:2], 0.9))
     asked = with_models(monkeypatch, found=better)
-    others = context.matches.alternatives(list(escalation.pairs))
+    others = context.matches.alternatives(list(escalation.pairs), LEARNED)
     context.matches.keep_note(CLIMBING, context.matches.note(FINISHED))
     look_at_learned(escalation, mapper)
     assert len(asked) == 1
@@ -152,8 +159,8 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
         for pair, other in others.items():
             stored = database.read_matches(*(ids[name] for name in pair))
             assert_array_equal(stored, other.matches.indices)
-    swapped = context.matches.alternatives(list(escalation.pairs))
-    assert {other.matches.level for other in swapped.values()} == {0}
+    measured = context.matches.alternatives(list(escalation.pairs), MEASURED)
+    assert {other.matches.level for other in measured.values()} == {0}
     assert not choose_kind(escalation, at_once=False)  # that is decided
 
 

@@ -60,8 +60,8 @@ def test_pairs_that_have_learned_matches_used_or_not_get_no_others() -> None:
     before = situation()
     states = dict(before.states)
     states["a", "d"] = PairState(0, 3, level=LEARNED, tried=1 | 1 << LEARNED)
-    states["a", "e"] = PairState(0, 3, other_level=LEARNED)
-    states["b", "d"] = PairState(0, 3, level=LEARNED, tried=0b111, other_level=1)
+    states["a", "e"] = PairState(0, 3, learned_level=LEARNED)
+    states["b", "d"] = PairState(0, 3, level=LEARNED, tried=0b111, measured_worth=(9, 0))
     after = replace(before, states=states)
     found = {"".join(pair) for pair in learned_step(after).pairs}
     assert found == {"be", "cd", "ce", "de"}
@@ -93,7 +93,7 @@ def done_with_learned(**given: Any) -> Situation:
     before = situation(**given)
     lacking = [set(NAMES)] * len(LEVELS)
     lacking[LEARNED] = set()
-    states = {p: replace(s, other_level=LEARNED) for p, s in before.states.items()}
+    states = {p: replace(s, learned_level=LEARNED) for p, s in before.states.items()}
     return replace(before, lacking=lacking, states=states)
 
 
