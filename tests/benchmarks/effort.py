@@ -134,7 +134,7 @@ def spent(context: Context) -> Row:
             if number
         },
         "hope": round(
-            max((situation.best_at(k, math.inf).all_photographs for k in situation.usable)), 3
+            max(situation.best_at(k, math.inf).all_photographs for k in situation.usable), 3
         ),
         "scores": context.matches.note(SCORES),
     }

@@ -201,9 +201,10 @@ def test_measured_matches_alone_come_back_where_models_were_better_before(
     escalation = escalation_of(context)
     pairs = list(escalation.pairs)
     before = {found.names: found for found in context.matches.read(pairs)}
-    others = context.matches.alternatives(pairs)
+    others = context.matches.alternatives(pairs, LEARNED)
     escalation.matches.choose(
-        {pair: (others[pair].matches, Alternative(before[pair], (100, 0))) for pair in pairs[:2]}
+        [others[pair].matches for pair in pairs[:2]],
+        [Alternative(MEASURED, before[pair], (100, 0)) for pair in pairs[:2]],
     )
     escalation.write()
     assert levels(context) == {0, 1}
