@@ -18,7 +18,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
-from colmap_affrect.options import EffortName
+from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
@@ -77,6 +77,14 @@ class RunOptions(InputOptions):
     effort: EffortName = "normal"  # how much is tried for photographs in need
     max_minutes: float = math.inf  # after which nothing more is tried for photographs in need
     command: tuple[str, ...] = ()  # words of the command line, for advice
+
+    def __post_init__(self) -> None:
+        """Refuse what would fail, or do nothing, once the first model is there."""
+        super().__post_init__()
+        if self.effort not in EFFORT_NAMES:
+            raise OptionError(f"effort {self.effort!r} is not one of {', '.join(EFFORT_NAMES)}")
+        if not self.max_minutes >= 0.0:
+            raise OptionError(f"max_minutes {self.max_minutes!r}: must be at least 0")
 
 
 def run(

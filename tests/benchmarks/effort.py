@@ -37,6 +37,7 @@ from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages import climb as climbing
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation
+from colmap_affrect.stages.escalation_policy import EFFORTS
 
 Row = dict[str, Any]
 
@@ -140,6 +141,34 @@ def spent(context: Context) -> Row:
     }
 
 
+def right_at(rows: Sequence[Row], spent_s: float) -> int:
+    """Return the photographs that are right when so many nominal seconds have been spent."""
+    there = [row for row in rows if row.get("spent_s", math.inf) <= spent_s]
+    last = there[-1] if there else rows[0]
+    return int(last["right"])
+
+
+def draw(found: dict[str, list[Row]], path: Path) -> None:
+    """Draw the photographs that are right in all subsets against what was spent on each."""
+    import matplotlib.pyplot as plt
+
+    known = [rows for rows in found.values() if "right" in rows[0]]
+    spent = sorted({row["spent_s"] for rows in known for row in rows if "spent_s" in row})
+    first = sum(row[0]["right"] for row in known)
+    figure, axes = plt.subplots(figsize=(7, 3.5))
+    axes.step(spent, [sum(right_at(rows, s) for rows in known) for s in spent], where="post")
+    axes.axhline(first, linestyle=":", color="gray")
+    axes.text(spent[-1], first, "first models", ha="right", va="bottom", color="gray")
+    for name, effort in EFFORTS.items():
+        if effort.least_s <= spent[-1]:
+            axes.axvline(effort.least_s, color="tab:orange", linewidth=1)
+            axes.text(effort.least_s, axes.get_ylim()[0], f" {name}", color="tab:orange")
+    axes.set_xlabel("seconds of one core on each set, after learned matching")
+    axes.set_ylabel("photographs right")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
 def main() -> None:
     """Run all subsets."""
     root = Path(__file__).resolve().parents[2]
@@ -151,6 +180,7 @@ def main() -> None:
     parser.add_argument("--effort", choices=EFFORT_NAMES, default="high")
     parser.add_argument("--max-time", type=float, default=math.inf, help="minutes of a run")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--plot-path", type=Path, help="PNG file of the curve")
     parser.add_argument("--work-path", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--output-path", type=Path, required=True, help="JSON file of the rows")
     arguments = parser.parse_args()
@@ -170,6 +200,8 @@ def main() -> None:
             scene_path, subset, work_path, arguments.effort, arguments.seed, arguments.max_time
         )
         output_path.write_text(json.dumps(found, indent=1) + "\n")
+    if arguments.plot_path:
+        draw(found, arguments.plot_path)
     keys = ("right", "registered", "sure", "sure_and_wrong", "expected", "spent_s", "cpu_s")
     lines = [
         [name, *(str(row.get(key, "")) for key in keys)]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -23,11 +25,16 @@ from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pipeline import RunOptions, run
-from colmap_affrect.project.report import Bridge, ModelSummary, ReconstructionReport
+from colmap_affrect.project.report import (
+    Bridge,
+    MatchedAgain,
+    ModelSummary,
+    ReconstructionReport,
+)
 from colmap_affrect.project.stores import FeatureStore, pair_key
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.advice import advice
@@ -333,3 +340,42 @@ def test_features_of_another_number_than_in_the_database_are_refused(
     store.write("a.png", features.select(np.arange(10)), IMAGE_SIZE)
     with pytest.raises(DatabaseError, match=r"keypoints in the database and 10 in the"):
         run(photos, copy.path, OPTIONS)
+
+
+@pytest.mark.parametrize(("values", "message"), [
+    ({"effort": "hihg"}, "effort 'hihg' is not one of low, normal, high"),
+    ({"max_minutes": -1.0}, "max_minutes -1.0: must be at least 0"),
+    ({"max_minutes": float("nan")}, "max_minutes nan: must be at least 0"),
+])  # fmt: skip
+def test_run_options_that_mean_nothing_are_refused_at_once(
+    values: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(OptionError, match=f"^{re.escape(message)}$"):
+        RunOptions(**values)
+
+
+def test_advice_names_what_was_not_tried_and_the_command_that_goes_on(
+    finished: Finished,
+) -> None:
+    workspace, report = finished
+    words = ("colmap-affrect", "run", "--image-path", "a b", "--output-path", "out")
+    left = [MatchedAgain("measured, all tilts", 28, 1200.0), MatchedAgain("new", 1, 60.0)]
+    context = Context(workspace, command=(*words, "--effort", "normal", "--max-time", "3"))
+    more, *_ = advice(context, [NAMES[0]], report.models, 0, left)
+    assert more.why.startswith("not tried, at most about ")
+    assert more.why.endswith(" min more: all tilts 28 pairs, new 1 pair")
+    assert shlex.split(more.command) == [*words, "--effort", "high"]
+    low = replace(context, effort="low", command=words)
+    (more,) = advice(low, [], report.models, 0, left)
+    assert shlex.split(more.command) == [*words, "--effort", "normal"]
+    assert advice(replace(context, effort="high"), [], report.models, 0, left) == ()
+
+
+def test_photographs_that_are_all_lost_are_not_to_be_joined_with_the_others(
+    finished: Finished,
+) -> None:
+    context = Context(finished[0])
+    *_, last = advice(context, [*NAMES], [], 0)
+    assert last.why == "more photographs, from places between those of these"
+    *_, last = advice(context, [NAMES[0]], [], 0)
+    assert last.why == f"more photographs, between {NAMES[0]} and the others"
