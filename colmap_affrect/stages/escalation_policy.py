@@ -31,7 +31,7 @@ from colmap_affrect.stages.expected_gain import (
 )
 
 SMALL = 30  # images up to which learned matching takes all pairs of images in need
-MIN_PHOTOGRAPHS = 0.05  # expected of all that the budget allows, below which nothing is tried
+MIN_PHOTOGRAPHS = 0.2  # expected of all that the budget allows, below which nothing is tried
 
 
 @dataclass(frozen=True)
