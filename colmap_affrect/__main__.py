@@ -16,6 +16,11 @@ from colmap_affrect.errors import EXIT_INTERRUPTED, INTERRUPTED, MEMORY_HINT, la
 from colmap_affrect.parallel.subprocesses import end_with
 
 PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
+WITHOUT_MEMORY = " (perhaps for want of memory)"
+KEPT = (
+    "run.log may say why, and what was done before is kept: run the same command again, or "
+    "'colmap-affrect doctor'"
+)
 SIGNALS = {signal.SIGINT, signal.SIGTERM}
 
 
@@ -35,19 +40,32 @@ def main() -> NoReturn:
     parent = os.getpid()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # else nobody could wait for the worker
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    heard, told = os.pipe()  # by which the worker says that Python has ended it
+    os.set_blocking(heard, False)
     try:
         worker = os.fork()
     except OSError:  # too many processes
         _work()
     if not worker:
         end_with(parent)
-        _work()
+        _work_and_tell(told)
+    os.close(told)
     signal.signal(signal.SIGALRM, lambda *_: _kill(worker, signal.SIGKILL))
     _handle(stop)
     _, status = os.waitpid(worker, 0)
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    sys.exit(_exit_code(os.waitstatus_to_exitcode(status), signals))
+    code = os.waitstatus_to_exitcode(status)
+    if code > 0 and code != EXIT_INTERRUPTED and not signals and not _has_told(heard):
+        say(f"error: native code ended the command with exit code {code}{WITHOUT_MEMORY}; {KEPT}")
+    sys.exit(_exit_code(code, signals))
+
+
+def _has_told(heard: int) -> bool:
+    try:
+        return bool(os.read(heard, 1))
+    except BlockingIOError:  # others have the pipe, too, and nobody has written
+        return False
 
 
 def _open_standard_streams() -> None:
@@ -83,12 +101,17 @@ def _exit_code(code: int, signals: list[int]) -> int:
     if signals:
         say(INTERRUPTED)
         return 128 + signals[0]
-    cause = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
-    say(
-        f"error: ended by {signal.Signals(-code).name}{cause}; run.log may say why, and what was "
-        "done before is kept: run the same command again, or 'colmap-affrect doctor'"
-    )
+    cause = WITHOUT_MEMORY if code == -signal.SIGKILL else ""
+    say(f"error: ended by {signal.Signals(-code).name}{cause}; {KEPT}")
     return 1
+
+
+def _work_and_tell(told: int) -> NoReturn:
+    """Run the command line, and write a byte in the end; native code that ends it writes none."""
+    try:
+        _work()
+    finally:
+        os.write(told, b".")
 
 
 def _work() -> NoReturn:

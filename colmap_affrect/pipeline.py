@@ -235,13 +235,17 @@ def map_and_report(
 ) -> ReconstructionReport:
     """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
     workspace, options, names = context.workspace, mapper.options, image_names(context)
-    if not workspace.is_foreign and (gone := set(context.features.names()) - set(names)):
+    gone = [] if workspace.is_foreign else sorted(set(context.features.names()) - set(names))
+    if gone and not earlier:
         path = context.inputs.image_path
-        raise ImageError(f"{path}: {min(gone)} has features, and is gone; run extract again")
+        raise ImageError(f"{path}: {gone[0]} has features, and is gone; run extract again")
+    names = sorted({*names, *gone})
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
     marks = _check_by_hand(context.by_hand, names, mapper)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
+    lost = dict.fromkeys(gone, "is gone since its features were extracted; these are used")
+    report = replace(report, warnings={**report.warnings, **lost})
     copied = workspace.is_foreign
     verified = num_verified_inliers(context)
     pair_inliers = {pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)}

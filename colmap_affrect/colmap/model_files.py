@@ -17,9 +17,8 @@ import numpy as np
 
 from colmap_affrect import errors
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.native_writes import native_writes
+from colmap_affrect.colmap.native_writes import native_writes, why_not_written
 from colmap_affrect.geometry.arrays import Array, Indices
-from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.regular_files import (
     read_regular,
     require_regular,
@@ -182,7 +181,7 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     try:
         registered_names(folder)
     except errors.StoreError as error:
-        raise cannot_write(folder, error) from error
+        raise why_not_written(folder, error) from error
 
 
 def read_given_model(folder: Path, option: str = "") -> pycolmap.Reconstruction:

@@ -215,7 +215,10 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
     """
     size = header_size(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
     is_far_larger = size is not None and max(size) >= 8 * max_size_px
-    image = decode(path, EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED)[:, :, ::-1]
+    try:
+        image = decode(path, EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED)[:, :, ::-1]
+    except ImageError:  # OpenCV makes no colour of one channel of floats
+        image = np.repeat(decode(path)[:, :, None], 3, axis=2)
     return shrink_to(in_eight_bits(image, tones(image) if stretch else None), max_size_px)
 
 
@@ -356,12 +359,21 @@ def alpha_mask(path: Path) -> Mask | None:
     if not read_header(path, _has_alpha):
         return None
     image = decode(path, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 3 or image.shape[2] != 4:
+    is_there = image.ndim == 3 and image.shape[2] == 4
+    alpha = image[:, :, 3] if is_there else read_header(path, _alpha_beside_gray)
+    if alpha is None:
         return None
-    alpha = image[:, :, 3]
     half = np.iinfo(alpha.dtype).max / 2 if np.issubdtype(alpha.dtype, np.integer) else 0.5
     mask = np.asarray(alpha > half)
     return mask if mask.any() and not mask.all() else None
+
+
+def _alpha_beside_gray(file: BinaryIO) -> NDArray[Any] | None:
+    """Read the alpha channel of a gray TIFF, which OpenCV drops; None of one that Pillow turns."""
+    image = opened(file)
+    if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
+        return None
+    return np.asarray(image.convert("RGBA").getchannel("A"))
 
 
 def _has_alpha(file: BinaryIO) -> bool:

@@ -22,6 +22,7 @@ from colmap_affrect.project.regular_files import open_regular, read_regular
 logger = logging.getLogger(__name__)
 
 PAGE_BYTES = 4096
+TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
 NEW_SUFFIX = ".affrect-new"  # of files that are being written; a killed program leaves them
 JOURNAL_MARK = b"AFFRECT2"
 JOURNAL_HEADER = struct.Struct("<8sQQ")
@@ -107,9 +108,21 @@ def cannot_write(path: Path, error: Exception) -> WorkspaceError:
     """Return the error that says which file could not be written and what to do."""
     reason = getattr(error, "strerror", None) or error
     return WorkspaceError(
-        f"{path}: cannot be written ({reason}); free space on the disk, or permit writing, and "
-        "run the same command again: what was done before is kept"
+        f"{_final(path)}: cannot be written ({reason}); free space on the disk, or permit writing, "
+        "and run the same command again: what was done before is kept"
     )
+
+
+def _final(path: Path) -> Path:
+    """Return the name that a file in a folder for what is not complete yet will have."""
+    kept = list[str]()
+    parts = iter(path.parts)
+    for part in parts:
+        if part.startswith(TEMPORARY_PREFIX):
+            next(parts, None)  # the folder of results in it
+        else:
+            kept.append(part)
+    return Path(*kept)
 
 
 @contextmanager

@@ -15,10 +15,14 @@ from tempfile import mkdtemp
 from filelock import FileLock, Timeout
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.project.atomic_files import cannot_write, require_space, uninterrupted
+from colmap_affrect.project.atomic_files import (
+    TEMPORARY_PREFIX,
+    cannot_write,
+    require_space,
+    uninterrupted,
+)
 from colmap_affrect.project.regular_files import NotAFileError, open_regular, require_regular
 
-TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
 RESULTS = "results"  # folder of these in such a folder, whose names are the user's
 LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works there
 MARKS = {"config.toml": b"format_version", "run.log": b"colmap-affrect"}  # files of ours begin so
@@ -134,20 +138,30 @@ def _refuse_existing(target: Path) -> None:
 @contextmanager
 def temporary_folder(parent: Path) -> Iterator[Path]:
     """Yield a new folder in a folder, in which those that killed processes left are removed."""
+    missing = [path for path in (parent, *parent.parents) if not path.exists()]
     try:
         parent.mkdir(parents=True, exist_ok=True)
         name = mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent)
     except OSError as error:
+        _remove_empty(missing)
         raise cannot_write(parent, error) from error
     for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
         if (left / LOCK).is_file() and not left.is_symlink():
             with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
                 shutil.rmtree(left)  # its process has ended
     with ExitStack() as stack:
+        stack.callback(_remove_empty, missing)
         stack.callback(shutil.rmtree, name, ignore_errors=True)
         with suppress(OSError):  # of file systems without locks leftovers are not tidied up
             stack.enter_context(FileLock(Path(name) / LOCK))
         yield Path(name)
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders that were made for results, the inner ones first, where there are none."""
+    with suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def database_files(path: Path) -> list[Path]:

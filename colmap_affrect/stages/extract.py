@@ -289,7 +289,8 @@ def _refuse_changed(context: Context, inputs: Inputs, names: Iterable[str]) -> N
     """Refuse to add to the features of photographs that have changed."""
     known = context.features.contents()
     now = inputs.contents(names, context.extraction, known)
-    if changed := _counted(_changed(known, now), "changed"):
+    there = {name: content for name, content in now.items() if content.digest}
+    if changed := _counted(_changed(known, there), "changed"):
         raise StoreError(
             f"{context.workspace.features}: {changed[0]} since their features were extracted; run "
             "extract again"

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from command import on_photographs, run_in_process_of_its_own, start
 
+from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 TIMEOUT_S = 60
@@ -141,3 +142,54 @@ def test_worker_ends_with_the_process_that_was_started() -> None:
     with start_stuck(STUCK) as process:
         process.kill()
         process.communicate(timeout=5.0)  # which the worker's end of the pipe would keep open
+
+
+@pytest.mark.parametrize(
+    "closed", [(0, 1, 2), *(pytest.param((number,), marks=pytest.mark.long) for number in (1, 2))]
+)
+def test_streams_that_are_closed_stop_nothing(
+    photos: Path, tmp_path: Path, closed: tuple[int, ...]
+) -> None:
+    extract = ["extract", *on_photographs(photos, tmp_path / "out"), "-q"]
+
+    def close() -> None:
+        for number in closed:
+            os.close(number)
+
+    done = subprocess.run(
+        [sys.executable, "-m", "colmap_affrect", *extract],
+        stdout=subprocess.PIPE, text=True, check=False, timeout=TIMEOUT_S,
+        preexec_fn=close,
+    )  # fmt: skip
+    assert done.returncode == 0
+    assert done.stdout.startswith("extract: 3 done" if 1 not in closed else "")
+    assert FeatureStore(tmp_path / "out" / "features.h5").num_keypoints()
+
+
+def test_native_code_that_ends_the_command_is_named() -> None:
+    code = "import os\nfrom colmap_affrect import __main__, cli\ncli.main = lambda: os._exit(1)\n"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}__main__.main()"],
+        capture_output=True, text=True, check=False, timeout=TIMEOUT_S,
+    )  # fmt: skip
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: native code ended the command with exit code 1 (perhaps for")
+
+
+def test_want_of_memory_while_packages_are_loaded_is_one_line() -> None:
+    code = (
+        "import sys, types\nfrom colmap_affrect import __main__\n"
+        "class Full:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'colmap_affrect.cli':\n"
+        "            raise ImportError('x.so: failed to map segment from shared object')\n"
+        "sys.meta_path.insert(0, Full())\n__main__.main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True, text=True, check=False, timeout=TIMEOUT_S,
+    )  # fmt: skip
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: not enough memory; ")

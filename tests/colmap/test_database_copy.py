@@ -5,6 +5,7 @@ Those of COLMAP 3.8 are written from newer ones.
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 from contextlib import closing
@@ -247,3 +248,49 @@ def test_existing_target_is_not_overwritten(database_path: Path, tmp_path: Path)
         with pytest.raises(DatabaseError, match="exists already"):
             copy(database_path, tmp_path / "there.db")
     assert (tmp_path / "there.db").read_text() == "precious"
+
+
+ACTING = {
+    "CREATE TRIGGER t AFTER INSERT ON keypoints BEGIN DELETE FROM images; END": "",
+    "CREATE VIEW v AS SELECT * FROM images": "",
+    "CREATE INDEX x ON images(name, zeroblob(1000000))": "",
+    "DROP INDEX index_name; CREATE INDEX index_name ON images(zeroblob(1000000))": "",
+    "ALTER TABLE cameras ADD COLUMN note TEXT DEFAULT 'mine'": "",
+    "ALTER TABLE cameras ADD COLUMN g AS (zeroblob(1000000))": "column g of the table cameras",
+}
+
+
+@pytest.mark.parametrize("statement", ACTING)
+def test_what_acts_on_its_own_does_not_come_into_a_copy(
+    source: Path, tmp_path: Path, statement: str
+) -> None:
+    given = Path(shutil.copy(source, tmp_path / "given.db"))
+    with closing(sqlite3.connect(given)) as connection:
+        connection.executescript(statement)
+    if refused := ACTING[statement]:
+        with pytest.raises(DatabaseError, match=refused):
+            copy_database(given, tmp_path / "copy.db")
+        assert not (tmp_path / "copy.db").exists()
+        return
+    copy_database(given, tmp_path / "copy.db")
+    made = "SELECT type, name FROM sqlite_master WHERE type != 'table' AND sql IS NOT NULL"
+    left = set(rows(tmp_path / "copy.db", made))
+    copy_database(source, tmp_path / "usual.db")
+    assert left <= set(rows(tmp_path / "usual.db", made))
+    count = "SELECT COUNT(*) FROM keypoints"
+    assert rows(tmp_path / "copy.db", count) == rows(source, count)
+
+
+@pytest.mark.parametrize("name", ["new.db", ".lock", "results"])
+def test_an_exported_database_may_have_any_name(source: Path, tmp_path: Path, name: str) -> None:
+    export_database(source, tmp_path / name)
+    assert rows(tmp_path / name, "SELECT COUNT(*) FROM images") == [(6,)]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+@pytest.mark.parametrize("suffix", ["", "-wal", "-journal"])
+def test_pipes_in_the_place_of_a_database_are_refused(tmp_path: Path, suffix: str) -> None:
+    os.mkfifo(tmp_path / f"x.db{suffix}")
+    with pytest.raises(OptionError, match="is not a file, but a pipe"):
+        schema_version(tmp_path / "x.db")

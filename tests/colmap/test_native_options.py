@@ -64,3 +64,11 @@ def test_option_that_pycolmap_does_not_take_is_one_clear_line(
     assert text.startswith(f"{FLAG} {key}")
     assert message in text
     assert "\n" not in text
+
+
+@pytest.mark.parametrize("key", ["num_threads", "mapper.num_threads"])
+def test_threads_that_nobody_has_are_refused(key: str) -> None:
+    options = pycolmap.IncrementalPipelineOptions()
+    with pytest.raises(OptionError, match="at most 1024, or -1 for all cores"):
+        resolve(options, {key: "100000"}, "--mapper-options")
+    assert resolve(options, {key: "-1"}, "--mapper-options") == {key: -1}

@@ -302,3 +302,14 @@ def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path, 
     presets = [(run.verification.preset_name, run.mapping.preset_name) for run in asked]
     assert presets == [("colmap", "colmap"), ("sparse", "sparse")]
     assert [run.mapping.name for run in asked] == ["incremental", "sparse"]
+
+
+def test_a_folder_of_a_run_is_refused(scene: Path, options: CompareOptions, tmp_path: Path) -> None:
+    page = tmp_path / "out" / "report.html"
+    page.parent.mkdir()
+    page.write_text("of the run")
+    (tmp_path / "out" / "run.log").write_text("colmap-affrect 0.1.0: output folder")
+    (tmp_path / "out" / "config.toml").write_text("format_version = 11")
+    with pytest.raises(OptionError, match="has the results of a run"):
+        compare(scene, tmp_path / "out", options)
+    assert page.read_text() == "of the run"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
+import os
 import pickle
 import urllib.error
 import warnings
@@ -305,3 +307,37 @@ def test_published_files_have_the_sha256_of_the_table() -> None:
     found = {key: find(key, SHARED_WEIGHTS) for key in keys}
     assert [is_published(*item) for item in found.items()] == [True] * 3
     assert all(map(load_state_dict, found.values()))
+
+
+@pytest.mark.parametrize("home", ["nobody", "unreadable", "~nosuchuser"])
+def test_without_a_home_there_is_no_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, home: str
+) -> None:
+    for name in ("XDG_CACHE_HOME", "TORCH_HOME", ENVIRONMENT_VARIABLE):
+        monkeypatch.delenv(name, raising=False)
+
+    def fail(_: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    if home == "unreadable":  # that of another user, as in a container
+        monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+        usual = Path.is_file
+
+        def is_file(path: Path) -> bool:
+            if path.is_relative_to(tmp_path / "hub"):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            return usual(path)
+
+        monkeypatch.setattr(Path, "is_file", is_file)
+    elif home == "nobody":
+        monkeypatch.setattr(Path, "expanduser", fail)
+    else:
+        monkeypatch.setenv("TORCH_HOME", "~nosuchuser/torch")
+        monkeypatch.setenv(ENVIRONMENT_VARIABLE, "~nosuchuser/weights")
+    assert find("hardnet") is None
+    if home != "unreadable":
+        assert cache_folder() is None
+        with pytest.raises(OptionError, match="there is no home for a cache"):
+            fetch(["hardnet"])
+    (tmp_path / NAME).write_bytes(some_weights())
+    assert find("hardnet", tmp_path) == tmp_path / NAME

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,8 @@ import pytest
 from PIL import Image, TiffImagePlugin
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.images import conversion
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.reading import decode
 
@@ -95,3 +98,81 @@ def test_folders_that_are_there_and_those_inside_the_old_one_are_refused(
         convert_images(scans, tmp_path / "mine")
     with pytest.raises(OptionError, match="nowhere: no such folder"):
         convert_images(scans / "nowhere", scans)
+
+
+def test_only_what_can_be_decoded_is_copied(scans: Path, tmp_path: Path) -> None:
+    (scans / "secret.txt").write_text("a private key")
+    (scans / "linked.jpg").symlink_to(scans / "secret.txt")
+    (scans / "drawing.jpg").write_text("<svg/>")
+    (scans / "text.png").write_text("%PDF-1.7")
+    picture(7).save(scans / "old.tga")
+    (scans / "old.tga").rename(scans / "old.jpg")
+    for name in ("half.jpg", "half.png"):
+        large = Image.fromarray(np.random.default_rng(1).integers(0, 256, (300, 400, 3), np.uint8))
+        large.save(scans / name)
+        data = (scans / name).read_bytes()
+        (scans / name).write_bytes(data[: len(data) // 2])
+    report = convert_images(scans, tmp_path / "photos")
+    bad = {"linked.jpg", "drawing.jpg", "text.png", "old.jpg", "half.jpg", "half.png"}
+    assert set(report.failures) == {"broken.jp2", *bad}
+    assert report.copied == ["c.jpg"]
+    assert not bad & {path.name for path in (tmp_path / "photos").iterdir()}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+def test_pipes_devices_and_endless_files_are_named_and_the_others_converted(
+    scans: Path, tmp_path: Path
+) -> None:
+    os.mkfifo(scans / "pipe.jpg")
+    os.mkfifo(scans / "box" / "config.toml")  # would say whose the folder is
+    (scans / "zeros.jpg").symlink_to("/dev/zero")
+    with (scans / "huge.jpg").open("wb") as file:
+        file.truncate(1 << 40)
+    report = convert_images(scans, tmp_path / "photos")
+    assert set(report.failures) == {"broken.jp2", "pipe.jpg", "zeros.jpg", "huge.jpg"}
+    assert "is not a file, but a pipe" in report.failures["pipe.jpg"]
+    assert "is not a file, but a device" in report.failures["zeros.jpg"]
+    assert "is 1100 GB long" in report.failures["huge.jpg"]
+    assert report.copied == ["c.jpg"]
+
+
+def test_no_photograph_takes_the_place_of_another(scans: Path, tmp_path: Path) -> None:
+    picture(8).save(scans / "b.webp.png")
+    picture(9).save(scans / "d.tif-page2.png")
+    report = convert_images(scans, tmp_path / "photos")
+    assert report.renamed == {
+        "b.webp.png": "b.webp-2.png",
+        "d.tif-page2.png": "d.tif-page2-2.png",
+    }
+    assert report.written["d.tif"] == ["d.tif-page1.png", "d.tif-page2-2.png"]
+    assert "b.webp-2.png: instead of b.webp.png" in report.summary()
+    made = Image.open(tmp_path / "photos" / "b.webp.png")
+    np.testing.assert_array_equal(made, picture(8))
+    np.testing.assert_array_equal(Image.open(tmp_path / "photos" / "b.webp-2.png"), picture(2))
+
+
+def test_of_a_damaged_page_no_other_page_is_left(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = conversion._as_png
+
+    def as_png(path: Path, data: object, numbers: list[int]) -> Iterator[bytes]:
+        for number, content in enumerate(usual(path, data, numbers)):
+            if number:
+                raise ImageError("damaged")
+            yield content
+
+    monkeypatch.setattr(conversion, "_as_png", as_png)
+    report = convert_images(scans, tmp_path / "photos")
+    assert report.failures["d.tif"] == "damaged"
+    assert not list((tmp_path / "photos").glob("d.tif*"))
+
+
+def test_converted_photographs_with_long_names_get_shorter_ones(tmp_path: Path) -> None:
+    (tmp_path / "scans").mkdir()
+    name = "x" * 250 + ".webp"
+    picture(1).save(tmp_path / "scans" / name)
+    report = convert_images(tmp_path / "scans", tmp_path / "photos")
+    (new,) = report.written[name]
+    assert len(new) == 255
+    assert (tmp_path / "photos" / new).is_file()

@@ -18,7 +18,7 @@ import colmap_affrect
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask
-from colmap_affrect.errors import ImageError
+from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.images.photographs import MaskOptions, Photographs, left_out, list_images
 from colmap_affrect.images.reading import read_mask, shrink_mask
 from colmap_affrect.project.stores import FeatureStore
@@ -204,3 +204,82 @@ def test_videos_are_named_with_what_to_do(photo_path: Path) -> None:
     found = left_out(photo_path.parent)
     assert set(found) == {"*.mp4", "*.mov"}
     assert found["*.mp4"].startswith("1 left out, such as film.MP4: it is a video; take")
+
+
+def test_linked_folders_are_followed_and_each_folder_is_taken_once(tmp_path: Path) -> None:
+    photos, other = tmp_path / "photos", tmp_path / "other"
+    touch(photos, "a.png", "side/b.png")
+    touch(other, "c.png", "deep/d.png")
+    (photos / "0 side again").symlink_to(photos / "side")
+    (photos / "linked").symlink_to(other)
+    (photos / "same").symlink_to(other)
+    (photos / "up").symlink_to(tmp_path)
+    (photos / "side" / "round").symlink_to(photos)
+    (other / "back").symlink_to(photos)
+    (photos / "gone").symlink_to(tmp_path / "nowhere")
+    assert list_images(photos) == ["a.png", "linked/c.png", "linked/deep/d.png", "side/b.png"]
+    (note,) = left_out(photos).items()
+    assert "0 side again/" in note[0]
+    assert note[1].startswith("left out: a link to a folder that is looked through anyway")
+
+
+def test_folders_of_systems_are_left_out_and_named(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "@eaDir/a.jpg/SYNOPHOTO_THUMB_XL.jpg", "in/@eaDir/b.jpg/x.jpg")
+    touch(tmp_path, "#recycle/old.jpg")
+    assert list_images(tmp_path) == ["a.jpg"]
+    found = left_out(tmp_path)
+    assert found["@eaDir/, in/@eaDir/"].startswith("left out: thumbnails that a NAS")
+    assert found["#recycle/"] == "left out: what was deleted, or was there before"
+
+
+def write_transparent(path: Path, mask: Mask, mode: str = "RGBA") -> None:
+    alpha = PIL.Image.fromarray(np.where(mask, 255, 100).astype(np.uint8))
+    gray = texture(mask.shape[::-1], 5)
+    image = PIL.Image.fromarray(np.repeat(gray[:, :, None], 3, axis=2))
+    image.putalpha(alpha)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.convert(mode).save(path)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+@pytest.mark.parametrize("mode", ["RGBA", "LA"])
+def test_the_alpha_channel_is_the_mask_where_there_is_no_file_of_one(
+    tmp_path: Path, name: str, mode: str
+) -> None:
+    mask = diagonal_mask((120, 90))
+    write_transparent(tmp_path / "photos" / name, mask, mode)
+    photographs = Photographs(tmp_path / "photos", MaskOptions(path=str(tmp_path / "masks")))
+    np.testing.assert_array_equal(photographs.mask(name), mask)
+    write_mask(tmp_path / "masks" / "a.png", ~mask)
+    np.testing.assert_array_equal(photographs.mask(name), ~mask)
+
+
+def test_an_alpha_channel_that_is_one_value_all_over_is_no_mask(tmp_path: Path) -> None:
+    for name, is_seen in (("opaque.png", True), ("empty.png", False)):
+        write_transparent(tmp_path / name, np.full((90, 120), is_seen))
+        assert Photographs(tmp_path).mask(name) is None
+
+
+def test_masks_that_are_white_all_over_are_named_in_one_line(
+    photo_path: Path, tmp_path: Path, call: Call
+) -> None:
+    write_mask(tmp_path / "masks" / "a b.png", np.ones(IMAGE_SIZE[::-1], bool))
+    arguments = ["--image-path", photo_path.parent, "--mask-path", tmp_path / "masks"]
+    done = call("extract", *arguments, "--output-path", tmp_path / "out")
+    assert done.code == 0
+    (line,) = [line for line in done.stderr if "white" in line]
+    assert line.startswith("WARNING: white masks: 1 masks are white all over, such as that of a b")
+
+
+@pytest.mark.parametrize("place", ["photos", "photos/masks"])
+def test_masks_that_are_photographs_are_refused(tmp_path: Path, place: str) -> None:
+    touch(tmp_path / "photos", "a.png", "b.jpg", "masks/a.png")
+    names = list_images(tmp_path / "photos")
+    for masks in (
+        MaskOptions(path=str(tmp_path / place)),
+        MaskOptions(camera_path=str(tmp_path / "photos" / "b.jpg")),
+    ):
+        with pytest.raises(OptionError, match="is one of the photographs in"):
+            Photographs(tmp_path / "photos", masks).without_mask(names)
+    beside = MaskOptions(path=str(tmp_path / "photos" / "masks"))
+    assert Photographs(tmp_path / "photos", beside).without_mask(["a.png", "b.jpg"]) == ["b.jpg"]

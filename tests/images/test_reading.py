@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import time
 import warnings
@@ -130,3 +132,30 @@ def test_threads_that_read_headers_leave_filters_of_warnings(tmp_path: Path) -> 
         for duration_s in (0.1, 0.3):  # the one that begins later ends later
             threads.submit(read_header, path, lambda _, s=duration_s: time.sleep(s))
     assert warnings.filters == before
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 255.0), (-1.0, 1.0), (-9.0, -5.0), (0.0, 1e6)])
+def test_floats_of_any_range_are_seen(tmp_path: Path, low: float, high: float) -> None:
+    ramp = np.linspace(low, high, 4000, dtype=np.float32).reshape(50, 80)
+    path = write_image(tmp_path / "x.tif", ramp)
+    expected = np.linspace(0, 255, 4000).reshape(50, 80)
+    assert_allclose(read_gray(path).astype(float), expected, atol=40)
+    assert len(np.unique(read_gray(path))) > 200
+    assert_allclose(read_color(path, 80)[:, :, 0].astype(float), expected, atol=40)
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="only Linux has such a file")
+def test_a_file_whose_content_cannot_be_read_is_an_image_that_cannot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "x.jpg").symlink_to("/proc/self/mem")
+    with pytest.raises(ImageError, match=r"x\.jpg: "):
+        decode(tmp_path / "x.jpg")
+    (tmp_path / "y.jpg").write_bytes(b"content")
+
+    def fail(_: Path) -> object:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr("colmap_affrect.images.reading.open_regular", fail)
+    with pytest.raises(ImageError, match=r"y\.jpg: cannot be read \(Input/output error\)"):
+        decode(tmp_path / "y.jpg")

@@ -146,3 +146,17 @@ def test_nothing_is_overwritten_and_no_model_is_said(tmp_path: Path) -> None:
     wrong = Reference(positions_path=tmp_path / "x", distances=reference.distances)
     with pytest.raises(OptionError, match="leave it out"):
         align(tmp_path / "model", tmp_path / "new", wrong)
+
+
+def test_names_may_begin_with_a_hyphen_and_hold_commas(tmp_path: Path, call: Call) -> None:
+    model = write_model(tmp_path / "model")
+    model.find_image_with_name("a.png").name = "-rf.png"
+    model.find_image_with_name("b.png").name = "b,c.png"
+    model.write(tmp_path / "model")
+    known = ["align", "--model-path", tmp_path / "model", "--output-path"]
+    for number, given in enumerate(['-rf.png,"b,c.png",2', '"b,c.png",-rf.png,2']):
+        done = call(*known, tmp_path / f"new{number}", "--distance", given)
+        assert (done.code, done.stderr) == (0, [])
+    refused = call(*known, tmp_path / "new", "--distance", "-rf.png,b,c.png,2")
+    assert refused.code == 2
+    assert "give A,B,METRES, a name that holds a comma in double quotes" in refused.errors[0]

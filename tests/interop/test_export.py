@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import shutil
+import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import Call
 from exported_model import write_model, write_photographs
+from filelock import FileLock
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.errors import AffrectError, ImageError, OptionError, WorkspaceError
 from colmap_affrect.interop.export import FORMATS, export
 
 
@@ -116,3 +121,89 @@ def test_command_names_what_it_wrote(tmp_path: Path, call: Call) -> None:
     assert all(Path(line.split()[1]).exists() for line in done.stdout.splitlines())
     help_text = call("export", "--help").stdout
     assert all(name in help_text for name in FORMATS)
+
+
+@pytest.mark.parametrize("name", ["IMG 1.png", " a.png", "a.png ", "#a.png", "a\u3000b.png", ""])
+def test_names_that_text_cannot_hold_are_refused(tmp_path: Path, name: str) -> None:
+    model = write_model(tmp_path / "model")
+    model.find_image_with_name("a.png").name = name
+    model.write(tmp_path / "model")
+    with pytest.raises(OptionError, match="text: cannot hold the image name"):
+        export(tmp_path / "model", tmp_path / "out", ["text", "ply"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_native_writers_that_fail_are_one_line_and_leave_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_model(tmp_path / "model")
+
+    def fail(*_: object) -> None:
+        raise ValueError("[ply.cc:382] Check failed: is_open()")
+
+    for form, method in (("ply", "export_PLY"), ("text", "write_text")):
+        with monkeypatch.context() as patch:
+            patch.setattr(pycolmap.Reconstruction, method, fail)
+            with pytest.raises(WorkspaceError, match=r"out.*: cannot be written \(\[ply\.cc:382\]"):
+                export(tmp_path / "model", tmp_path / "out", [form])
+        assert not (tmp_path / "out").exists()
+
+
+def test_undistortion_that_ends_its_process_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_model(tmp_path / "model")
+    write_photographs(tmp_path / "photos")
+    ended = subprocess.CompletedProcess([], -signal.SIGABRT, b"")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: ended)
+    given = {"image_path": tmp_path / "photos"}
+    why = r"dense: cannot be written \(COLMAP was ended by SIGABRT\)"
+    with pytest.raises(WorkspaceError, match=why):
+        export(tmp_path / "model", tmp_path / "out", ["undistorted"], **given)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_a_run_is_about_to_replace_is_not_called_damaged(tmp_path: Path) -> None:
+    (tmp_path / "out" / "sparse").mkdir(parents=True)
+    model = tmp_path / "out" / "sparse" / "0"
+    with FileLock(tmp_path / "out" / ".lock"):
+        with pytest.raises(WorkspaceError, match="another colmap-affrect is writing this model"):
+            export(model, tmp_path / "new", ["ply"])
+        write_model(model)
+        export(model, tmp_path / "new", ["ply"])
+    shutil.rmtree(model)
+    with pytest.raises(OptionError, match="no such folder"):
+        export(model, tmp_path / "newer", ["ply"])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+@pytest.mark.parametrize("name", ["images.bin", "frames.bin", "points3D.txt"])
+def test_pipes_among_the_files_of_a_model_are_refused(tmp_path: Path, name: str) -> None:
+    write_model(tmp_path / "model")
+    (tmp_path / "model" / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / "model" / name)
+    with pytest.raises(AffrectError, match="is not a file, but a pipe"):
+        export(tmp_path / "model", tmp_path / "out", ["ply"])
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid(), reason="only root mounts disks")
+@pytest.mark.parametrize("limit", ["size=64k", "size=300k", "nr_inodes=4", "nr_inodes=15"])
+@pytest.mark.parametrize("form", ["ply", "text", "undistorted", "nerfstudio", "cameras"])
+def test_small_disks_are_one_line(tmp_path: Path, call: Call, limit: str, form: str) -> None:
+    write_model(tmp_path / "model")
+    write_photographs(tmp_path / "photos")
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", limit, "none", str(disk)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("no disk can be mounted here")
+    try:
+        given = ["--model-path", tmp_path / "model", "--image-path", tmp_path / "photos"]
+        done = call("export", *given, "--output-path", disk / "new", "--format", form)
+        assert done.code in (0, 1)
+        assert len(done.stderr) == done.code
+        assert all("cannot be written (No space left" in line for line in done.stderr)
+        assert not done.code or not list(disk.iterdir())
+    finally:
+        subprocess.run(["umount", disk], check=True)

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from small_comparison import write_scene
 from small_run import small_report
 from synthetic import texture, write_image
@@ -256,3 +262,29 @@ def test_of_many_pairs_twelve_are_shown_and_without_a_model_the_missing_ones(
     assert len(chosen(whole, verified)) == 12
     without = replace(report, models=(), unregistered={"007.jpg": "not registered"})
     assert chosen(without, verified) == {("006.jpg", "007.jpg"): "007.jpg is missing"}
+
+
+def test_a_pair_of_long_names_and_of_a_read_only_folder_is_drawn(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(shutil.copytree(scene, tmp_path / "out"))
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    names = tuple(letter * 240 + ".png" for letter in "xy")
+    for old, new in zip(NAMES, names, strict=False):
+        write_image(photos / new, texture((320, 240), 1))
+        with closing(sqlite3.connect(out / "database.db")) as connection, connection:
+            connection.execute("UPDATE images SET name = ? WHERE name = ?", (new, old))
+    (out / "run.log").write_text("colmap-affrect 0.1.0: output folder\n")
+    shutil.rmtree(out / "sparse")  # which has other names
+    said = pairs.draw_pair(out, names, photos)
+    picture = Path(said.splitlines()[-1])
+    assert picture.is_file()
+    assert len(picture.name) < 255
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(FileLock, "acquire", fail)
+    pairs.draw_pair(out, names, photos, tmp_path / "pair.png")
+    assert (tmp_path / "pair.png").is_file()

@@ -17,6 +17,7 @@ from synthetic import png_of_size, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import StoreError
+from colmap_affrect.images.photographs import list_images
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, read_gray
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
@@ -210,3 +211,45 @@ def test_tiny_images_are_no_obstacle(trio: Path, tmp_path: Path, call: Call) -> 
 def test_float_pixels_that_are_not_finite_are_black_or_white(tmp_path: Path) -> None:
     values = np.array([[np.nan, np.inf, -np.inf, 0.5]], np.float32)
     assert read_gray(write_image(tmp_path / "x.tif", values)).tolist() == [[0, 255, 0, 127]]
+
+
+OF_A_RUN = (
+    "features.h5", "features.h5.journal", "matches.h5", "guided.h5", "config.toml", "cameras.json",
+    "database.db", "database.db.seal", "database.db-wal", "pairs.txt", "run.log", ".lock",
+    "report.json",
+)  # fmt: skip
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+@pytest.mark.parametrize("name", OF_A_RUN)
+def test_pipes_in_the_place_of_results_are_refused(
+    trio: Path, tmp_path: Path, call: Call, name: str
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "config.toml").write_text("format_version = 11")  # it is ours
+    (out / name).unlink(missing_ok=True)
+    os.mkfifo(out / name)
+    if name == "config.toml":
+        (out / "run.log").write_text("colmap-affrect 0.1.0: output folder")
+    ended = call("run", "--image-path", trio, "--output-path", out)
+    assert (ended.code, len(ended.stderr)) == (2, 1)
+    assert f"{name}: is not a file, but a pipe" in ended.errors[0]
+    ended = call("doctor", out)
+    assert ended.code in (0, 1, 2)
+    assert "Traceback" not in "".join(ended.stderr)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+def test_pipes_among_photographs_and_lists_are_one_line(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    os.mkfifo(trio / "side" / "config.toml")
+    os.mkfifo(trio / "side" / "run.log")
+    run = ["run", "--image-path", trio, "--output-path", tmp_path / "out"]
+    os.mkfifo(tmp_path / "list")
+    for option in ("--image-list-path", "--match-list-path", "--cameras-path", "--tie-points"):
+        ended = call(*run, option, tmp_path / "list")
+        assert (ended.code, len(ended.stderr)) == (2, 1)
+        assert "is not a file, but a pipe, which can be read only once" in ended.errors[0]
+    assert list_images(trio) == TRIO

@@ -63,6 +63,7 @@ def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     folder = tmp_path_factory.mktemp("scene")
     shutil.copytree(photos, folder / "photos")
+    (folder / "photos" / "b c.png").rename(folder / "photos" / "b-c.png")  # text has no blanks
     files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
     out = folder / "out"
     for words in (
@@ -93,7 +94,7 @@ def assert_clear(end: Ended, *codes: int) -> None:
 # Part 1: names and links that lead astray.
 
 NAMES = (
-    "{photos}/b c.png", "{world}/elsewhere/new.png", "../../../photos/b c.png",
+    "{photos}/b-c.png", "{world}/elsewhere/new.png", "../../../photos/b-c.png",
     "side/../../../../../photos/x.png", "x.png", "x.png/..", "..", "C:\\x.png", "..\\..\\x.png",
     "\u202egnp.x", "line\nbreak.png", "~/x.png", "-rf.png", "/".join(["deep" * 12] * 20) + "/x.png",
     "dense/images/x.png", "sparse/0/cameras.bin", "",
@@ -118,7 +119,7 @@ def exports(base: Path, photograph: str) -> dict[str, tuple[Words, str]]:
         for model in ("plain", "lens"):
             given = ["--model-path", base / model, *images, "--format", form]
             found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)
-    distance = ["--distance", "b c.png,side/d.png,2.0", "--output-path", "{out}/new"]
+    distance = ["--distance", "b-c.png,side/d.png,2.0", "--output-path", "{out}/new"]
     source = ["--database-path", base / "any.db"]
     image = base / "photos" / photograph
     listed = ["--image-list-path", base / "list.txt"] if (base / "list.txt").exists() else []
@@ -161,7 +162,7 @@ def rename_image(base: Path, name: str) -> None:
     execute(base / "any.db", f"UPDATE images SET name = '{quoted}' WHERE name = 'a.png'")
     with suppress(ValueError, RuntimeError), h5py.File(base / "features.h5", "a") as file:
         file.copy("a.png", name)
-    (base / "list.txt").write_text(f"{name}\nb c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
+    (base / "list.txt").write_text(f"{name}\nb-c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
 
 
 def assert_whole(label: str, out: Path) -> None:
@@ -215,7 +216,7 @@ def test_names_of_images_lead_nowhere_else(
     monkeypatch.setenv("HOME", str(base.parents[2] / "home"))
     name = name.format(photos=base / "photos", world=base.parents[2])
     rename_image(base, name)
-    photograph = "b c.png"
+    photograph = "b-c.png"
     with suppress(OSError):
         photograph = name if (base / "photos" / name).is_file() else photograph
     codes = (0,) if name == "x.png" else (0, 1, 2)
@@ -281,7 +282,7 @@ def reader(name: str, scene: Path, out: Path) -> Words:
         "run": run_words(scene, out),
         "map": ["map", "-q", "--output-path", out],
         "export": ["export", *model, "--format", "ply,text,cameras,undistorted"],
-        "align": ["align", *model, "--distance", "b c.png,side/d.png,2.0"],
+        "align": ["align", *model, "--distance", "b-c.png,side/d.png,2.0"],
         "doctor": ["doctor", "-q", out],
     }[name]
 
@@ -338,6 +339,21 @@ def test_damaged_file_is_mended_or_named(
         doctor = call("doctor", "-q", out)
         assert doctor.code == 1, doctor
         assert Path(name).name in doctor.stdout, doctor
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+@pytest.mark.parametrize("name", [*FILES, "features.h5.journal", "database.db.seal", ".lock"])
+def test_pipe_in_the_place_of_a_file_is_named_at_once(
+    scene: Path, tmp_path: Path, call: Call, name: str
+) -> None:
+    for command in READERS:
+        out = Path(shutil.copytree(scene / "out", tmp_path / command / "out"))
+        (out / name).unlink(missing_ok=True)
+        os.mkfifo(out / name)
+        end = call(*reader(command, scene, out))
+        assert "Traceback" not in end.stdout + "".join(end.stderr), (command, end)
+        assert end.code in (0, 1, 2), (command, end)
+        assert command == "doctor" or len(end.errors) == bool(end.code), (command, end)
 
 
 # Part 3: folders that are not ours.

@@ -24,6 +24,7 @@ from colmap_affrect.images.reading import read_gray
 from colmap_affrect.interop.pycolmap_api import extract_features
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages import extract as extract_stage
 
 FIRST, SECOND = NAMES[:2]
 
@@ -222,3 +223,41 @@ def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
     for name in ("features.h5", "matches.h5"):
         again, fresh = (hdf5_content(out / name) for out in folders)
         assert again == fresh
+
+
+@pytest.mark.parametrize("before", ["_extract_missing", "write_images_and_keypoints"])
+def test_a_photograph_that_vanishes_while_a_run_works_is_left_out(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, before: str
+) -> None:
+    photos = tmp_path / "photos"
+    write_photographs(photos)
+    lost = Path(shutil.copy(photos / "a.png", photos / "z.png"))
+    usual = getattr(extract_stage, before)
+
+    def vanish(*given: object, **named: object) -> object:
+        lost.unlink(missing_ok=True)
+        return usual(*given, **named)
+
+    monkeypatch.setattr(extract_stage, before, vanish)
+    run = ["run", "--image-path", photos, "--output-path", tmp_path / "out", *FAST, "--json"]
+    done = call(*run)
+    assert done.code == 1
+    assert done.errors[0].startswith("error: could not read 1 of the images: z.png; ")
+    assert done.report["images_registered"] == 4
+
+
+def test_a_folder_that_vanishes_while_a_run_works_is_one_line(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = tmp_path / "photos"
+    write_photographs(photos)
+    usual = extract_stage.write_images_and_keypoints
+
+    def vanish(*given: object) -> object:
+        photos.rename(tmp_path / "gone")
+        return usual(*given)
+
+    monkeypatch.setattr(extract_stage, "write_images_and_keypoints", vanish)
+    done = call("run", "--image-path", photos, "--output-path", tmp_path / "out", *FAST)
+    assert (done.code, len(done.errors)) == (2, 1)
+    assert done.errors[0].startswith(f"error: {photos}: no such folder")
