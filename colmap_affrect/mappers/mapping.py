@@ -8,9 +8,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from pydantic import TypeAdapter
 
-from colmap_affrect.colmap.database import image_ids
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
 from colmap_affrect.errors import damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
@@ -38,6 +40,26 @@ def write_summary(summary: ModelSummary, folder: Path) -> None:
     """Keep the summary of the model in a folder."""
     kept = _Kept(file_digests(folder), summary)
     replace_text(folder / SUMMARY, _KEPT.dump_json(kept, indent=2).decode())
+
+
+def copy_with_keypoints(folder: Path, target: Path, database_path: Path) -> None:
+    """Copy a model with the keypoints that the database has got since it was made.
+
+    Args:
+        folder: of the model and its summary.
+        target: new folder of the copy.
+        database_path: the database of the model; new keypoints follow those that there were.
+    """
+    summary = read_summary(folder)
+    model = pycolmap.Reconstruction(folder)
+    with open_database(database_path) as database:
+        for image in model.images.values():
+            keypoints = database.read_keypoints(image.image_id)
+            new = keypoints[image.num_points2D() :, :2].astype(np.float64)
+            for xy in new:
+                image.points2D.append(pycolmap.Point2D(xy))
+    write_model(model, target)
+    write_summary(summary, target)
 
 
 def read_summary(folder: Path) -> ModelSummary:

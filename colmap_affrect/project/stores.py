@@ -4,7 +4,8 @@ Features of the levels of escalation follow each other in the order in which the
 those of ``levels[k]`` end at ``level_ends[k]``. Descriptors of several sizes are filled up with
 zeros, which change no distance. Matches have the attributes ``level``, whose features were matched
 together with those of level 0, and ``tried``, with a bit for each level that was tried. Beside
-them a pair may have matches of one kind of features that are not in use: :class:`Alternative`.
+them a pair may have learned matches that are not in use (:class:`Learned`), and pairs that use
+learned ones have the attribute ``measured_worth``: what the best of measured frames are worth.
 ``guided.h5`` has a group per pair that was matched again by its geometry. Files are opened for one
 image or one batch of pairs and closed again; what is written in between appears as a whole
 (:mod:`colmap_affrect.project.atomic_files`).
@@ -16,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import h5py
 import numpy as np
@@ -39,7 +40,8 @@ STEP = "step"  # level and pairs of the step of escalation that has begun and no
 FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
 IN_VAIN = "all_features_in_vain"  # that list, and whether all features bring no more than some
 CLIMBING = "climbing_list"  # the same, of which there was a model before pairs were matched again
-SCORES = "scores_by_kind"  # of models by one kind of matches alone, and the kind that was chosen
+LOOKED_AT = "learned_looked_at"  # what models of learned matches alone are worth
+RESTORING = "restoring"  # matches are those of better models before, the models not yet
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
@@ -57,21 +59,13 @@ class PairMatches:
     of_some: bool = False  # only of the features with the largest responses
 
 
-Kind = Literal["measured", "learned"]  # of features: whether their frames are measured one by one
-MEASURED: Kind = "measured"
-LEARNED: Kind = "learned"
 Worth = tuple[int, int]  # inliers; where there are none, how many matches confirm each other
 
 
 @dataclass(frozen=True)
-class Alternative:
-    """Matches of a pair that are kept beside those in use, and what they are worth.
+class Learned:
+    """Matches of a pair by learned features, kept beside those in use, and what they are worth."""
 
-    Learned ones are those of the first learned level; measured ones the best that there were before
-    learned ones took their place.
-    """
-
-    kind: Kind
     matches: PairMatches
     worth: Worth
 
@@ -244,6 +238,10 @@ def pair_key(name1: str, name2: str) -> str:
     return f"{name1.replace('/', '-')}/{name2.replace('/', '-')}"
 
 
+LEARNED = "learned_"  # begins the names of datasets and attributes of such matches
+KEPT = ("tried", "measured_worth")  # attributes that stay when a pair has other matches
+
+
 def hloc_matches(pair: PairMatches) -> dict[str, NDArray[Any]]:
     """Return the datasets that hloc has for a pair; in 32 bits where 16 do not suffice."""
     matches0 = np.full(pair.num_keypoints1, -1, np.int64)
@@ -264,7 +262,7 @@ class MatchStore(GroupStore):
         pairs: Iterable[PairMatches],
         tried: Iterable[Names] = (),
         tried_level: int = 0,
-        alternatives: Iterable[Alternative] = (),
+        measured_worths: Mapping[Names, Worth] | None = None,
     ) -> None:
         """Write a batch of pairs.
 
@@ -272,71 +270,85 @@ class MatchStore(GroupStore):
             pairs: matches that take the place of what is there.
             tried: pairs for which a level was tried, with success or without.
             tried_level: that level.
-            alternatives: matches that are kept beside those of their pairs, in the place of others.
+            measured_worths: what the best measured matches are worth, by pair.
         """
         with self._open("a") as file:
             for pair in pairs:
                 self._write_pair(file, pair)
             for names in tried:
                 file[pair_key(*names)].attrs["tried"] |= 1 << tried_level
-            for other in alternatives:
-                self._write_alternative(file, other)
+            for names, worth in (measured_worths or {}).items():
+                file[pair_key(*names)].attrs["measured_worth"] = worth
 
     def _write_pair(self, file: h5py.File, pair: PairMatches) -> None:
+        """Write matches; what is known of the pair besides stays."""
         key = pair_key(*pair.names)
-        is_there = is_complete(file, key)
-        kept = _read_alternatives(file[key], pair.names) if is_there else []
-        tried = int(file[key].attrs["tried"]) if is_there else 0
-        known = {"level": pair.level, "tried": tried | 1 << pair.level, "of_some": pair.of_some}
+        known: dict[str, Any] = {"tried": 0}
+        learned = None
+        if is_complete(file, key):
+            known = {name: file[key].attrs[name] for name in KEPT if name in file[key].attrs}
+            learned = _read_learned(file[key], pair.names)
+        known["tried"] |= 1 << pair.level
+        known |= {"level": pair.level, "of_some": pair.of_some}
         self._write(file, key, hloc_matches(pair), **known)
-        for alternative in kept:
-            self._write_alternative(file, alternative)
+        if learned:
+            self._write_learned(file, learned)
 
-    def _write_alternative(self, file: h5py.File, other: Alternative) -> None:
-        group = file[pair_key(*other.matches.names)]
-        for name, values in hloc_matches(other.matches).items():
-            self._write_dataset(group, f"{other.kind}_{name}", values)
-        group.attrs[f"{other.kind}_level"] = other.matches.level
-        group.attrs[f"{other.kind}_worth"] = other.worth
+    def _write_learned(self, file: h5py.File, learned: Learned) -> None:
+        group = file[pair_key(*learned.matches.names)]
+        for name, values in hloc_matches(learned.matches).items():
+            self._write_dataset(group, LEARNED + name, values)
+        group.attrs[LEARNED + "level"] = learned.matches.level
+        group.attrs[LEARNED + "worth"] = learned.worth
 
-    def alternatives(self, pairs: Sequence[Names], kind: Kind) -> dict[Names, Alternative]:
-        """Return the matches of a kind that are kept beside those in use, where there are any."""
-        found = dict[Names, Alternative]()
+    def keep_learned(self, found: Iterable[Learned]) -> None:
+        """Write learned matches beside those in use."""
+        with self._open("a") as file:
+            for learned in found:
+                self._write_learned(file, learned)
+
+    def learned(self, pairs: Sequence[Names]) -> dict[Names, Learned]:
+        """Return the learned matches that are kept beside those in use, where there are any."""
+        found = dict[Names, Learned]()
         with self._open("r") as file:
             for names in pairs:
-                for other in _read_alternatives(file[pair_key(*names)], names, [kind]):
-                    found[names] = other
+                learned = _read_learned(file[pair_key(*names)], names)
+                if learned:
+                    found[names] = learned
         return found
 
-    def worths(self, pairs: Iterable[Names], kind: Kind) -> dict[Names, tuple[int, Worth]]:
-        """Return level and worth of such matches by pair, without reading them."""
+    def learned_levels(self, pairs: Iterable[Names]) -> dict[Names, int]:
+        """Return the level of these by pair, without reading them; -1 where there are none."""
+        with self._open("r") as file:
+            groups = {names: file[pair_key(*names)] for names in pairs}
+            return {n: int(group.attrs.get(LEARNED + "level", -1)) for n, group in groups.items()}
+
+    def measured_worths(self, pairs: Iterable[Names]) -> dict[Names, Worth]:
+        """Return what the best measured matches of pairs are worth that use others."""
         found = {}
         with self._open("r") as file:
             for names in pairs:
-                group = file[pair_key(*names)]
-                if f"{kind}_level" in group.attrs:
-                    found[names] = int(group.attrs[f"{kind}_level"]), _worth(group, kind)
+                inliers, consistent = file[pair_key(*names)].attrs.get("measured_worth", (0, 0))
+                found[names] = int(inliers), int(consistent)
         return found
 
     def choose(
-        self, chosen: Iterable[PairMatches], kept: Iterable[Alternative], scores: Any = None
+        self, chosen: Iterable[PairMatches], measured_worths: Mapping[Names, Worth], **notes: Any
     ) -> None:
         """Let other matches take the place of those of their pairs, all or none.
 
-        Models that were made before are not gone on from.
-
         Args:
             chosen: matches that are used from now on.
-            kept: what is kept beside them, of those before.
-            scores: what is kept as the note ``SCORES``.
+            measured_worths: what the measured matches were worth that were used, by pair.
+            notes: what is kept with the whole file.
         """
         with self._open("a") as file:
-            file.attrs[SCORES] = json.dumps(scores)
-            file.attrs.pop(CLIMBING, None)
+            for key, value in notes.items():
+                file.attrs[key] = json.dumps(value)
             for pair in chosen:
                 self._write_pair(file, pair)
-            for alternative in kept:
-                self._write_alternative(file, alternative)
+            for names, worth in measured_worths.items():
+                file[pair_key(*names)].attrs["measured_worth"] = worth
 
     def remove(self, images: Iterable[str] = (), pairs: Iterable[Names] = ()) -> None:
         """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
@@ -348,7 +360,7 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, SCORES):
+            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, LOOKED_AT, RESTORING):
                 file.attrs.pop(note, None)
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
@@ -402,19 +414,11 @@ def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatc
     return PairMatches(names, indices, scores, len(matches0), int(group.attrs[f"{prefix}level"]))
 
 
-def _read_alternatives(
-    group: h5py.Group, names: Names, kinds: Iterable[Kind] = (MEASURED, LEARNED)
-) -> list[Alternative]:
-    there = [kind for kind in kinds if f"{kind}_level" in group.attrs]
-    return [
-        Alternative(kind, _read_matches(group, names, f"{kind}_"), _worth(group, kind))
-        for kind in there
-    ]
-
-
-def _worth(group: h5py.Group, kind: Kind) -> Worth:
-    num_inliers, num_consistent = group.attrs[f"{kind}_worth"].tolist()
-    return num_inliers, num_consistent
+def _read_learned(group: h5py.Group, names: Names) -> Learned | None:
+    if LEARNED + "level" not in group.attrs:
+        return None
+    num_inliers, num_consistent = group.attrs[LEARNED + "worth"].tolist()
+    return Learned(_read_matches(group, names, LEARNED), (num_inliers, num_consistent))
 
 
 @dataclass(frozen=True)

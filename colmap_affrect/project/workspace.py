@@ -57,6 +57,7 @@ class Workspace:
         self.pairs = path / "pairs.txt"  # those to match
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
         self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
+        self.best = path / "sparse.best"  # the best models so far, with their matches
         self.config, self.log = path / "config.toml", path / "run.log"  # options; of all runs
         self.report, self.page = path / "report.json", path / "report.html"  # of the last run
         self.cameras = path / "cameras.json"  # what is known of the database's, and from where
@@ -314,7 +315,14 @@ class Workspace:
     def _results(self, stage: str) -> list[Path]:
         """Return what a stage and those after it make."""
         made = {
-            "map": [self.sparse, self.snapshots, self.report, self.page, self.mapped_database],
+            "map": [
+                self.sparse,
+                self.snapshots,
+                self.best,
+                self.report,
+                self.page,
+                self.mapped_database,
+            ],
             "guide": [self.guided],
             "verify": [self.cameras, self.seal, *outputs.database_files(self.database)],
             "match": [self.matches],

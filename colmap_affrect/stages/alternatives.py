@@ -1,34 +1,43 @@
-"""Which kind of matches the models are made of: the best of each pair, or those of one kind alone.
+"""Models beside those that grow step by step: of learned matches alone, and the best ones so far.
 
 Matches of measured frames and learned ones err in different ways: where sides of a thing look
 alike, or only a flat part of a scene is tied, one kind may place photographs wrongly that the other
-places right, and mixed they may not agree at all. So models of learned matches alone are made
-beside those that grow step by step. The kind is chosen for which most relative poses are expected
-to be right.
+places right, and mixed they may not agree at all. More matches can make a model worse, too. So of
+small sets models of learned matches alone are looked at, and the best models so far are kept with
+their matches; what stays in the end is what most relative poses are expected to be right of.
 """
 
+import json
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from colmap_affrect.mappers.base import Mapper
-from colmap_affrect.mappers.mapping import read_summaries
+from colmap_affrect.mappers.mapping import copy_with_keypoints, model_folders, read_summaries
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT
-from colmap_affrect.project.outputs import temporary_folder
+from colmap_affrect.project.atomic_files import cannot_write, replace_text
+from colmap_affrect.project.outputs import remove_own, temporary_folder
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import (
-    LEARNED,
-    MEASURED,
-    SCORES,
-    Alternative,
-    Kind,
+    CLIMBING,
+    LOOKED_AT,
+    RESTORING,
+    MatchStore,
     PairMatches,
+    Worth,
 )
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation
+from colmap_affrect.stages.escalation_policy import SMALL
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.verify import verify_matches
+
+SCORE = "score.json"  # in the folder of the best models
 
 
 def score(models: Sequence[ModelSummary]) -> float:
@@ -42,95 +51,98 @@ def score(models: Sequence[ModelSummary]) -> float:
     return sum(max(0.0, number) for number in expected)
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Scores of the models by one kind of matches alone."""
+def present_score(context: Context) -> float:
+    """Return the score of the models that are there."""
+    return score(read_summaries(context.workspace.sparse))
 
-    by_kind: Mapping[Kind, float] = field(default_factory=dict)
-    is_sure: bool = False  # whether the models of learned matches have all images, and are sure
-    chosen: str = ""  # kind that took the place of the best matches of each pair
+
+# Learned matches alone
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """What models of learned matches alone are worth."""
+
+    score: float  # 0 where there are none
+    is_sure: bool  # of all images
+    score_without: float  # of the first models
+    is_chosen: bool = False
 
     @classmethod
-    def of(cls, context: Context) -> "Scores | None":
+    def of(cls, context: Context) -> "LookedAt | None":
         """Return what is on record; None before learned matching."""
-        known = context.matches.note(SCORES)
-        return cls(**known) if known else None
+        known = context.matches.note(LOOKED_AT)
+        return cls(*known) if known else None
+
+    @property
+    def note(self) -> list[Any]:
+        """What is kept on record."""
+        return [self.score, self.is_sure, self.score_without, self.is_chosen]
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether nothing is left to try with them, or nothing is registered without."""
+        is_better = self.score > self.score_without
+        return is_better and (self.is_sure or not self.score_without)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Learned matches of pairs that use others."""
+
+    matches: Sequence[PairMatches]
+    measured_worths: dict[Pair, Worth]  # of those that are used
 
 
 def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
-    """Map learned matches alone, once, and keep the score on record.
+    """Map learned matches alone, and keep on record what that is worth.
 
     Args:
         escalation: of the workspace; its models are those of the first matches.
         mapper: what makes models.
     """
     context = escalation.context
-    models = read_summaries(context.workspace.sparse)
-    by_kind: dict[Kind, float] = {MEASURED: score(models)}
-    is_sure = False
-    choice = _choice(escalation, LEARNED)
-    if choice.matches:
-        found = _models_of(context, mapper, choice)
-        by_kind[LEARNED] = score(found)
-        is_sure = bool(found) and len(found[0].sure) == len(context.features.names())
-    context.matches.keep_note(SCORES, asdict(Scores(by_kind, is_sure)))
+    choice = _learned_choice(escalation)
+    found = _models_of(context, mapper, choice) if choice.matches else []
+    is_sure = bool(found) and len(found[0].sure) == len(context.features.names())
+    looked_at = LookedAt(score(found), is_sure, present_score(context))
+    context.matches.keep_note(LOOKED_AT, looked_at.note)
 
 
-def choose_kind(escalation: Escalation, *, at_once: bool) -> bool:
-    """Let the matches of one kind take the place of the others if their models are better.
+def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
+    """Let learned matches take the place of the others if their models are better.
 
     Args:
         escalation: of the workspace, with the models that are there.
-        at_once: choose learned matches only if nothing is left to try with them, or nothing is
-            registered without.
+        at_once: choose them only if they are enough.
 
     Returns:
-        Whether other matches were chosen, so that the models must be made again.
+        Whether they were chosen, so that models must be made of them.
     """
     context = escalation.context
-    scores = Scores.of(context)
-    if not scores or scores.chosen:
+    looked_at = LookedAt.of(context)
+    if not looked_at or looked_at.is_chosen:
         return False
-    present = score(read_summaries(context.workspace.sparse))
-    if at_once:  # as it was then, also for a run that was killed since
-        present = scores.by_kind[MEASURED]
-    kind = max(scores.by_kind, key=lambda name: scores.by_kind[name])
-    if scores.by_kind[kind] <= present:
+    # At once: as it was then, also for a run that was killed since.
+    is_wanted = looked_at.is_enough if at_once else looked_at.score > present_score(context)
+    choice = _learned_choice(escalation) if is_wanted else None
+    if not choice or not choice.matches:
         return False
-    if at_once and not (scores.is_sure or present == 0.0):
-        return False
-    choice = _choice(escalation, kind)
-    if not choice.matches:
-        return False
-    chosen = asdict(replace(scores, chosen=kind))
-    context.matches.choose(choice.matches, choice.kept, chosen)
+    chosen = replace(looked_at, is_chosen=True).note
+    notes = {LOOKED_AT: chosen, CLIMBING: None}  # models that are there are not gone on from
+    context.matches.choose(choice.matches, choice.measured_worths, **notes)
     escalation.write()
     return True
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Matches of one kind for pairs that use others."""
-
-    matches: Sequence[PairMatches]
-    kept: Sequence[Alternative]  # measured matches that were in use
-
-
-def _choice(escalation: Escalation, kind: Kind) -> Choice:
-    """Return what changes if all pairs use the matches of a kind that are kept beside others."""
+def _learned_choice(escalation: Escalation) -> Choice:
     states = escalation.states()
-    others = escalation.matches.alternatives(list(states), kind)
-    matches = list[PairMatches]()
-    kept = list[Alternative]()
-    for there in escalation.matches.read(list(others)):
-        other = others[there.names]
-        is_measured = escalation.is_measured[there.level]
-        if (kind == MEASURED and is_measured) or there.level == other.matches.level:
-            continue
-        matches.append(other.matches)
-        if is_measured:
-            kept.append(Alternative(MEASURED, there, states[there.names].worth))
-    return Choice(matches, kept)
+    learned = escalation.matches.learned(list(states))
+    levels = {pair: found.matches.level for pair, found in learned.items()}
+    changed = [pair for pair, level in levels.items() if states[pair].level != level]
+    measured = [pair for pair in changed if escalation.is_measured[states[pair].level]]
+    worths = {pair: states[pair].worth for pair in measured}
+    return Choice([learned[pair].matches for pair in changed], worths)
 
 
 def _models_of(context: Context, mapper: Mapper, choice: Choice) -> list[ModelSummary]:
@@ -141,7 +153,86 @@ def _models_of(context: Context, mapper: Mapper, choice: Choice) -> list[ModelSu
         branch.matches.unlink()  # a link perhaps
         shutil.copy(workspace.matches, branch.matches)
         other = replace(context, workspace=branch, progress=SILENT)
-        other.matches.choose(choice.matches, choice.kept)
+        other.matches.choose(choice.matches, choice.measured_worths)
         verify_matches(other, context.verification)
         guide(other, context.guiding)
         return map_images(other, mapper)[1]
+
+
+# The best models so far
+
+
+def keep_best(context: Context) -> None:
+    """Keep the models that are there, with their matches, if none were better so far.
+
+    Of small sets, and where the models are those of the verified pairs.
+    """
+    workspace = context.workspace
+    is_small = len(context.features.names()) <= SMALL
+    if not is_small or workspace.made_from("map") != context.verified_digest():
+        return
+    present = present_score(context)
+    if present < best_score(context):
+        return
+    with _replaced(workspace.best) as new:
+        new.mkdir()
+        shutil.copytree(workspace.sparse, new / "sparse")
+        shutil.copy(workspace.matches, new / workspace.matches.name)
+        replace_text(new / SCORE, json.dumps(present))
+
+
+def best_score(context: Context) -> float:
+    """Return the score of the best models so far; 0 where none are kept."""
+    path = context.workspace.best / SCORE
+    return float(json.loads(path.read_text())) if path.exists() else 0.0
+
+
+def restore_best(escalation: Escalation) -> bool:
+    """Go back to the best models so far, and to their matches, if those that are there are worse.
+
+    Returns:
+        Whether there were better ones.
+    """
+    context = escalation.context
+    if not context.matches.note(RESTORING):
+        if best_score(context) <= present_score(context):
+            return False
+        before = MatchStore(context.workspace.best / context.workspace.matches.name)
+        pairs = list(escalation.num_inliers())
+        levels = context.matches.levels(pairs)
+        changed = [p for p, level in before.levels(pairs).items() if level != levels[p]]
+        worths = before.measured_worths(changed)
+        context.matches.choose(before.read(changed), worths, **{RESTORING: True})
+    escalation.write()
+    guide(context, context.guiding)
+    workspace = context.workspace
+    with _replaced(workspace.sparse) as new:
+        new.mkdir()
+        for folder in model_folders(workspace.best / "sparse"):
+            copy_with_keypoints(folder, new / folder.name, workspace.database)
+    workspace.record_made_from(map=context.verified_digest())
+    context.matches.keep_note(RESTORING, None)
+    return True
+
+
+def forget_best(context: Context) -> None:
+    """Remove the copy of the best models: those that are there are as good, or of other pairs."""
+    best = context.workspace.best
+    remove_own([best, _partial(best)])
+
+
+def _partial(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.partial")
+
+
+@contextmanager
+def _replaced(folder: Path) -> Iterator[Path]:
+    """Yield the name of a new folder that takes the place of another; AffrectError if it cannot."""
+    new = _partial(folder)
+    remove_own([new])
+    try:
+        yield new
+        remove_own([folder])
+        new.rename(folder)
+    except OSError as error:
+        raise cannot_write(folder, error) from error

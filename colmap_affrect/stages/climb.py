@@ -1,9 +1,8 @@
 """Climb: map, match again what lost and doubtful photographs need, and map on, until nothing helps.
 
 The first model says what is needed: where it is sure of all photographs, nothing more is done.
-Later models begin with those before, and so are not worse, by the evidence. Models of learned
-matches alone are looked at as well (:mod:`colmap_affrect.stages.alternatives`): at once, if these
-leave nothing to try, and at the end.
+Later models begin with those before. Models of learned matches alone are looked at as well, and the
+best ones so far are gone back to in the end (:mod:`colmap_affrect.stages.alternatives`).
 """
 
 import time
@@ -12,9 +11,16 @@ from dataclasses import replace
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import model_folders
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import CLIMBING, FINISHED
+from colmap_affrect.project.stores import CLIMBING, FINISHED, RESTORING
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages.alternatives import Scores, choose_kind, look_at_learned
+from colmap_affrect.stages.alternatives import (
+    LookedAt,
+    choose_learned,
+    forget_best,
+    keep_best,
+    look_at_learned,
+    restore_best,
+)
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, begin
 from colmap_affrect.stages.guide import guide
@@ -36,24 +42,30 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
     """
     escalation, escalated = begin(context, recipe.escalate)
     reports = _mapped_anew(context, mapper, recipe)
+    if context.matches.note(RESTORING):  # a run was killed meanwhile
+        restore_best(escalation)
     escalated = _learned(escalation, mapper, escalated)
-    if choose_kind(escalation, at_once=True):
+    if choose_learned(escalation, at_once=True):
         reports += _mapped_anew(context, mapper, recipe)
+    elif not escalation.has_stepped:
+        reports += _mapped_on(context, mapper, recipe)  # images may have got features
     while True:
         while step := escalation.next_step():
+            keep_best(context)
             escalated = escalation.taken(step, escalated)
         guided, mapped = _mapped_on(context, mapper, recipe)
         reports += [guided, mapped]
-        if mapped.num_done:
+        if mapped.num_done or restore_best(escalation):
             continue
-        if not choose_kind(escalation, at_once=False):
+        if not choose_learned(escalation, at_once=False):
+            forget_best(context)
             return [*reports, escalation.ended(escalated)]
         reports += _mapped_anew(context, mapper, recipe)
 
 
 def _learned(escalation: Escalation, mapper: Mapper, report: StageReport) -> StageReport:
     """Match pairs of a small set by learned matching, once, and look at what that makes alone."""
-    if Scores.of(escalation.context) or escalation.is_over_time:
+    if LookedAt.of(escalation.context) or escalation.is_over_time:
         return report
     step = escalation.learned_pairs()
     if not step:
@@ -71,6 +83,7 @@ def _mapped_anew(context: Context, mapper: Mapper, recipe: Recipe) -> list[Stage
     listed = matches.note(FINISHED)
     if matches.note(CLIMBING) == listed and model_folders(context.workspace.sparse):
         return []
+    forget_best(context)  # of other pairs, or worse
     reports = [guide(context, recipe.guided), map_images(context, mapper)[0]]
     matches.keep_note(CLIMBING, listed)
     return reports

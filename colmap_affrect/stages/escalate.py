@@ -27,14 +27,7 @@ from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain, ModelSummary, StageReport
-from colmap_affrect.project.stores import (
-    LEARNED,
-    MEASURED,
-    STEP,
-    Alternative,
-    PairMatches,
-    Worth,
-)
+from colmap_affrect.project.stores import STEP, Learned, PairMatches, Worth
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.context import Context
@@ -60,7 +53,6 @@ from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers,
 
 logger = logging.getLogger(__name__)
 
-NO_MATCHES: tuple[int, Worth] = (-1, (0, 0))  # level and worth of those that are not there
 LIKELY = 0.25  # part of a gain that counts for images that are likely right: matches mend few
 
 
@@ -119,8 +111,7 @@ def matched_again(context: Context) -> Tried:
     escalation = Escalation(context, context.escalation)
     models = escalation.models()
     needs = escalation.needs(models)
-    has_stepped = escalation.matches.note(STEP) is not None
-    if not (needs or has_stepped):  # large sets take long to go through
+    if not (needs or escalation.has_stepped):  # large sets take long to go through
         return Tried()
     situation = escalation.situation(needs, models)
     return Tried(context.effort, tuple(tried(situation)), tuple(untried(situation)))
@@ -159,6 +150,11 @@ class Escalation:
         """The recipe, prepared for all images when it is needed first."""
         names, context = self.features.names(), self.context
         return prepare(self.extraction, context.resources, names, context.progress)
+
+    @property
+    def has_stepped(self) -> bool:
+        """Whether a step has begun, or was taken."""
+        return self.matches.note(STEP) is not None
 
     @property
     def is_over_time(self) -> bool:
@@ -219,16 +215,16 @@ class Escalation:
         failed = [pair for pair, count in num_inliers.items() if not count]
         num_consistent, levels = self._num_consistent(failed), self.matches.levels
         reached, tried = levels(num_inliers), levels(num_inliers, "tried")
-        measured = self.matches.worths(num_inliers, MEASURED)
-        learned = self.matches.worths(num_inliers, LEARNED)
+        measured = self.matches.measured_worths(num_inliers)
+        learned = self.matches.learned_levels(num_inliers)
         return {
             pair: PairState(
                 count,
                 num_consistent.get(pair, 0),
                 reached[pair],
                 tried[pair],
-                measured_worth=measured.get(pair, NO_MATCHES)[1],
-                learned_level=learned.get(pair, NO_MATCHES)[0],
+                measured_worth=measured[pair],
+                learned_level=learned[pair],
             )
             for pair, count in num_inliers.items()
         }
@@ -323,14 +319,13 @@ class Escalation:
         """
         if pairs:
             self.matches.keep_note(STEP, [level, list(pairs)])
-        known = self.matches.alternatives(pairs, LEARNED)
-        known = {p: other for p, other in known.items() if other.matches.level == level}
+        known = {
+            p: one for p, one in self.matches.learned(pairs).items() if one.matches.level == level
+        }
         unknown = [pair for pair in pairs if pair not in known]
         if known:
             states = self.states()
-            trials = [
-                Trial(other.matches, other.worth, states[pair]) for pair, other in known.items()
-            ]
+            trials = [Trial(one.matches, one.worth, states[pair]) for pair, one in known.items()]
             self._keep(trials, level)
         self._match_with(unknown, level, self._keep)
         self.write()
@@ -354,10 +349,10 @@ class Escalation:
         """Match pairs with the features of a learned level, and keep that beside what is there."""
 
         def keep(batch: Sequence[Trial], _: int) -> None:
-            others = [Alternative(LEARNED, trial.found, trial.worth) for trial in batch]
-            self.matches.write([], alternatives=others)
+            self.matches.keep_learned([Learned(trial.found, trial.worth) for trial in batch])
 
         self._match_with(step.pairs, step.level, keep)
+        self.write()  # the features are keypoints of the database, too
 
     def _match_with(
         self, pairs: Sequence[Pair], level: int, keep: Callable[[Sequence["Trial"], int], None]
@@ -423,20 +418,19 @@ class Escalation:
         """Write the better matches of some trials, and that all were made; all or nothing."""
         better = [trial.found for trial in batch if trial.is_better]
         tried = [trial.found.names for trial in batch]
-        self.matches.write(better, tried, level, self._alternatives(batch))
+        self.matches.write(better, tried, level, self._measured_worths(batch))
 
-    def _alternatives(self, batch: Sequence[Trial]) -> list[Alternative]:
-        """Return the best measured matches of pairs that use learned ones."""
-        kept = list[Alternative]()
+    def _measured_worths(self, batch: Sequence[Trial]) -> dict[Pair, Worth]:
+        """Return what the best measured matches are worth of pairs that use learned ones."""
+        worths = dict[Pair, Worth]()
         for trial in batch:
             was_measured = self.is_measured[trial.before.level]
             is_measured = self.is_measured[trial.found.level]
             if was_measured and not is_measured and trial.is_better:
-                (before,) = self.matches.read([trial.found.names])
-                kept.append(Alternative(MEASURED, before, trial.before.worth))
-            elif is_measured and not was_measured and trial.worth > trial.before.measured_worth:
-                kept.append(Alternative(MEASURED, trial.found, trial.worth))
-        return kept
+                worths[trial.found.names] = trial.before.worth
+            elif is_measured and not was_measured:
+                worths[trial.found.names] = max(trial.worth, trial.before.measured_worth)
+        return worths
 
     def _worth(self, found: PairMatches, verifier: PairVerifier) -> Worth:
         """Return the inliers of a pair, or without any how many matches confirm each other."""

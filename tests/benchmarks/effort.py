@@ -32,7 +32,7 @@ from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.stores import SCORES
+from colmap_affrect.project.stores import LOOKED_AT
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages import climb as climbing
 from colmap_affrect.stages.context import Context
@@ -137,7 +137,7 @@ def spent(context: Context) -> Row:
         "hope": round(
             max(situation.best_at(k, math.inf).all_photographs for k in situation.usable), 3
         ),
-        "scores": context.matches.note(SCORES),
+        "scores": context.matches.note(LOOKED_AT),
     }
 
 

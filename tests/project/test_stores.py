@@ -13,10 +13,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import StoreError
 from colmap_affrect.project.stores import (
-    LEARNED,
-    MEASURED,
-    Alternative,
     FeatureStore,
+    Learned,
     MatchStore,
     PairMatches,
     pair_key,
@@ -228,7 +226,9 @@ def test_file_that_somebody_else_has_written_is_read_again(store: FeatureStore) 
     assert store.num_keypoints() == {"b.png": 3}
 
 
-def test_matches_kept_beside_those_in_use_stay_when_these_change(matches: MatchStore) -> None:
+def test_learned_matches_kept_beside_those_in_use_stay_when_these_change(
+    matches: MatchStore,
+) -> None:
     names = ("a.png", "b c.png")
 
     def found(*rows: tuple[int, int], level: int = 0) -> PairMatches:
@@ -236,23 +236,28 @@ def test_matches_kept_beside_those_in_use_stay_when_these_change(matches: MatchS
         return PairMatches(names, indices, np.full(len(rows), 0.5, np.float32), 9, level)
 
     matches.write([found((0, 3), (2, 1))])
-    learned = Alternative(LEARNED, found((4, 7), level=2), (12, 0))
-    measured = Alternative(MEASURED, found((5, 5), level=1), (0, 3))
-    matches.write([], [names], 3, [learned, measured])
+    learned = Learned(found((4, 7), level=2), (12, 0))
+    matches.keep_learned([learned])
+    matches.write([], [names], 3, {names: (0, 5)})
     matches.write([found((1, 1), (3, 8), level=4)])
     (used,) = matches.read([names])
     assert_array_equal(used.indices, [[1, 1], [3, 8]])
-    for kept in (learned, measured):
-        (there,) = matches.alternatives([names], kept.kind).values()
-        assert_array_equal(there.matches.indices, kept.matches.indices)
-        assert there.matches.level == kept.matches.level
-        assert there.worth == kept.worth
-        assert matches.worths([names], kept.kind) == {names: (kept.matches.level, kept.worth)}
+    (kept,) = matches.learned([names]).values()
+    assert_array_equal(kept.matches.indices, learned.matches.indices)
+    assert (kept.matches.level, kept.worth) == (2, (12, 0))
+    assert matches.learned_levels([names]) == {names: 2}
+    assert matches.measured_worths([names]) == {names: (0, 5)}
     assert matches.levels([names], "tried") == {names: 0b11001}
+    matches.choose([learned.matches], {names: (3, 0)}, note=[1, "a"])
+    (used,) = matches.read([names])
+    assert (used.level, used.indices.tolist()) == (2, [[4, 7]])
+    assert matches.measured_worths([names]) == {names: (3, 0)}
+    assert matches.note("note") == [1, "a"]
 
 
-def test_pairs_without_matches_beside_those_in_use_have_none(matches: MatchStore) -> None:
+def test_pairs_without_learned_matches_beside_those_in_use_have_none(matches: MatchStore) -> None:
     names = ("a.png", "b c.png")
     matches.write([PairMatches(names, np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)])
-    assert matches.alternatives([names], LEARNED) == {}
-    assert matches.worths([names], MEASURED) == {}
+    assert matches.learned([names]) == {}
+    assert matches.learned_levels([names]) == {names: -1}
+    assert matches.measured_worths([names]) == {names: (0, 0)}

@@ -3,41 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from results import database_content
 from small_scene import NAMES
 from verified import copy_of, verified
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import (
-    CLIMBING,
-    FINISHED,
-    LEARNED,
-    MEASURED,
-    SCORES,
-    Alternative,
-)
+from colmap_affrect.project.stores import CLIMBING, FINISHED, RESTORING
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.stages import alternatives, climb
 from colmap_affrect.stages.alternatives import (
     Choice,
-    Scores,
-    choose_kind,
+    LookedAt,
+    best_score,
+    choose_learned,
+    forget_best,
+    keep_best,
     look_at_learned,
+    present_score,
+    restore_best,
     score,
 )
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, begin
 from colmap_affrect.stages.expected_gain import Step
+from colmap_affrect.stages.map import map_images
 
 RECIPE = """
 [rectifier]
@@ -104,15 +105,14 @@ def with_models(monkeypatch: pytest.MonkeyPatch, *, found: ModelSummary) -> list
 
 def test_learned_matches_are_kept_beside_those_that_are_there(context: Context) -> None:
     pairs = escalation_of(context).pairs
-    others = context.matches.alternatives(list(pairs), LEARNED)
+    learned = context.matches.learned(list(pairs))
     assert levels(context) == {0}
-    assert set(others) == set(pairs)
-    assert not context.matches.alternatives(list(pairs), MEASURED)
+    assert set(learned) == set(pairs)
     states = escalation_of(context).states()
-    for pair, other in others.items():
-        assert other.matches.level == 1
-        assert other.matches.names == pair
-        assert 0 < other.worth[0] < states[pair].num_inliers
+    for pair, kept in learned.items():
+        assert kept.matches.level == 1
+        assert kept.matches.names == pair
+        assert 0 < kept.worth[0] < states[pair].num_inliers
         assert (states[pair].tried, states[pair].learned_level) == (1, 1)
 
 
@@ -121,18 +121,20 @@ def test_step_takes_matches_that_are_kept_and_matches_nothing_anew(
 ) -> None:
     escalation = escalation_of(context)
     (pair, *_) = escalation.pairs
-    (there,) = context.matches.read([pair])
-    none = replace(there, indices=there.indices[:0], scores=there.scores[:0])
-    context.matches.write([none])
-    escalation.write()
-    (other,) = context.matches.alternatives([pair], LEARNED).values()
+    without_matches(escalation, pair)
+    (kept,) = context.matches.learned([pair]).values()
     monkeypatch.setattr("colmap_affrect.stages.escalate.matched_at_level", None)
     escalation.match_at([pair], 1)
     state = escalation.states()[pair]
-    assert (state.level, state.num_inliers, state.tried) == (1, other.worth[0], 0b11)
+    assert (state.level, state.num_inliers, state.tried) == (1, kept.worth[0], 0b11)
     assert (state.measured_worth, state.learned_level) == ((0, 0), 1)
-    (measured,) = context.matches.alternatives([pair], MEASURED).values()
-    assert len(measured.matches.indices) == 0
+
+
+def without_matches(escalation: Escalation, pair: tuple[str, str]) -> None:
+    (there,) = escalation.matches.read([pair])
+    none = replace(there, indices=there.indices[:0], scores=there.scores[:0])
+    escalation.matches.write([none])
+    escalation.write()
 
 
 def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
@@ -141,27 +143,28 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     escalation = escalation_of(context)
     better = replace(UNSURE, probabilities=dict.fromkeys(NAMES[:2], 0.9))
     asked = with_models(monkeypatch, found=better)
-    others = context.matches.alternatives(list(escalation.pairs), LEARNED)
+    learned = context.matches.learned(list(escalation.pairs))
+    before = escalation.states()
     context.matches.keep_note(CLIMBING, context.matches.note(FINISHED))
     look_at_learned(escalation, mapper)
     assert len(asked) == 1
-    assert not choose_kind(escalation, at_once=True)  # more may be tried without them
+    assert not choose_learned(escalation, at_once=True)  # more may be tried without them
     assert levels(context) == {0}
-    assert choose_kind(escalation, at_once=False)
-    scores = Scores.of(context)
-    assert scores
-    assert scores.by_kind == pytest.approx({MEASURED: 0.2, LEARNED: 0.8})
-    assert scores.chosen == LEARNED
+    assert choose_learned(escalation, at_once=False)
+    looked_at = LookedAt.of(context)
+    assert looked_at
+    assert (looked_at.score, looked_at.score_without) == pytest.approx((0.8, 0.2))
+    assert looked_at.is_chosen
     assert context.matches.note(CLIMBING) is None  # models that are there are not gone on from
     assert levels(context) == {1}
     ids = image_ids(context.workspace.database)
     with open_database(context.workspace.database) as database:
-        for pair, other in others.items():
+        for pair, kept in learned.items():
             stored = database.read_matches(*(ids[name] for name in pair))
-            assert_array_equal(stored, other.matches.indices)
-    measured = context.matches.alternatives(list(escalation.pairs), MEASURED)
-    assert {other.matches.level for other in measured.values()} == {0}
-    assert not choose_kind(escalation, at_once=False)  # that is decided
+            assert_array_equal(stored, kept.matches.indices)
+    for pair, state in escalation.states().items():
+        assert state.measured_worth == before[pair].worth
+    assert not choose_learned(escalation, at_once=False)  # that is decided
 
 
 def test_learned_models_that_are_sure_of_all_are_chosen_at_once(
@@ -170,7 +173,7 @@ def test_learned_models_that_are_sure_of_all_are_chosen_at_once(
     sure = replace(UNSURE, registered_names=NAMES, probabilities=dict.fromkeys(NAMES, 0.95))
     with_models(monkeypatch, found=sure)
     look_at_learned(escalation_of(context), mapper)
-    assert choose_kind(escalation_of(context), at_once=True)
+    assert choose_learned(escalation_of(context), at_once=True)
     assert levels(context) == {1}
 
 
@@ -180,7 +183,7 @@ def test_any_learned_model_is_chosen_at_once_where_there_is_none(
     with_models(monkeypatch, found=UNSURE)
     monkeypatch.setattr(alternatives, "read_summaries", lambda _: [])
     look_at_learned(escalation_of(context), mapper)
-    assert choose_kind(escalation_of(context), at_once=True)
+    assert choose_learned(escalation_of(context), at_once=True)
 
 
 def test_learned_models_that_are_no_better_change_nothing(
@@ -189,31 +192,10 @@ def test_learned_models_that_are_no_better_change_nothing(
     with_models(monkeypatch, found=UNSURE)
     before = database_content(context.workspace.database)
     look_at_learned(escalation_of(context), mapper)
-    assert not choose_kind(escalation_of(context), at_once=True)
-    assert not choose_kind(escalation_of(context), at_once=False)
+    assert not choose_learned(escalation_of(context), at_once=True)
+    assert not choose_learned(escalation_of(context), at_once=False)
     assert levels(context) == {0}
     assert database_content(context.workspace.database) == before
-
-
-def test_measured_matches_alone_come_back_where_models_were_better_before(
-    context: Context, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    escalation = escalation_of(context)
-    pairs = list(escalation.pairs)
-    before = {found.names: found for found in context.matches.read(pairs)}
-    others = context.matches.alternatives(pairs, LEARNED)
-    escalation.matches.choose(
-        [others[pair].matches for pair in pairs[:2]],
-        [Alternative(MEASURED, before[pair], (100, 0)) for pair in pairs[:2]],
-    )
-    escalation.write()
-    assert levels(context) == {0, 1}
-    with_models(monkeypatch, found=UNSURE)
-    context.matches.keep_note(SCORES, asdict(Scores({MEASURED: 0.5, LEARNED: 0.3})))
-    assert choose_kind(escalation, at_once=False)
-    assert levels(context) == {0}
-    for found in context.matches.read(pairs):
-        assert_array_equal(found.indices, before[found.names].indices)
 
 
 def test_score_counts_poses_that_are_expected_to_be_right() -> None:
@@ -224,6 +206,105 @@ def test_score_counts_poses_that_are_expected_to_be_right() -> None:
     assert score([three]) == pytest.approx(1.7)
     assert score([pair, pair]) < score([three])
     assert score([replace(UNSURE, probabilities={"a": 0.2, "b": 0.2})]) == 0.0
+
+
+@pytest.fixture(scope="module")
+def mapped(matched: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    workspace = copy_of(matched, tmp_path_factory.mktemp("mapped") / "out")
+    map_images(Context(workspace), MAPPERS.make(MAPPERS.options("sparse")))
+    return workspace
+
+
+def made_worse(workspace: Workspace, mapper: Mapper) -> Escalation:
+    """Keep the models, take the matches of a photograph away, and map again.
+
+    Images get more features meanwhile.
+    """
+    context = Context(workspace)
+    escalation = escalation_of(context)
+    keep_best(context)
+    more = context.features.read(NAMES[1]).select(np.arange(7))
+    context.features.extend(NAMES[1], more, 2)
+    for pair in escalation.pairs:
+        if NAMES[0] in pair:
+            (there,) = escalation.matches.read([pair])
+            none = replace(there, indices=there.indices[:0], scores=there.scores[:0], level=1)
+            escalation.matches.write([none])
+    escalation.write()
+    map_images(context, mapper)
+    assert present_score(context) < best_score(context)
+    return escalation
+
+
+def test_best_models_and_their_matches_come_back(
+    mapped: Workspace, mapper: Mapper, tmp_path: Path
+) -> None:
+    workspace = copy_of(mapped, tmp_path / "out")
+    summaries = read_summaries(workspace.sparse)
+    before = database_content(workspace.database)
+    old = pycolmap.Reconstruction(workspace.sparse / "0")
+    escalation = made_worse(workspace, mapper)
+    context = escalation.context
+    keep_best(context)  # worse ones take no place
+    assert restore_best(escalation)
+    assert read_summaries(workspace.sparse) == summaries
+    after = database_content(workspace.database)
+    assert after.keys() == before.keys()
+    for table in before.keys() - {"keypoints"}:
+        assert after[table] == before[table]
+    assert levels(context) == {0}
+    model = pycolmap.Reconstruction(workspace.sparse / "0")
+    with open_database(workspace.database) as database:
+        for image in model.images.values():
+            keypoints = database.read_keypoints(image.image_id)
+            assert image.num_points2D() == len(keypoints)
+            assert_array_equal([point.xy for point in image.points2D], keypoints[:, :2])
+            was = old.images[image.image_id]
+            ids = [point.point3D_id for point in image.points2D]
+            assert ids[: was.num_points2D()] == [point.point3D_id for point in was.points2D]
+            assert image.num_points3D == was.num_points3D
+    assert model.num_points3D() == old.num_points3D()
+    tried = context.matches.levels(escalation.pairs, "tried")
+    assert {levels for pair, levels in tried.items() if NAMES[0] in pair} == {0b11}
+    assert map_images(context, mapper, goes_on=True)[0].num_done == 0  # nothing is mapped anew
+    assert not restore_best(escalation)
+    forget_best(context)
+    assert best_score(context) == 0.0
+    assert not workspace.best.exists()
+
+
+@pytest.mark.parametrize("where", ["guide", "_replaced"])
+def test_run_killed_while_it_goes_back_does_so_afterwards(
+    mapped: Workspace, mapper: Mapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    workspace = copy_of(mapped, tmp_path / "out")
+    summaries = read_summaries(workspace.sparse)
+    content = database_content(workspace.database)
+    before = {table: rows for table, rows in content.items() if table != "keypoints"}
+    escalation = made_worse(workspace, mapper)
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(alternatives, where, killed)
+        with pytest.raises(KeyboardInterrupt):
+            restore_best(escalation)
+    assert escalation.matches.note(RESTORING)
+    assert restore_best(escalation)
+    assert not escalation.matches.note(RESTORING)
+    assert read_summaries(workspace.sparse) == summaries
+    after = database_content(workspace.database)
+    assert {k: v for k, v in after.items() if k != "keypoints"} == before
+
+
+def test_models_of_other_pairs_than_the_verified_ones_are_not_kept(
+    mapped: Workspace, tmp_path: Path
+) -> None:
+    context = Context(copy_of(mapped, tmp_path / "out"))
+    without_matches(escalation_of(context), escalation_of(context).pairs[0])
+    keep_best(context)
+    assert not context.workspace.best.exists()
 
 
 @pytest.mark.long
@@ -240,15 +321,15 @@ def test_run_killed_after_the_choice_maps_the_chosen_matches(
     whole, killed = (Context(space) for space in spaces)
     climb.climb(whole, mapper, recipe)
     with monkeypatch.context() as patch:
-        patch.setattr(Escalation, "write", interrupted_at_second_call())
+        patch.setattr(Escalation, "write", interrupted_at_third_call())
         with pytest.raises(KeyboardInterrupt):
             climb.climb(killed, mapper, recipe)
     goes_on = list[bool]()
-    map_images = climb.map_images
+    map_once = climb.map_images
 
     def watched(context: Context, mapper: Mapper, **how: bool) -> object:
         goes_on.append(how.get("goes_on", False))
-        return map_images(context, mapper, **how)
+        return map_once(context, mapper, **how)
 
     monkeypatch.setattr(climb, "map_images", watched)
     climb.climb(killed, mapper, recipe)
@@ -261,13 +342,13 @@ def test_run_killed_after_the_choice_maps_the_chosen_matches(
     assert models[0] == models[1]
 
 
-def interrupted_at_second_call() -> Callable[[Escalation], None]:
+def interrupted_at_third_call() -> Callable[[Escalation], None]:
     written = Escalation.write
     calls = list[int]()
 
     def write(escalation: Escalation) -> None:
         calls.append(1)
-        if len(calls) == 2:
+        if len(calls) == 3:  # after those of begin and learn
             raise KeyboardInterrupt
         written(escalation)
 

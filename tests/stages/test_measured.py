@@ -14,7 +14,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import Alternative, PairMatches
+from colmap_affrect.project.stores import PairMatches, Worth
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import map as stage
@@ -104,9 +104,10 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
         found: list[PairMatches],
         tried: list[tuple[str, str]],
         level: int,
-        alternatives: list[Alternative],
+        worths: dict[tuple[str, str], Worth],
     ) -> None:
-        written(found[:2], tried[:2], level, alternatives[:2])
+        kept = {pair: worth for pair, worth in worths.items() if pair in tried[:2]}
+        written(found[:2], tried[:2], level, kept)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
