@@ -144,6 +144,11 @@ def _work() -> NoReturn:
             raise
     if code == EXIT_INTERRUPTED:  # threads may be in the middle of something long
         os._exit(code)
+    _end(code)
+
+
+def _end(code: int | str | None) -> NoReturn:
+    """End this process, and do not mind that nobody reads what is printed any more."""
     for number in SIGNALS:  # too late to change anything
         signal.signal(number, signal.SIG_IGN)
     try:

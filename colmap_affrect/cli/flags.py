@@ -82,7 +82,8 @@ FLAGS: dict[str, Settings] = {
         "scheduler, such as tcp://10.0.0.1:8786 (pip install 'colmap-affrect[cluster]'); "
         "default: on this machine"),
     # photographs, masks and cameras
-    "--image-path": _path("PATH", "folder of the photographs, searched with its sub-folders"),
+    "--image-path": _path("PATH", "folder of the photographs, searched with its sub-folders, "
+        "linked ones too"),
     "--image-list-path": _path("FILE",
         "names of the images to use, one per line, relative to --image-path"),
     "--from-database": _path("FILE",

@@ -32,7 +32,7 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         # A Ctrl-C while pycolmap converts a Path would become a TypeError.
         database = pycolmap.Database.open(str(path))
     except NotAFileError as error:
-        raise DatabaseError(f"{path}: {error}; give a COLMAP database") from error
+        raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error
     except RuntimeError as error:
         require_space(path, BYTES_OF_EMPTY_DATABASE)
         raise DatabaseError(

@@ -9,8 +9,9 @@ COLMAP's own SIFT goes another way to features and matches.
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.errors import AffrectError, StoreError
+from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database
@@ -63,13 +65,35 @@ def extract_sift(
     photographs = Photographs(image_path, masks)
     impossible = {name: why for name in image_names if (why := photographs.why_impossible(name))}
     usable = [name for name in image_names if name not in impossible]
-    reader = pycolmap.ImageReaderOptions(mask_path=masks.path, camera_mask_path=masks.camera_path)
-    if usable:  # pycolmap takes no names for all
-        pycolmap.extract_features(database_path, image_path, usable, reader_options=reader)
+    with _masks_for_colmap(photographs, usable) as mask_path:
+        reader = pycolmap.ImageReaderOptions(
+            mask_path=mask_path, camera_mask_path=masks.camera_path
+        )
+        if usable:  # pycolmap takes no names for all
+            pycolmap.extract_features(database_path, image_path, usable, reader_options=reader)
     ids = image_ids(database_path)
     with open_database(database_path) as database:
         failed = [name for name in usable if not database.exists_keypoints(ids[name])]
     return impossible | dict.fromkeys(failed, "COLMAP cannot read it or its mask")
+
+
+@contextmanager
+def _masks_for_colmap(photographs: Photographs, names: Sequence[str]) -> Iterator[str]:
+    """Yield a folder of masks that has those of alpha channels, too: COLMAP does not look there."""
+    own = {name: photographs.own_mask(name) for name in names}
+    alphas = photographs.alpha_masks([name for name in names if not own[name]])
+    if not alphas:
+        yield photographs.masks.path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            target = Path(folder) / f"{name}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if name in alphas:
+                replace_bytes(target, reading.encode_mask(alphas[name]))
+            elif path := own[name]:
+                shutil.copy(path, target)
+        yield folder
 
 
 def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:

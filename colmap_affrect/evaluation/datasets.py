@@ -181,7 +181,8 @@ def stem(name: str) -> str:
 @contextmanager
 def _damaged(path: Path) -> Iterator[None]:
     with damage(path, "see docs/own-evaluation-set.md for the format"):
-        require_regular(path)
+        if not path.is_dir():
+            require_regular(path)
         yield
 
 

@@ -4,7 +4,8 @@ import os
 import posixpath
 import unicodedata
 from collections import defaultdict, deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
@@ -83,7 +84,8 @@ class Photographs:
 
         Where an image has no file of its own for it, its alpha channel is its mask.
         """
-        paths = [path for path in self._mask_paths(name) if path.is_file()][:1]
+        own = self.own_mask(name)
+        paths = [own] if own else []
         alpha = None if paths else reading.alpha_mask(self.folder / name)
         paths += [Path(self.masks.camera_path)] if self.masks.camera_path else []
         size = reading.header_size(self.folder / name)
@@ -101,6 +103,20 @@ class Photographs:
                 )
         return np.logical_and.reduce(masks) if masks else None
 
+    def own_mask(self, name: str) -> Path | None:
+        """Return the file of the mask of an image alone, None where it has none."""
+        return next((path for path in self._mask_paths(name) if path.is_file()), None)
+
+    def alpha_masks(self, names: Iterable[str]) -> dict[str, Mask]:
+        """Return the (H, W) masks of the alpha channels of images, as far as they have some."""
+        found: dict[str, Mask] = {}
+        for name in names:
+            with suppress(ImageError):  # who reads the image will find out
+                mask = reading.alpha_mask(self.folder / name)
+                if mask is not None:
+                    found[name] = mask
+        return found
+
     def without_mask(self, names: Sequence[str]) -> list[str]:
         """Return the images without a mask, if masks are given.
 
@@ -108,7 +124,7 @@ class Photographs:
         """
         self._refuse_photographs(names)
         paths = {name: self._mask_paths(name) for name in names if self.masks.path}
-        found = [name for name in paths if not any(path.is_file() for path in paths[name])]
+        found = [name for name in paths if not self.own_mask(name)]
         if found and len(found) == len(names):
             raise OptionError(
                 f"--mask-path {self.masks.path}: has no mask of any image, such as "
@@ -228,42 +244,59 @@ def folders_left_out(folder: Path) -> dict[str, str]:
 
 
 def _walk(folder: Path, suffixes: Collection[str]) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the files below a folder that end so, and notes of what is left out.
+    """Return the names of the files below a folder that end so, and notes of what is left out."""
+    walk = _Walk(folder, suffixes)
+    while walk.ahead or walk.linked:
+        walk.enter(walk.ahead.popleft() if walk.ahead else walk.linked.popleft())
+    return walk.found, {
+        such_as(map(one_line, names)): f"left out: {why}" for why, names in walk.left_out.items()
+    }
+
+
+class _Walk:
+    """A search for files below a folder.
 
     Links are followed after all else, so that a folder that is here and linked has its own name.
     """
-    found: list[str] = []
-    left_out: defaultdict[str, list[str]] = defaultdict(list)
-    seen = {_identity(path) for path in folder.resolve().parents}
-    ahead = deque([folder])
-    linked = deque[Path]()
-    while ahead or linked:
-        path = ahead.popleft() if ahead else linked.popleft()
-        below = "" if path == folder else f"{path.relative_to(folder).as_posix()}/"
+
+    def __init__(self, folder: Path, suffixes: Collection[str]) -> None:
+        self.folder = folder
+        self.suffixes = suffixes
+        self.found: list[str] = []
+        self.left_out: defaultdict[str, list[str]] = defaultdict(list)
+        self.ahead = deque([folder])
+        self.linked = deque[Path]()
+        self.seen = {_identity(path) for path in folder.resolve().parents}
+
+    def enter(self, path: Path) -> None:
+        """Look through a folder, but not through those in it, if nobody has done that."""
+        below = "" if path == self.folder else f"{path.relative_to(self.folder).as_posix()}/"
         try:
             identity = _identity(path)
             entries = sorted(os.scandir(path), key=lambda entry: entry.name)
         except OSError as error:
-            left_out[f"cannot be read ({error.strerror}); permit reading"].append(below)
-            continue
-        if identity in seen:
-            if path.is_symlink():
-                left_out[LINKED_TWICE].append(below)
-            continue
-        seen.add(identity)
-        for entry in entries:
-            if entry.name.startswith("."):
-                continue
-            if not entry.is_dir():
-                if _suffix(entry.name) in suffixes:
-                    found.append(below + entry.name)
-            elif entry.name in FOLDERS_OF_SYSTEMS:
-                left_out[FOLDERS_OF_SYSTEMS[entry.name]].append(f"{below}{entry.name}/")
-            elif not is_output_folder(path / entry.name):
-                (linked if entry.is_symlink() else ahead).append(path / entry.name)
-    return found, {
-        such_as(map(one_line, names)): f"left out: {why}" for why, names in left_out.items()
-    }
+            self.left_out[f"cannot be read ({error.strerror}); permit reading"].append(below)
+            return
+        if identity not in self.seen:
+            self.seen.add(identity)
+            for entry in entries:
+                self._meet(entry, below)
+        elif path.is_symlink():
+            self.left_out[LINKED_TWICE].append(below)
+
+    def _meet(self, entry: os.DirEntry[str], below: str) -> None:
+        """Take a file, or put a folder among those to look through."""
+        name = entry.name
+        if name.startswith("."):
+            return
+        if not entry.is_dir():
+            if _suffix(name) in self.suffixes:
+                self.found.append(below + name)
+        elif name in FOLDERS_OF_SYSTEMS:
+            self.left_out[FOLDERS_OF_SYSTEMS[name]].append(f"{below}{name}/")
+        elif not is_output_folder(self.folder / below / name):
+            among = self.linked if entry.is_symlink() else self.ahead
+            among.append(self.folder / below / name)
 
 
 def _identity(path: Path) -> tuple[int, int]:

@@ -381,6 +381,11 @@ def _has_alpha(file: BinaryIO) -> bool:
     return image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
 
 
+def encode_mask(mask: Mask) -> bytes:
+    """Return an (H, W) mask as PNG, white where it is True."""
+    return cv2.imencode(".png", mask.astype(np.uint8) * np.uint8(255))[1].tobytes()
+
+
 def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     """Resize an (H, W) mask to (width, height) px, each pixel from the nearest one."""
     values = mask.astype(np.uint8)

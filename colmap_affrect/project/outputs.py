@@ -150,7 +150,7 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
             with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
                 shutil.rmtree(left)  # its process has ended
     with ExitStack() as stack:
-        stack.callback(_remove_empty, missing)
+        stack.push(lambda failure, *_: _remove_empty(missing if failure else ()))
         stack.callback(shutil.rmtree, name, ignore_errors=True)
         with suppress(OSError):  # of file systems without locks leftovers are not tidied up
             stack.enter_context(FileLock(Path(name) / LOCK))
@@ -158,8 +158,8 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove folders that were made for results, the inner ones first, where there are none."""
-    with suppress(OSError):
+    """Remove folders that were made for results that failed, the inner ones first."""
+    with suppress(OSError):  # something else is there
         for folder in folders:
             folder.rmdir()
 

@@ -13,17 +13,19 @@ import numpy as np
 import pytest
 from command import FAST, run_in_process_of_its_own, start
 from small_scene import INTRINSICS, NAMES, write_photographs
+from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.comparison import compare as module
 from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.compare import CompareOptions, compare
-from colmap_affrect.comparison.method_run import MethodRun
+from colmap_affrect.comparison.method_run import MethodRun, _masks_for_colmap
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.tables import to_json, verdict
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
-from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs
+from colmap_affrect.images.reading import read_mask
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.progress import SILENT
@@ -313,3 +315,19 @@ def test_a_folder_of_a_run_is_refused(scene: Path, options: CompareOptions, tmp_
     with pytest.raises(OptionError, match="has the results of a run"):
         compare(scene, tmp_path / "out", options)
     assert page.read_text() == "of the run"
+
+
+def test_colmaps_sift_has_the_masks_of_alpha_channels(tmp_path: Path) -> None:
+    photographs = Photographs(tmp_path / "photos", MaskOptions(path=str(tmp_path / "masks")))
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "photos" / "side").mkdir(parents=True)
+    image = np.full((40, 60, 4), 255, np.uint8)
+    write_image(tmp_path / "photos" / "whole.png", image)
+    with _masks_for_colmap(photographs, ["whole.png"]) as folder:
+        assert folder == str(tmp_path / "masks")
+    image[:10, :, 3] = 0
+    write_image(tmp_path / "photos" / "side" / "cut.png", image)
+    write_image(tmp_path / "masks" / "whole.png", image[:, :, 0])
+    with _masks_for_colmap(photographs, ["side/cut.png", "whole.png"]) as folder:
+        assert read_mask(Path(folder) / "side" / "cut.png.png").mean() == 0.75
+        assert read_mask(Path(folder) / "whole.png.png").all()
