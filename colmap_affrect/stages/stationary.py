@@ -37,8 +37,9 @@ MIN_EVIDENCE = 3.0  # nats, twenty to one, that a place stands still to the pixe
 MAX_SHARE_OF_PHOTOGRAPH = 0.5  # where more of what is matched never moves, the camera stands still
 MIN_MOVING = 15  # matches of a pair that move together elsewhere, which may make a model
 MAX_SHARE_BESIDE = 0.2
-"""Of all cells. Matches from beside one place to beside another are left out only where these cells
-are so few: one in 25 of the scene's goes with them then, and of a watermark all over, all would."""
+"""Of all cells. Matches from beside one place to beside another, or from one to another, are left
+out only where these cells are so few: one in 25 of the scene's goes with them then, and of a
+watermark all over, or before a background, all would."""
 
 WHAT = "a caption, a frame, a watermark, or the background of something that turns"
 CAMERA_STANDS_STILL = (
