@@ -21,7 +21,7 @@ class MatcherOptions(NetworkOptions):
 
     filter_stationary_matches: bool = True
     """Leave out matches that do not move where those of other pairs do not either, and those from
-    one such place to another: captions, frames of scans, watermarks."""
+    one such place to another: captions, frames of scans, watermarks, backgrounds of turntables."""
     max_num_first: Annotated[int, within(0, 1_000_000)] = 0
     """Features of the largest responses that are matched first; 0: all at once. All follow for the
     pairs of images that these do not tie well."""

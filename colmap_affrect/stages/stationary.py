@@ -1,19 +1,22 @@
-"""Matches that never move: captions, frames of scans, watermarks, dust on the sensor.
+"""Matches that never move: captions, frames of scans, watermarks, dust on the sensor, backgrounds.
 
 Such a thing is at the same place of many photographs, whatever they show. Its matches fit a
-camera that does not move, and may be more than those of the scene.
+camera that does not move, and may be more than those of the scene. So may those of the background
+where an object turns before a camera that stands still. What a camera turns about is also at the
+same place, but not to the pixel: see :mod:`colmap_affrect.geometry.stillness`.
 """
 
 import logging
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 
 from colmap_affrect.data import Mask
-from colmap_affrect.geometry.arrays import Floats, Indices
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
+from colmap_affrect.geometry.stillness import exactness, means_of_regions, num_moving_together
 from colmap_affrect.images.reading import grown
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.stores import STATIONARY, FeatureStore, MatchStore, PairMatches
@@ -26,12 +29,34 @@ MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
 MIN_SHARE = 0.5  # of the pairs that have a match in a cell
+MIN_PX, MIN_FRAC = 1.0, 0.001
+"""Error of what stands still, px, or part of the longer side if that is more: large photographs are
+shrunk before features are found in them."""
+CONNECTED = 1  # cells by which those are grown that are looked at together
+MIN_EVIDENCE = 3.0  # nats, twenty to one, that a place stands still to the pixel
 MAX_SHARE_OF_PHOTOGRAPH = 0.5  # where more of what is matched never moves, the camera stands still
+MIN_MOVING = 15  # matches of a pair that move together elsewhere, which may make a model
 MAX_SHARE_BESIDE = 0.2
-"""Of all cells. Matches from beside one place to beside another are left out only where these cells
-are so few: one in 25 of the scene's goes with them then, and of a watermark all over, all would."""
+"""Of all cells. Matches from beside one place to beside another, or from one to another, are left
+out only where these cells are so few: one in 25 of the scene's goes with them then, and of a
+watermark all over, or before a background, all would."""
+
+WHAT = "a caption, a frame, a watermark, or the background of something that turns"
+CAMERA_STANDS_STILL = (
+    "nothing moves between most photographs, so that matches tell nothing of depth: the camera "
+    "stands still; take photographs from several places, or give masks of what stands still "
+    "(--mask-path) where something turns before it"
+)
 
 Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Cells of photographs of one size."""
+
+    still: Mask  # nothing moves there, to the pixel
+    is_most: bool  # nothing moves far in most of what is matched
 
 
 class StationaryFilter:
@@ -71,6 +96,8 @@ class StationaryFilter:
         places = self._places[size]
         near = grown(places, 1)
         both = near if near.mean() <= MAX_SHARE_BESIDE else places
+        if both.mean() > MAX_SHARE_BESIDE:
+            both = np.zeros_like(places)
         return ~(still & _at(near, first) | _at(both, first) & _at(both, second))
 
     def learn(self, pairs: Sequence[Pair]) -> str:
@@ -78,11 +105,16 @@ class StationaryFilter:
 
         A call that was killed may have dropped some: what it found is on record and counts too.
         """
-        for size, places in self._find(pairs).items():
-            if places.any():
-                self._places[size] = places | self._places.get(size, places)
+        found, idle = self._find(pairs), ""
+        for size, places in found.items():
+            if not places.still.any():
+                continue
+            if places.is_most and not self._moves_elsewhere(pairs, size, places.still):
+                idle = CAMERA_STANDS_STILL
+            else:
+                self._places[size] = places.still | self._places.get(size, places.still)
         if not self._places:
-            return ""
+            return idle
         kept = [(size, np.argwhere(found.T).tolist()) for size, found in self._places.items()]
         self._matches.keep_note(STATIONARY, kept)
         num_pairs = num_matches = 0
@@ -94,15 +126,14 @@ class StationaryFilter:
                 num_pairs += 1
                 num_matches += len(before.indices) - len(after.indices)
         if not num_pairs:
-            return ""
+            return idle
         return (
-            f"{num_matches} matches of {num_pairs} pairs never move (a caption, a frame or a "
-            "watermark?) and were left out (--set matching.filter_stationary_matches=false keeps "
-            "them)"
+            f"{num_matches} matches of {num_pairs} pairs never move ({WHAT}?) and were left out "
+            "(--set matching.filter_stationary_matches=false keeps them)"
         )
 
-    def _find(self, pairs: Sequence[Pair]) -> dict[Size, Mask]:
-        """Return a mask of the cells in which nothing moves, by size."""
+    def _find(self, pairs: Sequence[Pair]) -> dict[Size, "_Places"]:
+        """Return the cells in which nothing moves, by size."""
         numbers = {name: number for number, name in enumerate(self._sizes)}
         cells = NUM_CELLS, NUM_CELLS
         # By size and cell: numbers of pairs with a match, and with one that does not move; images.
@@ -117,13 +148,61 @@ class StationaryFilter:
             still[size] += unmoved
             for name in found.names:
                 images[size][unmoved, numbers[name]] = True
-        return {size: _places(matched[size], still[size], images[size].sum(2)) for size in matched}
+        places = {}
+        for size, counts in matched.items():
+            likely = (still[size] >= MIN_NUM_PAIRS) & (still[size] >= MIN_SHARE * counts)
+            likely &= images[size].sum(2) >= MIN_NUM_IMAGES
+            if likely.any():
+                exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
+                num_likely, num_matched = likely.sum(), (counts >= MIN_NUM_PAIRS).sum()
+                is_most = bool(num_likely > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
+                places[size] = _Places(likely & exact, is_most)
+        return places
+
+    def _evidence(self, pairs: Sequence[Pair], size: Size, likely: Mask) -> Array:
+        """Return for each likely cell how much speaks for what does not move at all, in nats.
+
+        It is the less of what the cell says, and all that moves little in connection with it: a
+        camera that turns about an upright line has a narrow strip that hardly moves, and beside it
+        what moves more and more. Each counts once in a pair: matches there err together.
+        """
+        limit_px = MAX_MOTION_FRAC * max(size)
+        tolerance_px = max(MIN_PX, MIN_FRAC * max(size))
+        own, connected = np.zeros((2, NUM_CELLS, NUM_CELLS))
+        for found in self._matches.read([p for p in pairs if self._common_size(p) == size]):
+            are_still, first, _ = self._still(found.names, found.indices, size)
+            cells = first[are_still]
+            if not _at(likely, cells).any():
+                continue
+            points, others = self._ends(found.names, found.indices[are_still])
+            ratios = exactness(points, others - points, tolerance_px, limit_px)
+            own += _means(cells, ratios)
+            connected += _means(cells, means_of_regions(cells, ratios, NUM_CELLS, CONNECTED))
+        return np.minimum(own, connected)
+
+    def _moves_elsewhere(self, pairs: Sequence[Pair], size: Size, places: Mask) -> bool:
+        """Tell whether enough matches of some pairs move together outside of places."""
+        num_pairs, names = 0, set[str]()
+        for found in self._matches.read([p for p in pairs if self._common_size(p) == size]):
+            are_still, first, second = self._still(found.names, found.indices, size)
+            are_moving = ~(are_still | _at(places, first) | _at(places, second))
+            points, others = self._ends(found.names, found.indices[are_moving])
+            near_px = max(size) / NUM_CELLS
+            if num_moving_together(points, others - points, near_px) >= MIN_MOVING:
+                num_pairs += 1
+                names.update(found.names)
+        return num_pairs >= MIN_NUM_PAIRS and len(names) >= MIN_NUM_IMAGES
 
     def _still(self, names: Pair, indices: Indices, size: Size) -> tuple[Mask, Indices, Indices]:
         """Return which matches do not move; also the (M, 2) cells, column and row, of both ends."""
-        first, second = (self._points(name)[indices[:, side]] for side, name in enumerate(names))
+        first, second = self._ends(names, indices)
         motion = np.linalg.norm(second - first, axis=1)
         return motion <= MAX_MOTION_FRAC * max(size), _cells(first, size), _cells(second, size)
+
+    def _ends(self, names: Pair, indices: Indices) -> tuple[Floats, Floats]:
+        """Return the (M, 2) px of matches in both images."""
+        first, second = (self._points(name)[indices[:, side]] for side, name in enumerate(names))
+        return first, second
 
     def _common_size(self, pair: Pair) -> Size | None:
         size = self._sizes[pair[0]]
@@ -136,13 +215,15 @@ def _cells(points: Floats, size: Size) -> Indices:
     return np.asarray(inside * (NUM_CELLS / max(size)), np.int64)
 
 
-def _places(matched: Indices, still: Indices, num_images: Indices) -> Mask:
-    """Return the cells that nothing moves in; none where that is most of a photograph."""
-    found = (still >= MIN_NUM_PAIRS) & (still >= MIN_SHARE * matched)
-    found &= num_images >= MIN_NUM_IMAGES
-    num_matched = np.count_nonzero(matched >= MIN_NUM_PAIRS)
-    is_most = np.count_nonzero(found) > MAX_SHARE_OF_PHOTOGRAPH * num_matched
-    return np.zeros_like(found) if is_most else found
+def _means(cells: Indices, values: Array) -> Array:
+    """Return the mean of (N,) values by cell, 0 where there are none.
+
+    Cells are (N, 2) columns and rows; what is returned has a row and a column for each.
+    """
+    numbers = cells[:, 1] * NUM_CELLS + cells[:, 0]
+    sums = np.bincount(numbers, values, minlength=NUM_CELLS**2)
+    counts = np.bincount(numbers, minlength=NUM_CELLS**2)
+    return np.asarray((sums / np.maximum(counts, 1)).reshape(NUM_CELLS, NUM_CELLS))
 
 
 def _mask(cells: Indices) -> Mask:

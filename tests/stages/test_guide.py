@@ -20,6 +20,7 @@ from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.project.stores import STATIONARY
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages import guide as stage
+from colmap_affrect.stages import stationary
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.guide import current, exact_inliers, guide, guided_counts
 from colmap_affrect.stages.stationary import NUM_CELLS
@@ -107,8 +108,9 @@ def test_only_images_in_need(context: Context, monkeypatch: pytest.MonkeyPatch) 
     assert (report.num_done, report.num_kept) == (2, 3)
 
 
-def test_captions_are_not_found_again(context: Context) -> None:
-    """Here they are said to be everywhere."""
+def test_captions_are_not_found_again(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here they are said to be everywhere, and matches from one to another are none of a scene."""
+    monkeypatch.setattr(stationary, "MAX_SHARE_BESIDE", 1.0)
     everywhere = np.indices((NUM_CELLS, NUM_CELLS)).reshape(2, -1).T
     sizes = set(context.features.image_sizes().values())
     context.matches.keep_note(STATIONARY, [(size, everywhere.tolist()) for size in sizes])

@@ -1,0 +1,71 @@
+"""Print that stands still, told from what a camera turns about."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.stillness import exactness, num_moving_together
+
+LIMIT_PX, TOLERANCE_PX = 5.0, 1.0
+
+
+def points(count: int) -> Array:
+    return np.random.default_rng(1).uniform((0, 0), (1000, 700), (count, 2))
+
+
+def noise(count: int) -> Array:
+    return np.random.default_rng(2).normal(0.0, 0.25, (count, 2))
+
+
+def mean_ratio(places: Array, motions: Array) -> float:
+    small = np.linalg.norm(motions, axis=1) <= LIMIT_PX
+    return float(exactness(places[small], motions[small], TOLERANCE_PX, LIMIT_PX).mean())
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (1.5, -1.5), (-3.0, 1.0)])
+@pytest.mark.parametrize("degrees", [0.0, 0.15])
+def test_print_on_sheets_laid_anew_stands_still(shift: tuple[float, float], degrees: float) -> None:
+    places = points(80)
+    from_centre = places - (500, 350)
+    turn = np.deg2rad(degrees) * np.stack([-from_centre[:, 1], from_centre[:, 0]], axis=1)
+    assert mean_ratio(places, turn + shift + noise(80)) > 1.0
+
+
+@pytest.mark.parametrize(
+    "slopes",
+    [
+        [[0.1, 0.0], [0.0, 0.1]],  # towards the scene
+        [[0.0, -0.1], [0.1, 0.0]],  # a camera that rolls
+        [[0.05, 0.0], [0.0, 0.0]],  # a plane that turns about an upright axis
+        [[-0.1, 0.02], [0.01, 0.03]],
+    ],
+)
+def test_motions_that_pass_through_zero_do_not_stand_still(slopes: list[list[float]]) -> None:
+    places = points(3000)
+    motions = (places - (500, 350)) @ np.array(slopes).T + noise(3000)
+    assert mean_ratio(places, motions) < -0.5
+
+
+def test_most_that_agree_count_and_not_the_others() -> None:
+    places = points(60)
+    motions = noise(60)
+    motions[::5] += (3.5, 0.0)
+    ratios = exactness(places, motions, TOLERANCE_PX, LIMIT_PX)
+    assert ratios[::5].max() < 0.0
+    assert np.median(ratios) > 1.0
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_or_no_motions_are_no_error(count: int) -> None:
+    assert exactness(points(count), noise(count), TOLERANCE_PX, LIMIT_PX).shape == (count,)
+
+
+def test_matches_of_an_object_move_together_and_wrong_ones_do_not() -> None:
+    places = points(200) / 5.0
+    turned = places * (0.9, 1.0) + (60.0, 5.0)
+    anywhere = np.random.default_rng(3).uniform((0, 0), (1000, 700), (200, 2))
+    assert num_moving_together(places, turned - places, 20.0) > 180
+    assert num_moving_together(points(200), anywhere - points(200), 20.0) < 5
+    assert num_moving_together(points(0), points(0), 20.0) == 0
