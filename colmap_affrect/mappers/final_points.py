@@ -5,16 +5,13 @@ enough (:mod:`colmap_affrect.mappers.adjustment`). In the end all tracks become 
 its errors are smallest; poses and cameras stay as they are, to the bit.
 """
 
-import numpy as np
+import pyceres
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import seen_points
-from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.refined_points import Observations, refined_points
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
+from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.tie_points import TiePoints
 
-STEP = 1e-4  # of normalized image coordinates, for derivatives
+MAX_ITERATIONS = 20  # each point is a problem of its own, which few solve
 
 
 def complete_points(
@@ -42,7 +39,8 @@ def complete_points(
     triangulator.complete_all_tracks(finding)
     triangulator.merge_all_tracks(finding)
     by_hand = {mark.point3D_id for _, _, mark in tie_points.observed(model)}
-    refined = _refine(model, graph, model.point3D_ids() - by_hand, noise_px)
+    _refine(model, by_hand, noise_px)
+    refined = model.point3D_ids() - by_hand
     manager.filter_points3D(mapping.filter_max_reproj_error, mapping.filter_min_tri_angle, refined)
     model.update_point_3d_errors()
 
@@ -62,57 +60,31 @@ def _correspondences(
     return found
 
 
-def _refine(
-    model: pycolmap.Reconstruction, graph: PairGraph, point_ids: set[int], noise_px: float
-) -> set[int]:
-    """Move points, those of some ids, to where their errors are smallest; return their ids."""
-    found = _observations(model, graph, point_ids)
-    if found is None:
-        return set()
-    ids, seen = found
-    points = model.points3D
-    before = np.array([points[key].xyz for key in ids])
-    after = refined_points(before, seen, noise_px)
-    for key, place in zip(ids, after, strict=True):
-        points[key].xyz = place
-    return set(ids)
+def _refine(model: pycolmap.Reconstruction, held: set[int], noise_px: float) -> None:
+    """Move the points to where their errors are smallest; poses and cameras stay, to the bit.
 
-
-def _observations(
-    model: pycolmap.Reconstruction, graph: PairGraph, point_ids: set[int]
-) -> tuple[list[int], Observations] | None:
-    """Return what is seen of points, those of some ids, and their ids in order; None if nothing."""
-    wanted = np.array(sorted(point_ids), np.int64)
-    seen_ids, parts = [], []
-    cameras = cameras_of(model)
-    for image_id, (rotation, translation) in sorted(poses_of(model).items()):
-        seen = seen_points(model.images[image_id])
-        keypoints = np.flatnonzero(np.isin(seen, wanted))
-        if not len(keypoints):
-            continue
-        seen_ids.append(seen[keypoints])
-        places = graph.keypoints[image_id][keypoints].astype(np.float64)
-        rotations = np.broadcast_to(rotation, (len(keypoints), 3, 3))
-        translations = np.broadcast_to(translation, (len(keypoints), 3))
-        parts.append((rotations, translations, *_rays(cameras[image_id], places)))
-    if not parts:
-        return None
-    ids, rows = np.unique(np.concatenate(seen_ids), return_inverse=True)
-    order = np.argsort(rows, kind="stable")
-    columns = [np.concatenate(column)[order] for column in zip(*parts, strict=True)]
-    return ids.tolist(), Observations(rows[order], *columns)
-
-
-def _rays(camera: pycolmap.Camera, places: Array) -> tuple[Array, Array]:
-    """Return (N, 2) normalized coordinates of px, and (N, 2, 2) derivatives of px by these."""
-    rays = np.asarray(camera.cam_from_img(places), np.float64).reshape(-1, 2)
-    columns = []
-    for step in (np.array([STEP, 0.0]), np.array([0.0, STEP])):
-        ends = [_px(camera, rays + sign * step) for sign in (1, -1)]
-        columns.append((ends[0] - ends[1]) / (2 * STEP))
-    return rays, np.stack(columns, axis=2)
-
-
-def _px(camera: pycolmap.Camera, rays: Array) -> Array:
-    rays = np.column_stack([rays, np.ones(len(rays))])
-    return np.asarray(camera.img_from_cam(rays), np.float64).reshape(-1, 2)
+    Args:
+        model: Changed in place.
+        held: Ids of the points that stay, too.
+        noise_px: Scale of the robust loss, px.
+    """
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.refine_focal_length = False
+    options.refine_principal_point = False
+    options.refine_extra_params = False
+    options.refine_rig_from_world = False
+    options.refine_sensor_from_rig = False
+    options.min_track_length = 2
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = noise_px
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    for point_id in sorted(held):
+        config.add_constant_point(point_id)
+    problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+    solver = pyceres.SolverOptions()
+    solver.max_num_iterations = MAX_ITERATIONS
+    solver.num_threads = 1
+    solver.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
+    pyceres.solve(solver, problem, pyceres.SolverSummary())
