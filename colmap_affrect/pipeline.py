@@ -271,10 +271,15 @@ def map_and_report(
         ),
         extended=tuple(before),
         advice=advice(
-            context, missing, models, max(pair_inliers.values(), default=0), again.untried
+            context,
+            missing,
+            models,
+            max(pair_inliers.values(), default=0),
+            again.untried,
+            again.effort,
         ),
         by_hand=context.by_hand.texts(),
-        effort=again.effort,
+        effort=again.effort if again.tried or again.untried else "",
         matched_again=again.tried,
         untried=again.untried,
     )

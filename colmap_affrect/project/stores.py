@@ -40,7 +40,9 @@ STEP = "step"  # level and pairs of the step of escalation that has begun and no
 FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
 IN_VAIN = "all_features_in_vain"  # that list, and whether all features bring no more than some
 CLIMBING = "climbing_list"  # the same, of which there was a model before pairs were matched again
-LOOKED_AT = "learned_looked_at"  # what models of learned matches alone are worth
+EFFORT = "effort"  # how much was tried for images in need
+LEARNING = "learning"  # level and pairs of learned matching that is kept beside what is there
+LOOKED_AT = "learned_looked_at"  # what models of learned matches are worth, and of which pairs
 RESTORING = "restoring"  # matches are those of better models before, the models not yet
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
@@ -360,11 +362,12 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, LOOKED_AT, RESTORING):
+            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, LEARNING, LOOKED_AT, RESTORING):
                 file.attrs.pop(note, None)
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
-                if is_asked or group.attrs["tried"] > 1:
+                is_escalated = group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs
+                if is_asked or is_escalated:
                     del file[key]
 
     def has(self, pairs: Sequence[Names]) -> Bools:

@@ -12,7 +12,7 @@ from colmap_affrect.errors import such_as
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
-from colmap_affrect.options import EFFORT_NAMES
+from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import Advice, MatchedAgain, ModelSummary
 from colmap_affrect.project.tables import as_row
@@ -34,6 +34,7 @@ class _Case:
     models: Sequence[ModelSummary]  # the largest first
     strongest: int  # inliers of a verified pair, at most
     untried: Sequence[MatchedAgain]  # what a greater effort would try
+    effort: EffortName  # how much was tried
 
     @property
     def model(self) -> ModelSummary:
@@ -63,6 +64,7 @@ def advice(
     models: Sequence[ModelSummary],
     strongest: int,
     untried: Sequence[MatchedAgain] = (),
+    effort: EffortName = "high",
 ) -> tuple[Advice, ...]:
     """Say what may help when images are missing or the largest model is doubtful, best first.
 
@@ -72,6 +74,7 @@ def advice(
         models: what is known of the models, the largest first.
         strongest: the largest number of inliers of a verified pair.
         untried: what a greater effort would try.
+        effort: how much was tried.
 
     Returns:
         What may help, the most promising first.
@@ -79,7 +82,7 @@ def advice(
     num_keypoints = colmap_database.keypoint_counts(context.workspace.database)
     lost = [n for n in missing if n in num_keypoints and n not in context.by_hand.left_out]
     num_usable = sum(map(bool, num_keypoints.values()))
-    case = _Case(context, lost, len(num_keypoints), models, strongest, untried)
+    case = _Case(context, lost, len(num_keypoints), models, strongest, untried, effort)
     if (missing or case.doubts) and num_usable < 2:
         return (Advice("more photographs: two that can be read and show the same make a model"),)
     found = _of_effort(case)
@@ -170,14 +173,18 @@ RULES: Sequence[Callable[[_Case], list[Advice]]] = (
 def _of_effort(case: _Case) -> list[Advice]:
     """Return the command that tries what the effort did not allow."""
     context = case.context
-    if not case.untried or context.effort == EFFORT_NAMES[-1]:
+    if not case.untried or case.effort == EFFORT_NAMES[-1]:
         return []
     minutes = sum(one.core_s for one in case.untried) / available_cores() / 60
     levels = ", ".join(one.text() for one in case.untried)
     why = f"not tried, at most about {max(1, round(minutes))} min more: {levels}"
-    greater = EFFORT_NAMES[EFFORT_NAMES.index(context.effort) + 1]
-    command = _without(_run_command(context), ["--effort", "--max-time"])
-    return [Advice(why, shlex.join([*command, "--effort", greater]))]
+    greater = EFFORT_NAMES[EFFORT_NAMES.index(case.effort) + 1]
+    if context.command[1:2] != ("run",):
+        return [Advice(f"{why}; give the command of the run again, with --effort {greater}")]
+    command = _without(context.command, ["--max-time"])
+    if len(command) == len(context.command):  # the effort was used up
+        command = [*_without(command, ["--effort"]), "--effort", greater]
+    return [Advice(why, shlex.join(command))]
 
 
 def _of_recipe(context: Context, names: str) -> list[Advice]:
@@ -203,10 +210,13 @@ def _again(context: Context, *words: str) -> str:
 
 def _without(command: Sequence[str], flags: Collection[str]) -> list[str]:
     """Leave out flags and their values."""
-    before = ("", *command)
-    return [
-        word for last, word in zip(before, command, strict=False) if not {last, word} & {*flags}
-    ]
+    kept = list[str]()
+    before = ""
+    for word in command:
+        if not {before, word.partition("=")[0]} & {*flags}:
+            kept.append(word)
+        before = word
+    return kept
 
 
 def _anew(context: Context, *words: str) -> str:

@@ -1,10 +1,11 @@
-"""Models beside those that grow step by step: of learned matches alone, and the best ones so far.
+"""Models beside those that grow step by step: of learned matches, and the best ones so far.
 
 Matches of measured frames and learned ones err in different ways: where sides of a thing look
 alike, or only a flat part of a scene is tied, one kind may place photographs wrongly that the other
 places right, and mixed they may not agree at all. More matches can make a model worse, too. So of
-small sets models of learned matches alone are looked at, and the best models so far are kept with
-their matches; what stays in the end is what most relative poses are expected to be right of.
+small sets models are looked at for which all pairs with learned matches use these, and the best
+models so far are kept with their matches. Those stay in the end of which most relative poses are
+expected to be right.
 """
 
 import json
@@ -18,12 +19,12 @@ from typing import Any
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import copy_with_keypoints, model_folders, read_summaries
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.progress import SILENT
 from colmap_affrect.project.atomic_files import cannot_write, replace_text
 from colmap_affrect.project.outputs import remove_own, temporary_folder
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import (
     CLIMBING,
+    FINISHED,
     LOOKED_AT,
     RESTORING,
     MatchStore,
@@ -56,12 +57,17 @@ def present_score(context: Context) -> float:
     return score(read_summaries(context.workspace.sparse))
 
 
-# Learned matches alone
+def _set_of(context: Context) -> str:
+    """Return a digest of the pairs that are listed, and of what is said by hand."""
+    return f"{context.matches.note(FINISHED)} {context.by_hand.digest()}"
+
+
+# Learned matches
 
 
 @dataclass(frozen=True)
 class LookedAt:
-    """What models of learned matches alone are worth."""
+    """What models of learned matches are worth."""
 
     score: float  # 0 where there are none
     is_sure: bool  # of all images
@@ -70,14 +76,13 @@ class LookedAt:
 
     @classmethod
     def of(cls, context: Context) -> "LookedAt | None":
-        """Return what is on record; None before learned matching."""
+        """Return what is on record of these pairs; None before learned matching."""
         known = context.matches.note(LOOKED_AT)
-        return cls(*known) if known else None
+        return cls(*known[1:]) if known and known[0] == _set_of(context) else None
 
-    @property
-    def note(self) -> list[Any]:
-        """What is kept on record."""
-        return [self.score, self.is_sure, self.score_without, self.is_chosen]
+    def note(self, context: Context) -> list[Any]:
+        """Return what is kept on record."""
+        return [_set_of(context), self.score, self.is_sure, self.score_without, self.is_chosen]
 
     @property
     def is_enough(self) -> bool:
@@ -95,7 +100,7 @@ class Choice:
 
 
 def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
-    """Map learned matches alone, and keep on record what that is worth.
+    """Map with all learned matches, and keep on record what that is worth.
 
     Args:
         escalation: of the workspace; its models are those of the first matches.
@@ -104,9 +109,10 @@ def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
     context = escalation.context
     choice = _learned_choice(escalation)
     found = _models_of(context, mapper, choice) if choice.matches else []
-    is_sure = bool(found) and len(found[0].sure) == len(context.features.names())
+    names = set(context.features.names()).difference(context.by_hand.left_out)
+    is_sure = bool(found) and names.issubset(found[0].sure)
     looked_at = LookedAt(score(found), is_sure, present_score(context))
-    context.matches.keep_note(LOOKED_AT, looked_at.note)
+    context.matches.keep_note(LOOKED_AT, looked_at.note(context))
 
 
 def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
@@ -128,7 +134,7 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
     choice = _learned_choice(escalation) if is_wanted else None
     if not choice or not choice.matches:
         return False
-    chosen = replace(looked_at, is_chosen=True).note
+    chosen = replace(looked_at, is_chosen=True).note(context)
     notes = {LOOKED_AT: chosen, CLIMBING: None}  # models that are there are not gone on from
     context.matches.choose(choice.matches, choice.measured_worths, **notes)
     escalation.write()
@@ -152,7 +158,8 @@ def _models_of(context: Context, mapper: Mapper, choice: Choice) -> list[ModelSu
         branch = workspace.branch(folder / "branch")
         branch.matches.unlink()  # a link perhaps
         shutil.copy(workspace.matches, branch.matches)
-        other = replace(context, workspace=branch, progress=SILENT)
+        shown = replace(context.progress, title="learned matches: ", forecast=None)
+        other = replace(context, workspace=branch, progress=shown)
         other.matches.choose(choice.matches, choice.measured_worths)
         verify_matches(other, context.verification)
         guide(other, context.guiding)
@@ -178,13 +185,16 @@ def keep_best(context: Context) -> None:
         new.mkdir()
         shutil.copytree(workspace.sparse, new / "sparse")
         shutil.copy(workspace.matches, new / workspace.matches.name)
-        replace_text(new / SCORE, json.dumps(present))
+        replace_text(new / SCORE, json.dumps([_set_of(context), present]))
 
 
 def best_score(context: Context) -> float:
-    """Return the score of the best models so far; 0 where none are kept."""
+    """Return the score of the best models so far; 0 where none of these pairs are kept."""
     path = context.workspace.best / SCORE
-    return float(json.loads(path.read_text())) if path.exists() else 0.0
+    if not path.exists():
+        return 0.0
+    of_set, found = json.loads(path.read_text(encoding="utf-8"))
+    return float(found) if of_set == _set_of(context) else 0.0
 
 
 def restore_best(escalation: Escalation) -> bool:

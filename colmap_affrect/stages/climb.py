@@ -53,9 +53,10 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         while step := escalation.next_step():
             keep_best(context)
             escalated = escalation.taken(step, escalated)
-        guided, mapped = _mapped_on(context, mapper, recipe)
-        reports += [guided, mapped]
-        if mapped.num_done or restore_best(escalation):
+        before = context.workspace.made_from("map")
+        reports += _mapped_on(context, mapper, recipe)
+        has_mapped = context.workspace.made_from("map") != before  # perhaps there is no model
+        if has_mapped or restore_best(escalation):
             continue
         if not choose_learned(escalation, at_once=False):
             forget_best(context)
@@ -64,17 +65,15 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
 
 
 def _learned(escalation: Escalation, mapper: Mapper, report: StageReport) -> StageReport:
-    """Match pairs of a small set by learned matching, once, and look at what that makes alone."""
-    if LookedAt.of(escalation.context) or escalation.is_over_time:
-        return report
-    step = escalation.learned_pairs()
-    if not step:
+    """Match pairs of a small set by learned matching, once, and look at what models it makes."""
+    if LookedAt.of(escalation.context) or not escalation.plan_learning():
         return report
     start = time.perf_counter()
-    escalation.learn(step)
-    look_at_learned(escalation, mapper)
+    num_matched = escalation.learn()
+    if escalation.is_learned:
+        look_at_learned(escalation, mapper)
     wall_s = report.wall_s + time.perf_counter() - start
-    return replace(report, wall_s=wall_s, num_done=report.num_done + len(step.pairs))
+    return replace(report, wall_s=wall_s, num_done=report.num_done + num_matched)
 
 
 def _mapped_anew(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:

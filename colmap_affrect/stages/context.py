@@ -194,7 +194,7 @@ class OnRecord(Generic[Built]):
 
 @dataclass(frozen=True)
 class Context:
-    """Where a run works and with what; but for the deadline none of it changes a result.
+    """Where a run works and with what; only the deadline and the effort change results.
 
     Options are those on record of the folder, which the workspace reads when a command begins: of
     photographs and features once these have been extracted, of other stages those that were done

@@ -24,10 +24,11 @@ from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import ImageError, such_as
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import LARGE
+from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain, ModelSummary, StageReport
-from colmap_affrect.project.stores import STEP, Learned, PairMatches, Worth
+from colmap_affrect.project.stores import EFFORT, LEARNING, STEP, Learned, PairMatches, Worth
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages import expected_gain
 from colmap_affrect.stages.context import Context
@@ -53,6 +54,7 @@ from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers,
 
 logger = logging.getLogger(__name__)
 
+PAIRS_AT_ONCE = 50  # matched between two looks at the clock
 LIKELY = 0.25  # part of a gain that counts for images that are likely right: matches mend few
 
 
@@ -81,6 +83,8 @@ def begin(
     context.workspace.require("verify")
     options = options or context.escalation
     context.workspace.record_options("escalate", options.to_mapping())
+    if context.matches.note(EFFORT) != context.effort:
+        context.matches.keep_note(EFFORT, context.effort)
     escalation = Escalation(context, options)
     escalation.write()  # it may have been killed before
     return escalation, StageReport("escalate", time.perf_counter() - start, 0)
@@ -98,7 +102,7 @@ def unmeasured_pairs(context: Context) -> list[Pair]:
 class Tried:
     """What escalation did for a set, and what is left."""
 
-    effort: str = ""  # how much was tried; empty where nothing had to be
+    effort: EffortName = "normal"  # how much was tried
     tried: tuple[MatchedAgain, ...] = ()  # pairs by level
     untried: tuple[MatchedAgain, ...] = ()  # what a greater effort would try
 
@@ -111,10 +115,12 @@ def matched_again(context: Context) -> Tried:
     escalation = Escalation(context, context.escalation)
     models = escalation.models()
     needs = escalation.needs(models)
-    if not (needs or escalation.has_stepped):  # large sets take long to go through
+    has_tried = escalation.has_stepped or escalation.matches.note(LEARNING)
+    if not (needs or has_tried):  # large sets take long to go through
         return Tried()
     situation = escalation.situation(needs, models)
-    return Tried(context.effort, tuple(tried(situation)), tuple(untried(situation)))
+    effort = escalation.matches.note(EFFORT) or context.effort
+    return Tried(effort, tuple(tried(situation)), tuple(untried(situation)))
 
 
 @dataclass(frozen=True)
@@ -181,8 +187,9 @@ class Escalation:
         To doubtful ones of the first what they may add to the probability that these are right,
         and a quarter of all that to those which are likely right in the model that they are in.
         """
-        workspace, names = self.context.workspace, self.features.names()
-        lost = set(names) - set(models[0].sure)
+        workspace = self.context.workspace
+        names = set(self.features.names()).difference(self.context.by_hand.left_out)
+        lost = names - set(models[0].sure)
         if workspace.made_from("map") != self.context.verified_digest():
             strong, counts = self.options.strong_num_inliers, self.num_inliers()
             insecure = lost & expected_gain.insecure_images(counts, strong, self._loose())
@@ -284,7 +291,8 @@ class Escalation:
         if begun := self.matches.note(STEP):
             level, pairs = begun
             tried = self.matches.levels(self.pairs, "tried")
-            return Step(level, [p for p in map(tuple, pairs) if not tried.get(p, -1) >> level & 1])
+            left = [pair for pair in map(tuple, pairs) if not tried.get(pair, -1) >> level & 1]
+            return Step(level, [pair for pair in left if self.context.by_hand.allows(*pair)])
         plan = self._plan()
         self.left_s = plan.left_s / available_cores()
         return plan.step if plan.step.pairs else None
@@ -331,28 +339,59 @@ class Escalation:
         self.write()
         self.matches.keep_note(STEP, [])
 
-    def learned_pairs(self) -> Step | None:
-        """Return the pairs that lack learned matches, none where these were all matched.
+    def plan_learning(self) -> bool:
+        """Put on record which pairs are to be matched by a learned level, beside what is there.
 
-        None for sets that are large or need nothing, and where no learned level can be used.
+        A killed run could not tell it else: images that get features change the database.
+
+        Returns:
+            Whether there are any; none of sets that are large or need nothing, nor where no learned
+            level can be used.
         """
+        if self.matches.note(LEARNING):
+            return True
         models = self.models()
         needs = self.needs(models)
         if not needs:
-            return None
+            return False
         situation = self.situation(needs, models)
-        if situation.learned_level is None or not situation.is_small:
-            return None
-        return learned_step(situation)
+        step = learned_step(situation) if situation.is_small else Step()
+        if step.pairs:
+            self.matches.keep_note(LEARNING, [step.level, list(step.pairs)])
+        return bool(step.pairs)
 
-    def learn(self, step: Step) -> None:
-        """Match pairs with the features of a learned level, and keep that beside what is there."""
+    def learn(self) -> int:
+        """Match the pairs of :meth:`plan_learning` that have no learned matches yet.
+
+        Returns:
+            How many were matched; some may be left where the time that the user gave is over.
+        """
+        level, planned = self.matches.note(LEARNING)
+        pairs = [(first, second) for first, second in planned]
+        done = self.matches.learned_levels(pairs)
+        todo = [pair for pair in pairs if done[pair] < 0]
+        num_matched = 0
+        for begin in range(0, len(todo), PAIRS_AT_ONCE):
+            if self.is_over_time:
+                break
+            batch = todo[begin : begin + PAIRS_AT_ONCE]
+            self._learn(Step(level, batch))
+            num_matched += len(batch)
+        self.write()  # the features are keypoints of the database, too
+        return num_matched
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether all pairs of :meth:`plan_learning` have learned matches."""
+        _, planned = self.matches.note(LEARNING)
+        return min(self.matches.learned_levels(map(tuple, planned)).values()) >= 0
+
+    def _learn(self, step: Step) -> None:
 
         def keep(batch: Sequence[Trial], _: int) -> None:
             self.matches.keep_learned([Learned(trial.found, trial.worth) for trial in batch])
 
         self._match_with(step.pairs, step.level, keep)
-        self.write()  # the features are keypoints of the database, too
 
     def _match_with(
         self, pairs: Sequence[Pair], level: int, keep: Callable[[Sequence["Trial"], int], None]

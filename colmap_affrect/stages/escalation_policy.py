@@ -72,7 +72,7 @@ class Situation:
 
     @property
     def is_small(self) -> bool:
-        """Whether learned matching of all pairs is cheap."""
+        """Whether learned matching takes all pairs of images in need."""
         return len(self.megapixels[0]) <= SMALL
 
     @property
@@ -105,17 +105,16 @@ class Situation:
         """Return the nominal seconds that a level has taken so far."""
         sizes = self.megapixels[number]
         tried = [pair for pair, state in self.states.items() if self.has_tried(state, number)]
-        images = [size for name, size in sizes.items() if name not in self.lacking[number]]
+        images = [sizes[name] for name in {name for pair in tried for name in pair}]
         pairs = [(sizes[first], sizes[second]) for first, second in tried]
         return gain_of(self.levels[number]).seconds(images, pairs)
 
     def spent_s(self) -> float:
         """Return the nominal seconds spent after learned matching, of which some is free."""
-        spent = sum(self.spent_on(number) for number in range(1, len(self.levels)))
-        if self.learned_level is None:
-            return spent
-        learned_s = self.spent_on(self.learned_level)
-        return spent - (learned_s if self.is_small else min(learned_s, self.first_model_s))
+        spent = {number: self.spent_on(number) for number in range(1, len(self.levels))}
+        learned_s = sum(s for k, s in spent.items() if kind_of(self.levels[k]) == LEARNED)
+        free_s = learned_s if self.is_small else min(learned_s, self.first_model_s)
+        return sum(spent.values()) - free_s
 
     def gain(self, number: int, needs: Mapping[str, float]) -> ExpectedGain:
         """Return what a level may bring to images in need."""

@@ -236,8 +236,8 @@ class ExpectedGain:
             The step; one without pairs where there is nothing to match.
         """
         mapping_s = MAPPING_S * len(self.megapixels)
-        step = _Plan(self, gain_of(level), mapping_s)
-        everything = _Plan(self, gain_of(level), mapping_s)
+        step = _Selection(self, gain_of(level), mapping_s)
+        everything = _Selection(self, gain_of(level), mapping_s)
         for one in self.candidates(number, level, others):
             if everything.seconds + everything.cost_of(one) - mapping_s > budget_s:
                 continue
@@ -256,7 +256,7 @@ class ExpectedGain:
 
 
 @dataclass
-class _Plan:
+class _Selection:
     """Pairs that are matched together, what they are expected to save, and what they take."""
 
     gain: ExpectedGain

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from results import database_content
+from results import database_content, hdf5_content
 from small_scene import NAMES
 from verified import copy_of, verified
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import CLIMBING, FINISHED, RESTORING
+from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING, LOOKED_AT, RESTORING
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.stages import alternatives, climb
@@ -36,9 +37,9 @@ from colmap_affrect.stages.alternatives import (
     score,
 )
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, begin
-from colmap_affrect.stages.expected_gain import Step
+from colmap_affrect.stages.escalate import Escalation, begin, matched_again
 from colmap_affrect.stages.map import map_images
+from colmap_affrect.stages.match import match
 
 RECIPE = """
 [rectifier]
@@ -68,7 +69,8 @@ def matched(photos: Path, recipe: Recipe, tmp_path_factory: pytest.TempPathFacto
     """All pairs were matched by both kinds; the learned ones have fewer features."""
     workspace = verified(photos, tmp_path_factory.mktemp("matched") / "out", recipe.name)
     escalation, _ = begin(Context(workspace), recipe.escalate)
-    escalation.learn(Step(1, escalation.pairs))
+    escalation.matches.keep_note(LEARNING, [1, list(escalation.pairs)])
+    assert escalation.learn() == len(escalation.pairs)
     return workspace
 
 
@@ -305,6 +307,94 @@ def test_models_of_other_pairs_than_the_verified_ones_are_not_kept(
     without_matches(escalation_of(context), escalation_of(context).pairs[0])
     keep_best(context)
     assert not context.workspace.best.exists()
+
+
+def test_what_was_looked_at_is_of_the_listed_pairs_and_of_what_is_said_by_hand(
+    context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_models(monkeypatch, found=UNSURE)
+    look_at_learned(escalation_of(context), mapper)
+    assert LookedAt.of(context)
+    assert not LookedAt.of(replace(context, by_hand=ByHand(left_out=(NAMES[0],))))
+    context.matches.keep_note(FINISHED, "another list")
+    assert not LookedAt.of(context)
+
+
+def test_images_that_are_left_out_need_nothing_and_are_no_lack(
+    context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = NAMES[1:]
+    sure = replace(UNSURE, registered_names=others, probabilities=dict.fromkeys(others, 0.95))
+    with_models(monkeypatch, found=sure)
+    said = replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
+    assert NAMES[0] not in escalation_of(said).needs([UNSURE])
+    look_at_learned(escalation_of(said), mapper)
+    looked_at = LookedAt.of(said)
+    assert looked_at
+    assert looked_at.is_sure
+
+
+def test_learning_that_was_killed_goes_on_with_the_same_pairs(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Images may have got features: what is needed would look different."""
+    escalation = escalation_of(context)
+    pairs = list(escalation.pairs)
+    context.matches.keep_note(LEARNING, None)
+    monkeypatch.setattr(Escalation, "needs", lambda *_: dict.fromkeys(NAMES, 1.0))
+    assert not escalation.plan_learning()  # all have learned matches
+    context.matches.remove(pairs=pairs)
+    match(context)
+    escalation.write()
+    assert escalation.plan_learning()
+    monkeypatch.setattr(Escalation, "needs", lambda *_: {})
+    assert escalation.plan_learning()
+    assert not escalation.is_learned
+    monkeypatch.setattr(Escalation, "is_over_time", True)
+    assert escalation.learn() == 0
+    monkeypatch.setattr(Escalation, "is_over_time", False)
+    assert escalation.learn() == len(pairs)
+    assert escalation.is_learned
+
+
+def test_matches_of_pairs_that_are_removed_take_learned_ones_along(context: Context) -> None:
+    pairs = list(escalation_of(context).pairs)
+    context.matches.keep_note(LOOKED_AT, [1])
+    context.matches.remove(pairs=pairs[:1])
+    assert not context.matches.has(pairs).any()
+    assert context.matches.note(LOOKED_AT) is None
+    assert context.matches.note(LEARNING) is None
+
+
+@pytest.mark.long
+def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
+    photos: Path, recipe: Recipe, mapper: Mapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also the copy of the workspace is mapped here."""
+    needs = Escalation.needs
+
+    def unsure(escalation: Escalation, models: Sequence[ModelSummary]) -> dict[str, float]:
+        return needs(escalation, models) or dict.fromkeys(NAMES, 1e-3)
+
+    monkeypatch.setattr(Escalation, "needs", unsure)
+    workspace = verified(photos, tmp_path / "out", recipe.name)
+    context = Context(workspace)
+    with workspace.locked():
+        reports = climb.climb(context, mapper, recipe)
+        assert reports[-1].num_done == len(escalation_of(context).pairs)
+        looked_at = LookedAt.of(context)
+        assert looked_at
+        assert looked_at.score > 1.0
+        before = hdf5_content(workspace.matches), database_content(workspace.database)
+        model = (workspace.sparse / "0" / "images.bin").stat().st_mtime_ns
+        again = climb.climb(context, mapper, recipe)
+    assert {report.num_done for report in again} == {0}
+    assert (hdf5_content(workspace.matches), database_content(workspace.database)) == before
+    assert (workspace.sparse / "0" / "images.bin").stat().st_mtime_ns == model
+    assert not workspace.best.exists()
+    done = matched_again(context)
+    assert done.effort == "normal"
+    assert [(one.kind, one.num_pairs) for one in done.tried] == [("learned", 6)]
 
 
 @pytest.mark.long

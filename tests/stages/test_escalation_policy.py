@@ -125,11 +125,11 @@ def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one(
 def test_what_is_spent_is_counted_but_for_learned_matching_of_small_sets() -> None:
     assert situation().spent_s() == 0.0
     assert done_with_learned().spent_s() == 0.0
-    lacking = [set(NAMES)] * len(LEVELS)
-    lacking[1] = set("cde")
-    covers = situation(tried={"ab": 0b11}, lacking=lacking)
+    covers = situation(tried={"ab": 0b11})
     gain = gain_of(LEVELS[1])
     assert covers.spent_s() == pytest.approx(2 * gain.image_s + gain.pair_s)
+    gone = replace(done_with_learned(), usable=[1, 3])  # weights that are not there any more
+    assert gone.spent_s() == 0.0
     names = [f"{number:03}" for number in range(SMALL + 1)]
     large = situation(names)
     states = {pair: replace(s, tried=1 | 1 << LEARNED) for pair, s in large.states.items()}

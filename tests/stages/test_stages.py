@@ -360,15 +360,22 @@ def test_advice_names_what_was_not_tried_and_the_command_that_goes_on(
     workspace, report = finished
     words = ("colmap-affrect", "run", "--image-path", "a b", "--output-path", "out")
     left = [MatchedAgain("measured, all tilts", 28, 1200.0), MatchedAgain("new", 1, 60.0)]
-    context = Context(workspace, command=(*words, "--effort", "normal", "--max-time", "3"))
-    more, *_ = advice(context, [NAMES[0]], report.models, 0, left)
+    context = Context(workspace, command=(*words, "--effort", "normal"))
+    more, *_ = advice(context, [NAMES[0]], report.models, 0, left, "normal")
     assert more.why.startswith("not tried, at most about ")
     assert more.why.endswith(" min more: all tilts 28 pairs, new 1 pair")
     assert shlex.split(more.command) == [*words, "--effort", "high"]
-    low = replace(context, effort="low", command=words)
-    (more,) = advice(low, [], report.models, 0, left)
+    low = replace(context, command=words)
+    (more,) = advice(low, [], report.models, 0, left, "low")
     assert shlex.split(more.command) == [*words, "--effort", "normal"]
-    assert advice(replace(context, effort="high"), [], report.models, 0, left) == ()
+    assert advice(context, [], report.models, 0, left, "high") == ()
+    for limit in (["--max-time", "3"], ["--max-time=3"]):  # the effort was not used up
+        limited = replace(context, command=(*words, "--effort=low", *limit))
+        (more,) = advice(limited, [], report.models, 0, left, "low")
+        assert shlex.split(more.command) == [*words, "--effort=low"]
+    (more,) = advice(replace(context, command=()), [], report.models, 0, left, "low")
+    assert more.command == ""
+    assert more.why.endswith("; give the command of the run again, with --effort normal")
 
 
 def test_photographs_that_are_all_lost_are_not_to_be_joined_with_the_others(
