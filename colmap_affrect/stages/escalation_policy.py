@@ -145,9 +145,11 @@ class Situation:
 
 
 def learned_step(situation: Situation) -> Step:
-    """Return the pairs for learned matching: of a small set all of images in need.
+    """Return the pairs for learned matching.
 
-    Of a larger set as many as take what the first model took, the most promising ones.
+    Of a small set all of images in need, and the others, too, where they take no longer than the
+    first model: models of learned matches alone need them. Of a larger set as many as take what the
+    first model took, the most promising ones.
     """
     number = situation.learned_level
     if number is None or not situation.needs:
@@ -155,12 +157,13 @@ def learned_step(situation: Situation) -> Step:
     if not situation.is_small:
         left_s = situation.first_model_s - situation.spent_on(number)
         return situation.best_at(number, left_s)
-    pairs = [
-        pair
-        for pair, state in situation.states.items()
-        if not situation.has_learned(state) and not situation.needs.keys().isdisjoint(pair)
-    ]
-    return Step(number, pairs)
+    lacking = [p for p, state in situation.states.items() if not situation.has_learned(state)]
+    needed = [pair for pair in lacking if not situation.needs.keys().isdisjoint(pair)]
+    sizes = situation.megapixels[number]
+    others = [(sizes[a], sizes[b]) for a, b in lacking if (a, b) not in needed]
+    others_s = gain_of(situation.levels[number]).seconds((), others)
+    is_cheap = others_s <= situation.first_model_s
+    return Step(number, lacking if needed and is_cheap else needed)
 
 
 def is_hopeful(step: Step, situation: Situation) -> bool:

@@ -48,7 +48,12 @@ def situation(names: str | list[str] = NAMES, **given: Any) -> Situation:
     return Situation(**values | given)
 
 
-def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need() -> None:
+def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The others are matched, too, where that takes no longer than the first model."""
+    assert len(learned_step(situation()).pairs) == 10
+    monkeypatch.setattr(Situation, "first_model_s", 3 * gain_of(LEVELS[LEARNED]).pair_s - 0.1)
     step = learned_step(situation())
     assert step.level == LEARNED
     assert ["".join(pair) for pair in step.pairs] == ["ad", "ae", "bd", "be", "cd", "ce", "de"]
@@ -56,7 +61,10 @@ def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need() -> 
     assert not next_step(situation(needs=""), "high").step.pairs
 
 
-def test_pairs_that_have_learned_matches_used_or_not_get_no_others() -> None:
+def test_pairs_that_have_learned_matches_used_or_not_get_no_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Situation, "first_model_s", 0.0)
     before = situation()
     states = dict(before.states)
     states["a", "d"] = PairState(0, 3, level=LEARNED, tried=1 | 1 << LEARNED)
@@ -67,8 +75,11 @@ def test_pairs_that_have_learned_matches_used_or_not_get_no_others() -> None:
     assert found == {"be", "cd", "ce", "de"}
 
 
-def test_strong_pairs_of_images_in_need_are_matched_by_networks_too() -> None:
+def test_strong_pairs_of_images_in_need_are_matched_by_networks_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """They may be wrong: of repeated structure, or of a flat part alone."""
+    monkeypatch.setattr(Situation, "first_model_s", 0.0)
     strong = situation()
     states = {pair: replace(state, num_inliers=500) for pair, state in strong.states.items()}
     assert len(learned_step(replace(strong, states=states)).pairs) == 7
