@@ -31,7 +31,7 @@ from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
-from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.mapping import map_database, read_summaries
 from colmap_affrect.pairs.lists import Pair, read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.pipeline import InputOptions
@@ -253,12 +253,9 @@ class MethodRun:
             new.mkdir()
             database_path, watch = new / "database.db", Stopwatch()
             copy_database(self.database, database_path)
-            with open_database(database_path) as database:
-                database.clear_two_view_geometries()
-            map_seed = self._map_recipe if self.method.recipe else self._map_sift
             progress = copy(self.progress)
             progress.title += f"seed {seed}, "
-            models = map_seed(seed, new, watch, progress)
+            models = self._models(seed, new, watch, progress)
             verified = verified_pairs(database_path, self.verification.min_num_inliers)
         largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
         return SeedResult(
@@ -283,6 +280,19 @@ class MethodRun:
         with watch.step("map"):
             guide(context)
             return map_images(context, MAPPERS.make(self.mapping.changed(random_seed=seed)))[1]
+
+    def _models(
+        self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
+    ) -> Sequence[ModelSummary]:
+        """Verify and map a copy of the database; escalation has done so with the first seed."""
+        if self.method.escalates and seed == self.options.seeds[0]:
+            self.workspace.branch(folder)
+            shutil.copytree(self.workspace.sparse, folder / "sparse")
+            return read_summaries(folder / "sparse")
+        with open_database(folder / "database.db") as database:
+            database.clear_two_view_geometries()
+        map_seed = self._map_recipe if self.method.recipe else self._map_sift
+        return map_seed(seed, folder, watch, progress)
 
     def _map_sift(
         self, seed: int, folder: Path, watch: Stopwatch, progress: Progress

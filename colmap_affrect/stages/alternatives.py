@@ -215,14 +215,28 @@ def restore_best(escalation: Escalation) -> bool:
         context.matches.choose(before.read(changed), worths, **{RESTORING: True})
     escalation.write()
     guide(context, context.guiding)
+    _take_over(context, context.workspace.best / "sparse")
+    context.matches.keep_note(RESTORING, None)
+    return True
+
+
+def follow_keypoints(context: Context) -> None:
+    """Give the models that are there the keypoints that images have got; nothing else has changed.
+
+    Mapping again would be of the same pairs, and might end elsewhere.
+    """
+    if context.workspace.made_from("map") != context.verified_digest():
+        _take_over(context, context.workspace.sparse)
+
+
+def _take_over(context: Context, sparse_path: Path) -> None:
+    """Let models be those of the verified pairs that are there, with all keypoints."""
     workspace = context.workspace
     with _replaced(workspace.sparse) as new:
         new.mkdir()
-        for folder in model_folders(workspace.best / "sparse"):
+        for folder in model_folders(sparse_path):
             copy_with_keypoints(folder, new / folder.name, workspace.database)
     workspace.record_made_from(map=context.verified_digest())
-    context.matches.keep_note(RESTORING, None)
-    return True
 
 
 def forget_best(context: Context) -> None:

@@ -11,11 +11,12 @@ from dataclasses import replace
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import model_folders
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import CLIMBING, FINISHED, RESTORING
+from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING, RESTORING
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.alternatives import (
     LookedAt,
     choose_learned,
+    follow_keypoints,
     forget_best,
     keep_best,
     look_at_learned,
@@ -47,8 +48,8 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
     escalated = _learned(escalation, mapper, escalated)
     if choose_learned(escalation, at_once=True):
         reports += _mapped_anew(context, mapper, recipe)
-    elif not escalation.has_stepped:
-        reports += _mapped_on(context, mapper, recipe)  # images may have got features
+    elif not escalation.has_stepped and context.matches.note(LEARNING):
+        follow_keypoints(context)
     while True:
         while step := escalation.next_step():
             keep_best(context)
