@@ -5,7 +5,7 @@ Rows that COLMAP does not expect end the process inside COLMAP, so SQLite reads 
 
 import sqlite3
 import tomllib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap.model_files import camera_like
+from colmap_affrect.colmap.links import check_links
+from colmap_affrect.colmap.model_files import MAX_SIDE_PX, camera_like
 from colmap_affrect.colmap.tables import (
     DAMAGED,
     MAX_NUM_IMAGES,
@@ -31,11 +32,19 @@ CHECKS: dict[str, dict[str, str]] = tomllib.loads(
     Path(__file__).with_name("checks.toml").read_text(encoding="utf-8")
 )
 
-FATAL_FOR_IMAGES = frozenset({"bad-name", "no-parent", "bad-camera", "camera-panorama"})
+FATAL_FOR_MAPPING = frozenset({"camera-panorama", "rig-without-pose"})
+"""Problems of databases that are of use to COLMAP, but cannot be mapped."""
+FATAL_FOR_IMAGES = FATAL_FOR_MAPPING | {
+    "bad-id", "bad-name", "no-parent", "bad-camera", "bad-rig", "bad-frame",
+}  # fmt: skip
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 USELESS_KEYPOINTS = frozenset({"keypoints-not-finite", "keypoints-at-one-place"})
 FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "matrix-data"}
 """The same of keypoints and matches."""
+FATAL_AS_IT_IS = FATAL | {"no-frame"}
+"""The same for a database that is mapped without a copy, which would get frames."""
+FATAL_BEFORE_MAPPING = FATAL - {"rig-without-pose"}
+"""The same where nothing is mapped yet."""
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
 
 MATRICES = {  # columns that hold so many float64 or nothing, by table
@@ -45,7 +54,6 @@ MATRICES = {  # columns that hold so many float64 or nothing, by table
 }
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
-MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
 MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
 
 
@@ -63,13 +71,13 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
     with open_read_only(path) as connection:
         try:
             connection.text_factory = lambda data: data.decode("utf-8", "replace")
-            (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
             if verdict != "ok":
                 raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
             tables = read_tables(connection)
             _check_cameras(tables, found)
             _check_images(connection, tables, found)
-            _check_links(connection, found)
+            check_links(connection, tables, found)
             _check_matrices(connection, found)
             _check_keypoints(connection, tables, found)
             _check_pairs(connection, tables, found)
@@ -97,21 +105,17 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
 
 def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
-        name = raw.decode("utf-8", "replace")
+        name = (raw or b"").decode("utf-8", "replace")
         if not name or "\0" in name or name.encode() != raw:
             found["bad-name"].append(f"image {image_id}: {name!r}")
+    for name, count in Counter(tables.names.values()).items():
+        if count > 1:
+            found["bad-name"].append(f"{name}, {count} times")
     for image_id, name in tables.names.items():
         if tables.camera_ids[image_id] not in tables.cameras:
             found["no-parent"].append(name)
         if tables.num_frames and image_id not in tables.frame_images:
             found["no-frame"].append(name)
-
-
-def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
-    tables = ("rig_sensors", "frames", "frame_data")
-    for table in [name for name in tables if columns_of(connection, name)]:
-        for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
-            found["no-parent"].append(f"row {row} of {table}, {parent}")
 
 
 def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:

@@ -1,4 +1,8 @@
-"""Copies of COLMAP databases, made by SQLite: COLMAP migrates a database as soon as it opens it."""
+"""Copies of COLMAP databases, made by SQLite: COLMAP migrates a database as soon as it opens it.
+
+A copy holds the rows of COLMAP's tables, in tables that pycolmap has made, and nothing else that is
+in the file: triggers, views and indices of others could do anything while COLMAP writes.
+"""
 
 import sqlite3
 import tempfile
@@ -8,11 +12,24 @@ from functools import cache
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
+from colmap_affrect.colmap.checks import (
+    FATAL,
+    FATAL_FOR_IMAGES,
+    FATAL_FOR_MAPPING,
+    refuse_unusable,
+)
 from colmap_affrect.colmap.database import open_database, write_frame
-from colmap_affrect.colmap.tables import open_read_only
+from colmap_affrect.colmap.tables import columns_of, open_read_only
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import temporary_folder
+
+COPIED = (  # what is referred to comes first
+    "cameras", "rigs", "rig_sensors", "frames", "frame_data", "images", "pose_priors", "keypoints",
+    "descriptors", "matches", "two_view_geometries", "inlier_matches",
+)  # fmt: skip
+"""All tables that COLMAP has had; the last one is older than two-view geometries."""
+TYPES = ("INTEGER", "TEXT", "BLOB", "REAL")  # of columns
 
 
 def schema_version(path: Path) -> int:
@@ -53,21 +70,94 @@ def copy_database(
     The copy, which appears as a whole, has the schema of the installed pycolmap, and what
     ``change`` does to it. COLMAP leaves positions of before 3.10 behind. DatabaseError when the
     target exists, for what is no intact database or one of a newer COLMAP, and for ``refused``
-    kinds of problems: databases of anybody are checked before COLMAP sees the copy.
+    kinds of problems: databases of anybody are checked before COLMAP sees the copy. What is no
+    table of COLMAP stays behind.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
-    refuse_newer(source)
+    version = refuse_newer(source)
     if refused:
         refuse_unusable(source, refused)
     with temporary_folder(target.parent) as folder:
-        new = folder / target.name
-        with open_read_only(source) as original, closing(sqlite3.connect(new)) as copy:
-            original.backup(copy)
-        with open_database(new) as database:  # COLMAP migrates it
-            if change:
+        new, old = folder / target.name, folder / "old.db"
+        with open_database(new):  # which makes the tables
+            pass
+        with open_read_only(source) as original:
+            if version == newest_schema_version():
+                _copy_tables(original, source, new)
+            else:
+                _copy_tables(original, source, old, version)
+        if old.exists():
+            with open_database(old):  # COLMAP migrates it
+                pass
+            with open_read_only(old) as migrated:
+                _copy_tables(migrated, source, new)
+        if change:
+            with open_database(new) as database:
                 change(database)
         new.replace(target)
+
+
+def _copy_tables(
+    original: sqlite3.Connection, source: Path, target: Path, version: int | None = None
+) -> None:
+    """Copy the rows of COLMAP's tables.
+
+    Args:
+        original: where they are read, in one transaction.
+        source: the file that an error names.
+        target: a database with tables of COLMAP, or a new file.
+        version: of the tables to be made in a new file, with the columns of the original.
+    """
+    original.execute("BEGIN")
+    with closing(sqlite3.connect(target)) as copy:
+        try:
+            for table in COPIED:
+                if version is not None:
+                    _make_table(original, copy, table)
+                _copy_rows(original, copy, table)
+            if version is not None:
+                copy.execute(f"PRAGMA user_version = {int(version)}")
+            copy.commit()
+        except sqlite3.IntegrityError as error:
+            raise DatabaseError(
+                f"{source}: has rows that COLMAP's tables cannot hold ({error}); import its images "
+                "again into a new database"
+            ) from error
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE):
+                raise cannot_write(target, error) from error
+            raise
+
+
+def _columns(connection: sqlite3.Connection, table: str) -> list[str]:
+    """Return the columns of a table whose names can be written into a statement, in order."""
+    return sorted(name for name in columns_of(connection, table) if name.isidentifier())
+
+
+def _make_table(original: sqlite3.Connection, copy: sqlite3.Connection, table: str) -> None:
+    """Make a table with the columns of the original, and none of its conditions."""
+    if not columns_of(original, table):
+        return
+    columns = []
+    for _, name, said, _, _, is_key in original.execute(f"PRAGMA table_info({table})"):
+        if str(name).isidentifier():
+            kind = str(said).upper() if str(said).upper() in TYPES else "BLOB"
+            key = " PRIMARY KEY" if is_key and kind == "INTEGER" else ""
+            columns.append(f'"{name}" {kind}{key}')
+    copy.execute(f"CREATE TABLE {table} ({', '.join(columns)})")
+
+
+def _copy_rows(original: sqlite3.Connection, copy: sqlite3.Connection, table: str) -> None:
+    """Copy the columns that both tables have."""
+    common = {*_columns(original, table)} & {*_columns(copy, table)}
+    if not common:
+        return
+    names = sorted(common)
+    listed, marks = ", ".join(f'"{name}"' for name in names), ", ".join("?" * len(names))
+    # The table is one of ours, and the names of its columns are identifiers.
+    rows = original.execute(f"SELECT {listed} FROM {table}")  # noqa: S608
+    copy.executemany(f"INSERT INTO {table} ({listed}) VALUES ({marks})", rows)  # noqa: S608
 
 
 def copy_without_features(source: Path, target: Path) -> None:
@@ -92,11 +182,13 @@ def add_frames(database: pycolmap.Database) -> None:
 
 
 @contextmanager
-def open_copy(source: Path) -> Iterator[pycolmap.Database]:
+def open_copy(
+    source: Path, refused: Collection[str] = FATAL - FATAL_FOR_MAPPING
+) -> Iterator[pycolmap.Database]:
     """Open a temporary :func:`copy_database`; the original stays as it is."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "database.db"
-        copy_database(source, copy, FATAL - {"camera-panorama"})
+        copy_database(source, copy, refused)
         with open_database(copy) as database:
             yield database
 

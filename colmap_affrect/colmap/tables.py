@@ -36,6 +36,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     address = f"{path.resolve().as_uri()}?{mode}"
     try:
         with closing(sqlite3.connect(address, uri=True)) as connection:
+            connection.execute("PRAGMA trusted_schema = OFF")  # no code of the file
             rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
             if missing := TABLES - {name for (name,) in rows}:
                 raise DatabaseError(
@@ -142,5 +143,8 @@ def rows_digest(path: Path) -> str:
 
 
 def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:
-    """Return the columns of a table, none if there is no such table."""
+    """Return the columns of a table, none if there is no such table; a view is none."""
+    is_table = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ? COLLATE NOCASE"
+    if not connection.execute(is_table, (table,)).fetchone():
+        return set()
     return {str(row[1]) for row in connection.execute(f"PRAGMA table_info({table})")}

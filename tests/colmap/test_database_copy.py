@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import Call
+from damaged import execute
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
@@ -247,3 +248,78 @@ def test_existing_target_is_not_overwritten(database_path: Path, tmp_path: Path)
         with pytest.raises(DatabaseError, match="exists already"):
             copy(database_path, tmp_path / "there.db")
     assert (tmp_path / "there.db").read_text() == "precious"
+
+
+FOREIGN = {
+    "trigger": "CREATE TRIGGER t AFTER INSERT ON keypoints BEGIN DELETE FROM images; END",
+    "trigger of change": """CREATE TRIGGER t AFTER UPDATE ON cameras
+        BEGIN UPDATE cameras SET params = zeroblob(300000000); END""",
+    "view": "CREATE VIEW v AS SELECT zeroblob(300000000)",
+    "index": "CREATE INDEX i ON images(length(name))",
+    "table": "CREATE TABLE more AS SELECT zeroblob(3000000) AS data",
+    "column": "ALTER TABLE images ADD COLUMN more BLOB AS (zeroblob(300000000))",
+}
+"""What others may have put into a database beside COLMAP's tables."""
+
+
+def whole(path: Path) -> list[tuple[object, ...]]:
+    """Return what a database holds: how it is made, and all rows."""
+    made = rows(path, "SELECT type, name, sql FROM sqlite_master ORDER BY name")
+    return [
+        *made,
+        *(row for name in tables_of(path) for row in rows(path, f"SELECT * FROM {name}")),
+    ]
+
+
+def tables_of(path: Path) -> list[str]:
+    """Return the names of the tables of a database."""
+    made = rows(path, "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name")
+    return [str(name) for (name,) in made]
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_copies_hold_the_tables_of_colmap_alone(source: Path, tmp_path: Path, case: str) -> None:
+    path = Path(shutil.copy(source, tmp_path / "given.db"))
+    execute(path, FOREIGN[case])
+    copy_database(source, tmp_path / "plain.db")
+    copy_database(path, tmp_path / "copy.db")
+    assert whole(tmp_path / "copy.db") == whole(tmp_path / "plain.db")
+    assert len(tables_of(source)) == 12
+    for name in tables_of(source):
+        query = f"SELECT * FROM {name}"
+        assert sorted(rows(tmp_path / "copy.db", query)) == sorted(rows(source, query)), name
+    with open_database(tmp_path / "copy.db") as database:
+        database.write_keypoints(99, np.zeros((1, 2), np.float32))
+        assert database.num_images() == 6
+
+
+def test_triggers_of_old_databases_stay_behind(source: Path, tmp_path: Path) -> None:
+    export_database(source, tmp_path / "old.db")
+    execute(tmp_path / "old.db", FOREIGN["trigger"], FOREIGN["view"])
+    copy_database(tmp_path / "old.db", tmp_path / "copy.db")
+    made = rows(tmp_path / "copy.db", "SELECT name FROM sqlite_master WHERE type != 'table'")
+    assert not {("t",), ("v",)} & {*made}
+    query = "SELECT image_id, rows, data FROM keypoints"
+    assert rows(tmp_path / "copy.db", query) == rows(source, query)
+    assert schema_version(tmp_path / "copy.db") == newest_schema_version()
+
+
+def test_views_are_no_tables(source: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(source, tmp_path / "given.db"))
+    execute(path, "ALTER TABLE frames RENAME TO f", "CREATE VIEW frames AS SELECT * FROM f")
+    copy_database(path, tmp_path / "copy.db")
+    assert rows(tmp_path / "copy.db", "SELECT * FROM frames") == []
+
+
+def test_rows_that_no_table_can_hold_are_one_line(source: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(source, tmp_path / "given.db"))
+    execute(
+        path,
+        "CREATE TABLE c AS SELECT * FROM cameras",
+        "DROP TABLE cameras",
+        "ALTER TABLE c RENAME TO cameras",
+        "UPDATE cameras SET prior_focal_length = NULL",
+    )
+    with pytest.raises(DatabaseError, match="has rows that COLMAP's tables cannot hold"):
+        copy_database(path, tmp_path / "copy.db")
+    assert not (tmp_path / "copy.db").exists()
