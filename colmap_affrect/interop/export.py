@@ -12,8 +12,9 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
-from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.colmap.model_files import model_folder, read_given_model
 from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.images.orientation import forget_orientation
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
@@ -48,11 +49,12 @@ def export(
 ) -> dict[str, Path]:
     """Write a COLMAP model in some of ``FORMATS``; return what was written by format.
 
-    The output folder is made if missing; nothing in it is overwritten. ``image_path`` has the
-    photographs to undistort, by default those of the run that made the model. Raises AffrectError
-    when a format cannot hold the model, or a file exists; nothing is written then.
+    ``model_path`` may be the output folder of a run, whose largest model is written. The output
+    folder is made if missing; nothing in it is overwritten. ``image_path`` has the photographs to
+    undistort, by default those of the run that made the model. Raises AffrectError when a format
+    cannot hold the model, or a file exists; nothing is written then.
     """
-    model_path, output_path = as_path(model_path), as_path(output_path)
+    model_path, output_path = model_folder(as_path(model_path)), as_path(output_path)
     image_path = as_path(image_path) if image_path else None
     for name in formats:
         if name not in FORMATS:
@@ -80,11 +82,20 @@ def _points(source: Source, folder: Path) -> Path:
 def _text(source: Source, folder: Path) -> Path:
     path = folder / "text"
     for image in source.images():
-        if not image.name or not image.name.isprintable():
-            raise OptionError(f"text: cannot hold the image name {image.name!r}; rename it")
+        if not _is_word(image.name):
+            raise OptionError(
+                f"text: COLMAP cannot read back the image name {image.name!r}, with blanks, odd "
+                "characters or # at its beginning; rename the photograph and run again, or use the "
+                "binary model as it is"
+            )
     path.mkdir()
     source.model.write_text(path)
     return path
+
+
+def _is_word(name: str) -> bool:
+    """Return whether COLMAP's readers of text models take a name as one word, and no remark."""
+    return bool(name) and name.isprintable() and " " not in name and not name.startswith("#")
 
 
 def _undistorted(source: Source, folder: Path) -> Path:
@@ -108,6 +119,7 @@ def _undistorted(source: Source, folder: Path) -> Path:
     for image in source.images():
         if not (picture := path / "images" / image.name).is_file():
             raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
+        forget_orientation(picture)  # COLMAP takes over EXIF, by which others would turn it
     return path
 
 

@@ -116,3 +116,27 @@ def test_command_names_what_it_wrote(tmp_path: Path, call: Call) -> None:
     assert all(Path(line.split()[1]).exists() for line in done.stdout.splitlines())
     help_text = call("export", "--help").stdout
     assert all(name in help_text for name in FORMATS)
+
+
+@pytest.mark.parametrize("name", ["IMG 1.png", "#1.png", "a\u00a0b.png", "line\nbreak.png", ""])
+def test_text_is_refused_where_colmap_could_not_read_the_names(tmp_path: Path, name: str) -> None:
+    model = write_model(tmp_path / "model")
+    model.images[1].name = name
+    model.write(tmp_path / "model")
+    with pytest.raises(OptionError, match="COLMAP cannot read back the image name"):
+        export(tmp_path / "model", tmp_path / "out", ["text"])
+    assert not (tmp_path / "out").exists()
+    export(tmp_path / "model", tmp_path / "out", ["cameras"])
+
+
+@pytest.mark.usefixtures("model")
+def test_output_folder_of_a_run_is_taken_for_its_model(tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos")
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "sparse").mkdir()
+    (tmp_path / "model").rename(out / "sparse" / "0")
+    written = export(
+        out, tmp_path / "new", ["cameras", "undistorted"], image_path=tmp_path / "photos"
+    )
+    assert (written["undistorted"] / "images" / "a.png").exists()
