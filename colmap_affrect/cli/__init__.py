@@ -68,7 +68,8 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
         workspace.require_own(options.image_path or options.dataset_path)
         log_path = workspace.log
     log_path.parent.mkdir(parents=True, exist_ok=True)
-    terminal = os.fdopen(os.dup(2), "w", buffering=1, encoding="utf-8", errors="replace")
+    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+    terminal = os.fdopen(os.dup(2), "w", buffering=1, encoding=encoding, errors=errors.ESCAPED)
     log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
     with terminal, closing(log), redirect_stderr(terminal):
         shown = logging.StreamHandler(terminal)

@@ -179,13 +179,14 @@ FLAGS: dict[str, Settings] = {
     "database_path": _path("OUT.db", "the database to make; must not exist"),
     "--descriptors": _switch("of an output folder, with the descriptors of features.h5 as 8-bit "
         "SIFT, which COLMAP's own matchers need"),
-    "--model-path": _path("MODEL", "folder of a COLMAP model, such as out/sparse/0"),
+    "--model-path": _path("MODEL", "folder of a COLMAP model, or of a run (its "
+        "largest one)"),
     "--output-path@files": _path("FOLDER", "folder for the files; nothing in it is overwritten",
         dest="target_path"),
     "--format": _value("A,B,...", "ply (points), text (COLMAP's), undistorted (photographs and "
         "model, for dense reconstruction), nerfstudio (the same with transforms.json, for "
         "Gaussian splatting too), cameras (CSV) "
-        "(default: ply,text,cameras)", type=words, default=("ply", "text", "cameras")),
+        "(default: ply,text,cameras; no text where names have blanks)", type=words, default=()),
     "--image-path@export": _path("PATH",
         "folder of the photographs, to undistort them (default: that of the run)"),
     "--output-path@model": _path("MODEL", "folder for the new model, in metres; must not exist",

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.model_files import model_folder, read_given_model
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.errors import ImageError, OptionError, such_as
 from colmap_affrect.images.orientation import forget_orientation
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
@@ -21,6 +22,9 @@ from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.workspace import Workspace
 
+logger = logging.getLogger(__name__)
+
+USUAL = ("ply", "text", "cameras")  # formats that need no photographs
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
 FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL and nerfstudio
@@ -43,16 +47,23 @@ class Source:
 def export(
     model_path: PathLike,
     output_path: PathLike,
-    formats: Sequence[str],
+    formats: Sequence[str] = (),
     *,
     image_path: PathLike | None = None,
 ) -> dict[str, Path]:
     """Write a COLMAP model in some of ``FORMATS``; return what was written by format.
 
-    ``model_path`` may be the output folder of a run, whose largest model is written. The output
-    folder is made if missing; nothing in it is overwritten. ``image_path`` has the photographs to
-    undistort, by default those of the run that made the model. Raises AffrectError when a format
-    cannot hold the model, or a file exists; nothing is written then.
+    The output folder is made if missing; nothing in it is overwritten.
+
+    Args:
+        model_path: folder of a model, or the output folder of a run, whose largest model it is.
+        output_path: folder for the files.
+        formats: names of formats; by default those of ``USUAL``, without text where COLMAP could
+            not read it back.
+        image_path: the photographs to undistort, by default those of the run.
+
+    Raises:
+        AffrectError: a format cannot hold the model, or a file exists; nothing is written then.
     """
     model_path, output_path = model_folder(as_path(model_path)), as_path(output_path)
     image_path = as_path(image_path) if image_path else None
@@ -63,6 +74,8 @@ def export(
         raise OptionError(f"--image-path {image_path}: no such folder")
     photographs = image_path or Workspace(model_path.resolve().parent.parent).photographs()
     source = Source(model_path, read_given_model(model_path), photographs)
+    if not formats:
+        formats = _usual(source)
     chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
     names = dict.fromkeys(made for _, made in chosen.values())
     targets = [output_path / name for name in names]
@@ -81,16 +94,33 @@ def _points(source: Source, folder: Path) -> Path:
 
 def _text(source: Source, folder: Path) -> Path:
     path = folder / "text"
-    for image in source.images():
-        if not _is_word(image.name):
-            raise OptionError(
-                f"text: COLMAP cannot read back the image name {image.name!r}, with blanks, odd "
-                "characters or # at its beginning; rename the photograph and run again, or use the "
-                "binary model as it is"
-            )
+    if unreadable := _no_words(source):
+        raise OptionError(
+            f"text: {_why_no_text(unreadable)}; rename the photographs and run again, or use the "
+            "binary model as it is"
+        )
     path.mkdir()
     source.model.write_text(path)
     return path
+
+
+def _usual(source: Source) -> Sequence[str]:
+    """Return the formats that are written where none is asked for."""
+    if not (unreadable := _no_words(source)):
+        return USUAL
+    logger.warning("text: left out, %s", _why_no_text(unreadable))
+    return [name for name in USUAL if name != "text"]
+
+
+def _no_words(source: Source) -> list[str]:
+    return [image.name for image in source.images() if not _is_word(image.name)]
+
+
+def _why_no_text(names: Sequence[str]) -> str:
+    return (
+        f"COLMAP could not read back names with blanks, odd characters or # at their beginning "
+        f"({such_as(map(repr, names))})"
+    )
 
 
 def _is_word(name: str) -> bool:

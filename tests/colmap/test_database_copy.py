@@ -289,7 +289,9 @@ def test_copies_hold_the_tables_of_colmap_alone(source: Path, tmp_path: Path, ca
         query = f"SELECT * FROM {name}"
         assert sorted(rows(tmp_path / "copy.db", query)) == sorted(rows(source, query)), name
     with open_database(tmp_path / "copy.db") as database:
-        database.write_keypoints(99, np.zeros((1, 2), np.float32))
+        database.clear_keypoints()
+        database.write_keypoints(1, np.zeros((1, 2), np.float32))
+        database.update_camera(database.read_camera(1))
         assert database.num_images() == 6
 
 

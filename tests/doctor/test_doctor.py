@@ -148,7 +148,7 @@ def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     model, out = folders.out / "sparse" / "0", str(folders.out)
     edit_model(model)
     before = (model / "points3D.bin").read_bytes()
-    target = ["--model-path", str(model), "--output-path", str(tmp_path / "new"), "--format=text"]
+    target = ["--model-path", str(model), "--output-path", str(tmp_path / "new"), "--format=ply"]
     for inputs in (None, "0" * 64):  # and where mapping would begin anew
         if inputs:
             Workspace(folders.out).record_made_from(map=inputs)

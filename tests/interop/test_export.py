@@ -123,10 +123,10 @@ def test_text_is_refused_where_colmap_could_not_read_the_names(tmp_path: Path, n
     model = write_model(tmp_path / "model")
     model.images[1].name = name
     model.write(tmp_path / "model")
-    with pytest.raises(OptionError, match="COLMAP cannot read back the image name"):
-        export(tmp_path / "model", tmp_path / "out", ["text"])
-    assert not (tmp_path / "out").exists()
-    export(tmp_path / "model", tmp_path / "out", ["cameras"])
+    with pytest.raises(OptionError, match="text: COLMAP could not read back names with blanks"):
+        export(tmp_path / "model", tmp_path / "out", ["text", "ply"])
+    assert list((tmp_path / "out").iterdir()) == []
+    assert [*export(tmp_path / "model", tmp_path / "out")] == ["ply", "cameras"]
 
 
 @pytest.mark.usefixtures("model")

@@ -114,7 +114,7 @@ def exports(base: Path, photograph: str) -> dict[str, tuple[Words, str]]:
     new_files = ["--features-path", "{out}/features.h5", "--matches-path", "{out}/matches.h5"]
     assert RESULTS.keys() == FORMATS.keys()
     found: dict[str, tuple[Words, str]] = {}
-    for form, name in {**RESULTS, "ply,text,cameras,nerfstudio": "text"}.items():
+    for form, name in {**RESULTS, "ply,cameras,nerfstudio": "points3D.ply"}.items():
         for model in ("plain", "lens"):
             given = ["--model-path", base / model, *images, "--format", form]
             found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)
@@ -192,9 +192,10 @@ def attack_exports(
         before = tree(world, *allowed)
         try:
             end = call(*(str(word).replace("{out}", str(out)) for word in words), "-q")
+            accepted = (*codes, 2) if "text" in label else codes  # which holds no blanks in names
             harmed = differences(before, tree(world, *allowed))
             assert not harmed, f"{harmed}, exit code {end.code}"
-            assert_clear(end, *codes)
+            assert_clear(end, *accepted)
             if end.code == 0 and out in allowed:
                 assert_whole(label, out)
         except AssertionError as error:
@@ -280,7 +281,7 @@ def reader(name: str, scene: Path, out: Path) -> Words:
     return {
         "run": run_words(scene, out),
         "map": ["map", "-q", "--output-path", out],
-        "export": ["export", *model, "--format", "ply,text,cameras,undistorted"],
+        "export": ["export", *model, "--format", "ply,cameras,undistorted"],
         "align": ["align", *model, "--distance", "b c.png,side/d.png,2.0"],
         "doctor": ["doctor", "-q", out],
     }[name]
