@@ -4,6 +4,7 @@ Rows that COLMAP does not expect end the process inside COLMAP, so SQLite reads 
 """
 
 import sqlite3
+import struct
 import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Collection
@@ -38,7 +39,9 @@ FATAL_FOR_IMAGES = FATAL_FOR_MAPPING | {
     "bad-id", "bad-name", "no-parent", "bad-camera", "bad-rig", "bad-frame",
 }  # fmt: skip
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
-USELESS_KEYPOINTS = frozenset({"keypoints-not-finite", "keypoints-at-one-place"})
+USELESS_KEYPOINTS = frozenset({
+    "keypoints-not-finite", "keypoints-outside", "keypoints-normalised", "keypoints-at-one-place",
+})  # fmt: skip
 FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "matrix-data"}
 """The same of keypoints and matches."""
 FATAL_AS_IT_IS = FATAL | {"no-frame"}
@@ -53,7 +56,12 @@ MATRICES = {  # columns that hold so many float64 or nothing, by table
     "rig_sensors": {"sensor_from_rig": 7},
 }
 
+PACKED_CAMERA = struct.Struct("<IiQQBQ")  # id, model, size, prior, and how many parameters follow
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
+MAX_OUTSIDE = 0.01  # of the longer side: so far some programs find, or move, what is at the border
+MAX_OUTSIDE_PX = 2.0  # more than that
+MIN_NORMALISED = 3  # keypoints, none further from the corner than ...
+MAX_NORMALISED = 2.0  # ... so many px: their unit is a side of the image, or half of one
 MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
 
 
@@ -124,10 +132,23 @@ def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
             for row, blob in rows_of(connection, f"rowid {name}", table):
                 if blob and _array(blob, 1, columns[name], np.dtype("<f8")) is None:
                     found["matrix-data"].append(f"{name} of row {row} of {table}")
+    for row, *blobs in rows_of(connection, "pair_id camera1 camera2", "two_view_geometries"):
+        if any(blob and not _is_camera(blob) for blob in blobs):
+            found["matrix-data"].append(f"camera1 or camera2 of pair_id {row}")
     if {"qvec", "tvec"} <= columns_of(connection, "two_view_geometries"):
         query = "SELECT pair_id FROM two_view_geometries WHERE (qvec IS NULL) != (tvec IS NULL)"
         for (row,) in connection.execute(query):
             found["matrix-data"].append(f"qvec and tvec of pair_id {row}")
+
+
+def _is_camera(blob: Any) -> bool:
+    """Return whether COLMAP can read a camera that it has packed into a column."""
+    if not isinstance(blob, bytes) or len(blob) < PACKED_CAMERA.size:
+        return False
+    _, model, *_, count = PACKED_CAMERA.unpack_from(blob)
+    like = camera_like(model)
+    size = PACKED_CAMERA.size + 8 * count
+    return like is not None and count == len(like.params) and len(blob) == size
 
 
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
@@ -142,16 +163,30 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
         if keypoints is None:
             found["keypoint-data"].append(name)
         elif count:
-            for kind in keypoint_problems(keypoints):
+            camera = tables.cameras.get(tables.camera_ids[image_id])
+            size = (camera.width, camera.height) if camera else None
+            for kind in keypoint_problems(keypoints, size):
                 found[kind].append(name)
 
 
-def keypoint_problems(keypoints: Singles) -> list[str]:
-    """Return which kinds of problems some of (N, 2 or more) keypoints have, in COLMAP's px."""
+def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:
+    """Return which kinds of problems some keypoints of an image have.
+
+    Args:
+        keypoints: (N, 2 or more), in COLMAP's px.
+        size: (width, height) of the image in px, None where it is not known.
+    """
     finite = np.asarray((np.abs(keypoints) <= MAX_SIDE_PX).all(axis=1))
     points, found = keypoints[finite, :2], list[str]()
     if not finite.all():
         found.append("keypoints-not-finite")
+    if size and len(points):
+        if len(points) >= MIN_NORMALISED and np.abs(points).max() <= MAX_NORMALISED < max(size):
+            found.append("keypoints-normalised")
+        margin = MAX_OUTSIDE * max(size) + MAX_OUTSIDE_PX
+        beyond = np.maximum(-points, points - np.array(size, np.float32))
+        if beyond.max() > margin:
+            found.append("keypoints-outside")
     if len(points) >= MIN_AT_ONE_PLACE:  # what more than half have is the median
         median = np.partition(points, len(points) // 2, axis=0)[len(points) // 2]
         num_there = int((points == median).all(axis=1).sum())

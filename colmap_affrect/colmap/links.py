@@ -88,11 +88,17 @@ def _check_ids(connection: sqlite3.Connection, found: Found) -> None:
                 found["bad-id"].append(f"{column} {value!r} of {table}")
         for value in _twice(ids):
             found["bad-id"].append(f"{column} {value!r} of {table}, twice")
+    _check_priors(connection, found)
+
+
+def _check_priors(connection: sqlite3.Connection, found: Found) -> None:
     priors = rows_of(connection, "corr_sensor_type corr_sensor_id corr_data_id", "pose_priors")
-    for kind, number, data_id in _twice(priors):
-        if number:  # databases of old have no such columns
-            label = f"pose prior of {data_id} of {_Sensor(kind, number)}"
-            found["bad-id"].append(f"{label}, twice")
+    known = [row for row in priors if row[1]]  # databases of old have no such columns
+    for kind, number, data_id in known:
+        if not all(isinstance(value, int) and 0 <= value <= MAX_ID for value in (number, data_id)):
+            found["bad-id"].append(f"pose prior of {data_id!r} of {_Sensor(kind, number)}")
+    for kind, number, data_id in _twice(known):
+        found["bad-id"].append(f"pose prior of {data_id!r} of {_Sensor(kind, number)}, twice")
 
 
 def _check_foreign_keys(connection: sqlite3.Connection, found: Found) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,11 @@ def changed_keypoint(row: int, column: int, value: float) -> Statement:
     return replace_data("keypoints", 2, keypoints)
 
 
+def in_units_of_sides(low: float, high: float) -> Statement:
+    places = np.linspace(low, high, 7, dtype=np.float32)
+    return replace_data("keypoints", 2, np.stack([places] * 6, axis=1))
+
+
 def at_one_place(count: int, num_there: int) -> Statement:
     keypoints = np.full((count, 6), 20, np.float32)
     keypoints[num_there:, 0] = np.arange(count - num_there)
@@ -113,6 +119,8 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
                 "INSERT INTO pose_priors VALUES (1, 2, 1, 0, NULL, NULL, NULL, 0)",
                 "INSERT INTO pose_priors VALUES (2, 2, 1, 0, NULL, NULL, NULL, 0)"],
      ["pose prior of 2 of camera 1, twice"]),
+    ("bad-id", ["INSERT INTO pose_priors VALUES (1, -1, 1, 0, NULL, NULL, NULL, 0)"],
+     ["pose prior of -1 of camera 1"]),
     ("bad-name", ["CREATE TABLE i AS SELECT * FROM images", "DROP TABLE images",
                   "ALTER TABLE i RENAME TO images", "UPDATE images SET name = 'a.png'"],
      ["a.png, 3 times"]),
@@ -154,7 +162,16 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     ("matrix-data",
      [f"UPDATE two_view_geometries SET F = substr(zeroblob(72), 1, 71) {OF_13}"],
      [f"F of row {pair_id(1, 3)} of two_view_geometries"]),
+    ("matrix-data", [f"UPDATE two_view_geometries SET camera1 = x'0011' {OF_13}"],
+     [f"camera1 or camera2 of pair_id {pair_id(1, 3)}"]),
+    ("matrix-data", [f"UPDATE two_view_geometries SET camera2 = zeroblob(65) {OF_13}"],
+     [f"camera1 or camera2 of pair_id {pair_id(1, 3)}"]),
     ("keypoints-not-finite", [changed_keypoint(6, 1, np.nan)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(6, 0, 94.0)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(6, 1, -4.0)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(6, 1, 64.0)], ["b c.png"]),
+    *(("keypoints-normalised", [in_units_of_sides(*ends)], ["b c.png"])
+      for ends in ((0.0, 1.0), (0.0, 1.5), (-1.0, 1.0))),
     ("keypoints-at-one-place", [at_one_place(11, 10)], ["b c.png"]),
     ("match-data",
      [f"UPDATE matches SET rows = 3 {OF_13}"], ["a.png - side/č.png (raw matches)"]),
@@ -178,8 +195,12 @@ def test_what_is_broken_is_found_and_nothing_else(
 
 @pytest.mark.parametrize("statement", [
     "DELETE FROM frames",  # none has one: as in databases of old
+    ("UPDATE two_view_geometries SET camera1 = ?, camera2 = camera1",
+     [struct.pack("<IiQQBQ3d", 7, 0, 90, 60, 1, 3, 100.0, 45.0, 30.0)]),
     "INSERT INTO frames VALUES (9, 1)",  # which holds nothing
     "INSERT INTO rig_sensors VALUES (1, 1, 1, zeroblob(56))",  # an IMU, and it is known where
+    changed_keypoint(6, 0, 91.0),  # a little beyond the border
+    changed_keypoint(6, 0, 1.0),
     at_one_place(11, 9),
     replace_data("keypoints", 2, np.full((7, 4), 3, np.float32)),
     replace_data("matches", pair_id(1, 2), np.array([[4, 6]], np.uint32)),  # the last ones
