@@ -6,15 +6,16 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks
+from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks, SizeOf
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
-from colmap_affrect.colmap.database_copy import read_names, schema_version
+from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.images.reading import header_size
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
@@ -107,7 +108,7 @@ def run(
     recipe, mapper = options.recipe, MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    _check_by_hand(options.by_hand, names, mapper)
+    _check_by_hand(options.by_hand, names, mapper, lambda name: header_size(image_path / name))
     forecast = Forecast(len(names), _num_pairs(names, options.pairs))
     until_s, workspace = time.monotonic() + 60 * options.max_minutes, Workspace(output_path)
     given = options.by_hand, options.command
@@ -139,8 +140,10 @@ def run(
         return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
 
 
-def _check_by_hand(by_hand: ByHand, names: Collection[str], mapper: Mapper) -> Marks:
-    marks = by_hand.marks(names)  # refuses what names other photographs
+def _check_by_hand(
+    by_hand: ByHand, names: Collection[str], mapper: Mapper, size_of: SizeOf
+) -> Marks:
+    marks = by_hand.marks(names, size_of)  # refuses what names other photographs, or lies outside
     if by_hand.tie_points_path and mapper.options.name != MAPPERS.default:
         raise OptionError(
             f"--tie-points: the {mapper.options.name} mapper takes none; use --mapper sparse"
@@ -182,7 +185,8 @@ def map_from_database(
         if overwrite:
             extend.refuse_discarding(output_path)
         read_given_model(extend.model_path, "--extend ")
-    _check_by_hand(by_hand, read_names(database_path), mapper)
+    sizes = read_sizes(database_path)
+    _check_by_hand(by_hand, read_names(database_path), mapper, sizes.get)
     context = Context(Workspace(output_path), progress=progress, by_hand=by_hand)
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()
@@ -207,7 +211,8 @@ def map_and_report(
         raise ImageError(f"{path}: {min(gone)} has features, and is gone; run extract again")
     if extend and overwrite:
         extend.refuse_discarding(workspace.path)
-    marks = _check_by_hand(context.by_hand, names, mapper)
+    sizes = read_sizes(workspace.database)
+    marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
     copied = workspace.is_foreign

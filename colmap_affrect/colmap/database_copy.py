@@ -197,3 +197,10 @@ def read_names(source: Path) -> list[str]:
     """Return the names of the images of a database, which is only read."""
     with open_read_only(source) as connection:
         return sorted(str(name) for (name,) in connection.execute("SELECT name FROM images"))
+
+
+def read_sizes(source: Path) -> dict[str, tuple[int, int]]:
+    """Return (width, height) in px of the images of a database, which is only read."""
+    query = "SELECT name, width, height FROM images JOIN cameras USING (camera_id)"
+    with open_read_only(source) as connection:
+        return {str(name): (width, height) for name, width, height in connection.execute(query)}

@@ -10,7 +10,7 @@ from statistics import median
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.by_hand import triangulated
+from colmap_affrect.colmap.by_hand import require_inside, triangulated
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, FATAL_FOR_MAPPING
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.model_files import read_given_model, write_model
@@ -255,7 +255,10 @@ def _marked_points(
         if any(column in row for column in METRIC):
             true[name] = _numbers(row, METRIC, place)
         if row.get("image", "") in images:
-            marks[name][images[row["image"]].image_id] = _numbers(row, ("px", "py"), place)
+            image = images[row["image"]]
+            camera, mark = model.cameras[image.camera_id], _numbers(row, ("px", "py"), place)
+            require_inside(place, mark, image.name, (camera.width, camera.height))
+            marks[name][image.image_id] = mark
     views = {name: marked for name, marked in marks.items() if len(marked) > 1}
     if not views:
         raise OptionError(f"{where}: no point is marked in two registered photographs")

@@ -212,6 +212,15 @@ def test_positions_that_leave_the_model_open_are_refused(
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize("cells", ["161,5", "5,-1", "1e308,5", "nan,5"])
+def test_marks_outside_of_their_photograph_are_refused(tmp_path: Path, cells: str) -> None:
+    write_model(tmp_path / "model")
+    table = tmp_path / "points.csv"
+    table.write_text(f"point,image,px,py,x,y,z\np,a.png,{cells},1,2,3\n")
+    with pytest.raises(OptionError, match=r"line 2: (.* is outside of a\.png|px is not finite)"):
+        align(tmp_path / "model", tmp_path / "new", Reference(points_path=table))
+
+
 def test_nothing_is_overwritten_and_no_model_is_said(tmp_path: Path) -> None:
     write_model(tmp_path / "model")
     reference = Reference(distances=(("a.png", "b.png", 1.0),))
