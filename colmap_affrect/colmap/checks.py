@@ -23,6 +23,7 @@ from colmap_affrect.colmap.tables import (
     columns_of,
     open_read_only,
     read_tables,
+    require_intact_pages,
     rows_of,
 )
 from colmap_affrect.errors import DatabaseError, such_as
@@ -79,9 +80,7 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
     with open_read_only(path) as connection:
         try:
             connection.text_factory = lambda data: data.decode("utf-8", "replace")
-            (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
-            if verdict != "ok":
-                raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
+            require_intact_pages(connection, path)
             tables = read_tables(connection)
             _check_cameras(tables, found)
             _check_images(connection, tables, found)

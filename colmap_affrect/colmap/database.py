@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
+from colmap_affrect.colmap.tables import MAX_NUM_IMAGES, damage_of
 from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.geometry import conventions
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
@@ -42,7 +42,16 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         with closing(database):
             yield database
     except RuntimeError as error:
+        if fault := damage_of(path):
+            raise DatabaseError(f"{path}: {fault}; {_mend(path)}") from error
         raise cannot_write(path, error) from error
+
+
+def _mend(path: Path) -> str:
+    """Say what mends a damaged database; those of runs are made again when they are next used."""
+    if (path.parent / "config.toml").exists():
+        return "run the same command again, which makes it again from what it was made from"
+    return "restore it; 'sqlite3 FILE .recover' may save a part of it"
 
 
 def write_frame(

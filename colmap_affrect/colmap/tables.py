@@ -142,6 +142,23 @@ def rows_digest(path: Path) -> str:
     return digest.hexdigest()
 
 
+def require_intact_pages(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse a database that SQLite finds damaged, perhaps in an index that no row shows."""
+    (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+    if verdict != "ok":
+        raise DatabaseError(f"{path}: damaged ({str(verdict).splitlines()[-1]})")
+
+
+def damage_of(path: Path) -> str:
+    """Return how a database is damaged, empty if it is not."""
+    try:
+        with open_read_only(path) as connection:
+            require_intact_pages(connection, path)
+    except (DatabaseError, OptionError) as error:
+        return str(error).removeprefix(f"{path}: ")
+    return ""
+
+
 def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:
     """Return the columns of a table, none if there is no such table; a view is none."""
     is_table = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ? COLLATE NOCASE"

@@ -18,7 +18,7 @@ from colmap_affrect.colmap.checks import (
     refuse_unusable,
 )
 from colmap_affrect.colmap.initial_cameras import record_cameras
-from colmap_affrect.colmap.tables import rows_digest
+from colmap_affrect.colmap.tables import damage_of, rows_digest
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import database_files
@@ -64,7 +64,8 @@ def watched(
     try:
         yield
     except AffrectError:
-        _seal(workspace)
+        if path.exists() and not damage_of(path):  # else it is looked through next time
+            _seal(workspace)
         raise
     _seal(workspace)
 
@@ -91,6 +92,8 @@ def _why_lost(workspace: Workspace) -> str:
     if not begun or _stamp(path) in sealed:
         return ""
     try:
+        if fault := damage_of(path):  # of an index perhaps, which rows do not show
+            return f"cannot be used ({fault})"
         if sealed:
             return "" if rows_digest(path) in sealed else CHANGED
         refuse_unusable(path, FATAL_AS_IT_IS)  # a command was killed, and what it wrote is good
