@@ -43,7 +43,9 @@ FATAL_FOR_IMAGES = FATAL_FOR_MAPPING | {
 USELESS_KEYPOINTS = frozenset({
     "keypoints-not-finite", "keypoints-outside", "keypoints-normalised", "keypoints-at-one-place",
 })  # fmt: skip
-FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "matrix-data"}
+FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {
+    "keypoint-data", "descriptor-data", "match-data", "matrix-data",
+}  # fmt: skip
 """The same of keypoints and matches."""
 FATAL_AS_IT_IS = FATAL | {"no-frame"}
 """The same for a database that is mapped without a copy, which would get frames."""
@@ -166,6 +168,11 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             size = (camera.width, camera.height) if camera else None
             for kind in keypoint_problems(keypoints, size):
                 found[kind].append(name)
+    for image_id, count, width, blob in rows_of(
+        connection, "image_id rows cols data", "descriptors"
+    ):
+        if _array(blob, count, width, np.dtype("u1")) is None:
+            found["descriptor-data"].append(tables.names.get(image_id, f"image {image_id}"))
 
 
 def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:
@@ -197,7 +204,11 @@ def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[
 def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:
     """Return the (rows, columns) array that is stored in a table, None if it is another size."""
     blob = b"" if blob is None else blob
-    if not isinstance(blob, bytes) or len(blob) != rows * columns * dtype.itemsize:
+    if (
+        not isinstance(blob, bytes)
+        or min(rows, columns) < 0
+        or len(blob) != rows * columns * dtype.itemsize
+    ):
         return None
     return np.frombuffer(blob, dtype).reshape(rows, columns)
 

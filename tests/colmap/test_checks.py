@@ -154,6 +154,10 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
       "UPDATE keypoints SET rows = -1 WHERE image_id = 2"],
      ["b c.png"]),
     ("keypoint-data", ["UPDATE keypoints SET data = 'text' WHERE image_id = 2"], ["b c.png"]),
+    ("descriptor-data", ["INSERT INTO descriptors VALUES (2, 0, 7, 128, zeroblob(895))"],
+     ["b c.png"]),
+    ("descriptor-data", ["INSERT INTO descriptors VALUES (2, 0, -7, -128, zeroblob(896))"],
+     ["b c.png"]),
     ("bad-camera", ["UPDATE cameras SET model = 12345"], ["camera 1: model 12345"]),
     ("bad-camera",
      ["UPDATE cameras SET width = 9223372036854775807"],
@@ -197,6 +201,7 @@ def test_what_is_broken_is_found_and_nothing_else(
     "DELETE FROM frames",  # none has one: as in databases of old
     ("UPDATE two_view_geometries SET camera1 = ?, camera2 = camera1",
      [struct.pack("<IiQQBQ3d", 7, 0, 90, 60, 1, 3, 100.0, 45.0, 30.0)]),
+    "INSERT INTO descriptors VALUES (2, 0, 7, 128, zeroblob(896))",
     "INSERT INTO frames VALUES (9, 1)",  # which holds nothing
     "INSERT INTO rig_sensors VALUES (1, 1, 1, zeroblob(56))",  # an IMU, and it is known where
     changed_keypoint(6, 0, 91.0),  # a little beyond the border
