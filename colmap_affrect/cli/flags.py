@@ -207,7 +207,7 @@ FLAGS: dict[str, Settings] = {
     "--image-path@pair": _path("PATH", "folder of the photographs (default: that of the run)"),
     "--output-path@pair": _path("FILE", "PNG file to make, in no folder of photographs (default: "
         "pairs/a--b.png in the folder of the run)", dest="picture_path"),
-    "path@optional": _path("PATH", "output folder, or any COLMAP database", nargs="?"),
+    "path@optional": _path("PATH", "output folder, any COLMAP database, or a model", nargs="?"),
     "name": {"nargs": "?", "help": "print this recipe with all of its options"},
     "action": {"choices": ["list", "fetch"], "nargs": "?", "default": "list",
         "help": "fetch downloads what is missing or damaged, for a machine without network "
