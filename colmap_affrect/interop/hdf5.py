@@ -250,8 +250,9 @@ def _write_keypoints(database: pycolmap.Database, image: pycolmap.Image, source:
                 f"and the photograph is {expected[0]} x {expected[1]} px; use the same photographs"
             )
     keypoints = _keypoint_rows(source, name)
-    for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints)):
-        raise StoreError(f"{source.path}: {CHECKS[kind]['what']}: {name}")
+    for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints, expected)):
+        check = CHECKS[kind]
+        raise StoreError(f"{source.path}: {check['what']}: {name}; {check['advice']}")
     database.write_keypoints(image.image_id, keypoints)
 
 

@@ -33,6 +33,7 @@ def files(tmp_path: Path) -> Files:
 
 
 def test_centres_move_by_half_a_pixel_once_and_in_float32(files: Files) -> None:
+    write_photos(files.photos, ["a.png"], (1100, 48))
     half = np.array([[3.25, 17.5], [1027.0, 2.0]], np.float16)
     write_h5(
         files.features,
@@ -179,7 +180,15 @@ ERRORS: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "not finite": (
         change_features(keypoints=[[1.0, 2.0], [np.nan, 3.0], [1e300, 2.0]]),
-        r"features\.h5: images with keypoints that are not finite.*: a\.png$",
+        r"features\.h5: images with keypoints that are not finite.*: a\.png; extract and",
+    ),
+    "of pictures twice as large": (
+        change_features(keypoints=[[1.0, 2.0], [70.0, 3.0], [100.0, 90.0]]),
+        r"features\.h5: images with keypoints outside of them.*: a\.png; extract and match with",
+    ),
+    "in units of its sides": (
+        change_features(keypoints=[[0.1, 0.2], [1.0, 0.3], [1.5, 0.9]]),
+        r"features\.h5: images with all keypoints in one corner.*: a\.png; write keypoints in px",
     ),
     "other size": (
         change_features(image_size=[48, 64]),
