@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from colmap_affrect.colmap.cameras import read_camera_records
-from colmap_affrect.colmap.checks import CHECKS, check_database
+from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import has_model, model_folder, read_given_model
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
@@ -31,6 +31,7 @@ Severity = Literal["error", "warning", "note"]
 """A program fails, or results are wrong; something is missing from results; worth knowing."""
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 MAX_ITEMS_SHOWN = 5
+HARMLESS = WARNED | {"camera-panorama"}  # problems of databases that may be of use to COLMAP
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
@@ -149,7 +150,7 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
     for kind in sorted(problems, key=list(CHECKS).index):
         what, usual = CHECKS[kind]["what"], CHECKS[kind]["advice"]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
-        severity: Severity = "warning" if kind == "camera-panorama" else "error"  # of use to COLMAP
+        severity: Severity = "warning" if kind in HARMLESS else "error"
         diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
     return True
 

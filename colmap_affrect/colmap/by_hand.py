@@ -134,6 +134,8 @@ def _append_keypoints(database: pycolmap.Database, image_id: int, places: Array)
 def require_inside(place: str, mark: Array, name: str, size: tuple[int, int] | None) -> None:
     """Refuse a mark that is nowhere in its photograph.
 
+    At the border it may be beyond by what marks are off anyway.
+
     Args:
         place: the line of a table that an error names.
         mark: (2,) px from the upper left corner.
@@ -145,7 +147,7 @@ def require_inside(place: str, mark: Array, name: str, size: tuple[int, int] | N
     """
     if not np.isfinite(mark).all():
         raise OptionError(f"{place}: x and y must be finite numbers of px")
-    if size and not ((mark >= 0.0) & (mark <= size)).all():
+    if size and not ((mark >= -SIGMA_PX) & (mark <= np.add(size, SIGMA_PX))).all():
         raise OptionError(
             f"{place}: {mark[0]:g}, {mark[1]:g} is outside of {name}, which is {size[0]} x "
             f"{size[1]} px; give px of the photograph as it is stored, from its upper left corner"

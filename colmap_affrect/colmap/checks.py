@@ -3,6 +3,7 @@
 Rows that COLMAP does not expect end the process inside COLMAP, so SQLite reads the tables.
 """
 
+import logging
 import sqlite3
 import struct
 import tomllib
@@ -29,6 +30,8 @@ from colmap_affrect.colmap.tables import (
 from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.geometry.arrays import Singles
 
+logger = logging.getLogger(__name__)
+
 # by kind what the problems are, and what to do about them
 CHECKS: dict[str, dict[str, str]] = tomllib.loads(
     Path(__file__).with_name("checks.toml").read_text(encoding="utf-8")
@@ -47,6 +50,8 @@ FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {
     "keypoint-data", "descriptor-data", "match-data", "matrix-data",
 }  # fmt: skip
 """The same of keypoints and matches."""
+WARNED = frozenset({"keypoints-in-a-corner"})
+"""Problems that results may be right in spite of."""
 FATAL_AS_IT_IS = FATAL | {"no-frame"}
 """The same for a database that is mapped without a copy, which would get frames."""
 FATAL_BEFORE_MAPPING = FATAL - {"rig-without-pose"}
@@ -65,15 +70,25 @@ MAX_OUTSIDE = 0.01  # of the longer side: so far some programs find, or move, wh
 MAX_OUTSIDE_PX = 2.0  # more than that
 MIN_NORMALISED = 3  # keypoints, none further from the corner than ...
 MAX_NORMALISED = 2.0  # ... so many px: their unit is a side of the image, or half of one
+MIN_IN_A_CORNER = 100  # keypoints that should fill an image, of each of so many images ...
+MIN_IMAGES_IN_A_CORNER = 3  # ... or more; none of them reaches further than ...
+IN_A_CORNER = 0.6  # ... so many sides from the upper left corner
 MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
 
 
-def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
-    """Refuse a damaged database, or one with some ``kinds`` of problems; DatabaseError."""
+def refuse_unusable(path: Path, kinds: Collection[str] = FATAL, *, warns: bool = False) -> None:
+    """Refuse a damaged database, or one with some ``kinds`` of problems; DatabaseError.
+
+    With ``warns`` other problems that make results wrong are said in a warning.
+    """
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         what, advice = CHECKS[kind]["what"], CHECKS[kind]["advice"].format(path=path)
         raise DatabaseError(f"{path}: {what} ({such_as(problems[kind])}); {advice}")
+    for kind in sorted(WARNED & problems.keys()) if warns else ():
+        check = CHECKS[kind]
+        items = such_as(problems[kind])
+        logger.warning("%s: %s (%s); %s", path, check["what"], items, check["advice"])
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
@@ -154,6 +169,7 @@ def _is_camera(blob: Any) -> bool:
 
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     rows = rows_of(connection, "image_id rows cols data", "keypoints")
+    extents: dict[str, float] = {}
     for image_id, count, width, blob in rows:
         if not (name := tables.names.get(image_id)):
             continue
@@ -168,11 +184,28 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             size = (camera.width, camera.height) if camera else None
             for kind in keypoint_problems(keypoints, size):
                 found[kind].append(name)
+            if size and count >= MIN_IN_A_CORNER:
+                extents[name] = extent(keypoints, size)
+    if are_in_a_corner(extents.values()):
+        found["keypoints-in-a-corner"] += sorted(extents)
     for image_id, count, width, blob in rows_of(
         connection, "image_id rows cols data", "descriptors"
     ):
         if _array(blob, count, width, np.dtype("u1")) is None:
             found["descriptor-data"].append(tables.names.get(image_id, f"image {image_id}"))
+
+
+def extent(keypoints: Singles, size: tuple[int, int]) -> float:
+    """Return how far (N, 2 or more) keypoints reach from the upper left corner, 1 for a side.
+
+    That of the side where they reach further.
+    """
+    return float((keypoints[:, :2].max(axis=0) / np.array(size, np.float64)).max())
+
+
+def are_in_a_corner(extents: Collection[float]) -> bool:
+    """Return whether the keypoints of all images end so early that these were shrunk."""
+    return len(extents) >= MIN_IMAGES_IN_A_CORNER and max(extents) < IN_A_CORNER
 
 
 def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:

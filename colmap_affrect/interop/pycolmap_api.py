@@ -223,7 +223,7 @@ def verify_matches(
     """
     path, pairs = as_path(database_path), None
     verification = translate.verification_options(options, None)
-    refuse_unusable(path, FATAL_BEFORE_MAPPING)
+    refuse_unusable(path, FATAL_BEFORE_MAPPING, warns=True)
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
         if pairs_path is not None:
             ids = image_ids(path)

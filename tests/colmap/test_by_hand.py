@@ -56,11 +56,11 @@ def test_marks_are_finite(tmp_path: Path, cells: str) -> None:
         marked(tmp_path / "marks.csv", f"p,a,1,2\np,b,{cells}\n")
 
 
-@pytest.mark.parametrize("cells", ["640.5,2", "1,481", "-1,2", "1e308,2", "5,-0.5"])
+@pytest.mark.parametrize("cells", ["644,2", "1,484", "-4,2", "1e308,2", "5,-3.5"])
 def test_marks_outside_of_their_photograph_are_refused(
     tmp_path: Path, database: Path, cells: str
 ) -> None:
-    (tmp_path / "marks.csv").write_text(f"p,a,0,480\np,b,{cells}\n")
+    (tmp_path / "marks.csv").write_text(f"p,a,-1,481.5\np,b,{cells}\n")
     by_hand = ByHand(tmp_path / "marks.csv")
     words = r"line 2: .* is outside of b\.jpg, which is 640 x 480 px; give px of the photograph"
     with pytest.raises(OptionError, match=words):

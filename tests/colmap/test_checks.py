@@ -12,9 +12,10 @@ from damaged import Statement, execute
 from mapping_tasks import write_images
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import check_database
+from colmap_affrect.colmap.checks import check_database, refuse_unusable
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
+from colmap_affrect.doctor import Diagnosis, examine_database
 from colmap_affrect.errors import DatabaseError
 
 NAMES = ["a.png", "b c.png", "side/č.png"]
@@ -195,6 +196,31 @@ def test_what_is_broken_is_found_and_nothing_else(
 ) -> None:
     execute(database_path, *statements)
     assert check_database(database_path)[1] == {kind: items}
+
+
+def test_keypoints_of_smaller_pictures_are_found(
+    database_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(3)
+    places = rng.uniform(0.0, 1.0, (100, 2)).astype(np.float32) * np.float32(SIZE)
+    execute(database_path, "DELETE FROM matches", "DELETE FROM two_view_geometries")
+    for scale in (0.4, 1.0):  # those of one image alone may be so
+        for image_id in (1, 2, 3):
+            rows = np.column_stack([places * np.float32(0.5), np.ones((100, 2), np.float32)])
+            if image_id == 2:
+                rows[:, :2] *= np.float32(2.0 * scale)
+            execute(database_path, (
+                "UPDATE keypoints SET rows = 100, cols = 4, data = ? WHERE image_id = ?",
+                [rows.astype(np.float32).tobytes(), image_id],
+            ))  # fmt: skip
+        caplog.clear()
+        refuse_unusable(database_path, warns=True)
+        found = check_database(database_path)[1]
+        assert found == ({"keypoints-in-a-corner": sorted(NAMES)} if scale < 1.0 else {})
+        assert ("all keypoints in the upper left part" in caplog.text) == (scale < 1.0)
+    diagnosis = Diagnosis()
+    assert examine_database(diagnosis, database_path)
+    assert diagnosis.num_errors == 0
 
 
 @pytest.mark.parametrize("statement", [

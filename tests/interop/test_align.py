@@ -212,7 +212,7 @@ def test_positions_that_leave_the_model_open_are_refused(
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("cells", ["161,5", "5,-1", "1e308,5", "nan,5"])
+@pytest.mark.parametrize("cells", ["164,5", "5,-4", "1e308,5", "nan,5"])
 def test_marks_outside_of_their_photograph_are_refused(tmp_path: Path, cells: str) -> None:
     write_model(tmp_path / "model")
     table = tmp_path / "points.csv"

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from h5_files import (
+    NAMES,
     Datasets,
     Files,
     hloc_group,
@@ -128,6 +129,18 @@ def test_images_without_features_are_imported_and_named_and_not_exported(files: 
     report = export_h5(files.database, *targets)
     assert "keypoints are left out: sub/č.png, sub_x/d.png" in report.summary()
     assert hloc_names(targets[0]) == {"a.png", "sub/b c.png"}
+
+
+def test_keypoints_of_smaller_pictures_are_noted(files: Files) -> None:
+    half = {name: hloc_group(120, n) for n, name in enumerate(NAMES)}
+    for group in half.values():
+        group["keypoints"] = group["keypoints"] / 2
+        del group["image_size"]
+    write_h5(files.features, half)
+    write_h5(files.matches, {})
+    notes = files.import_all().summary().splitlines()[1:]
+    assert len(notes) == 1
+    assert "all keypoints in the upper left part, found in smaller pictures perhaps" in notes[0]
 
 
 def change_features(**datasets: Any) -> Callable[[Files], object]:
