@@ -12,7 +12,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
 
-from colmap_affrect.errors import EXIT_INTERRUPTED, INTERRUPTED, MEMORY_HINT, lacks_memory, say
+from colmap_affrect.errors import (
+    EXIT_INTERRUPTED,
+    INTERRUPTED,
+    MEMORY_HINT,
+    escape_what_lacks,
+    lacks_memory,
+    say,
+)
 from colmap_affrect.parallel.subprocesses import end_with
 
 PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
@@ -125,6 +132,8 @@ def _work() -> NoReturn:
         signals.append(number)
         raise KeyboardInterrupt
 
+    for stream in (sys.stdout, sys.stderr):
+        escape_what_lacks(stream)
     try:
         _handle(interrupt)
         from colmap_affrect.cli import main

@@ -1,4 +1,4 @@
-"""What is wrong with an output folder, a COLMAP database or the installation, and what helps.
+"""What is wrong with an output folder, a COLMAP database, a model or the installation.
 
 Nothing is changed: databases are examined in a copy. No run can begin in a folder meanwhile.
 Files are read as runs read them, and what their readers say is what is found.
@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from colmap_affrect.colmap.cameras import read_camera_records
-from colmap_affrect.colmap.checks import CHECKS, check_database
+from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
+from colmap_affrect.colmap.model_files import has_model, model_folder, read_given_model
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
@@ -30,6 +31,7 @@ Severity = Literal["error", "warning", "note"]
 """A program fails, or results are wrong; something is missing from results; worth knowing."""
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 MAX_ITEMS_SHOWN = 5
+HARMLESS = WARNED | {"camera-panorama"}  # problems of databases that may be of use to COLMAP
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
@@ -85,13 +87,13 @@ class Diagnosis:
 
 
 def diagnose(path: PathLike | None = None, *, weights_path: PathLike | None = None) -> Diagnosis:
-    """Examine the installation and, if a path is given, an output folder or a COLMAP database.
+    """Examine the installation and, if a path is given, an output folder, a database or a model.
 
     OptionError when something that is given is not there.
     """
     path, weights_path = (as_path(given) if given else None for given in (path, weights_path))
     if path is not None and not path.exists():
-        wanted = "give a COLMAP database or output folder"
+        wanted = "give an output folder, a COLMAP database or the folder of a model"
         raise OptionError(f"{path}: no such file or folder; {wanted}")
     if weights_path is not None and not weights_path.is_dir():
         raise OptionError(f"--weights {weights_path}: no such folder")
@@ -148,7 +150,7 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
     for kind in sorted(problems, key=list(CHECKS).index):
         what, usual = CHECKS[kind]["what"], CHECKS[kind]["advice"]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
-        severity: Severity = "warning" if kind == "camera-panorama" else "error"  # of use to COLMAP
+        severity: Severity = "warning" if kind in HARMLESS else "error"
         diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
     return True
 
@@ -159,8 +161,11 @@ def _examine_folder(diagnosis: Diagnosis, path: Path) -> None:
     if path.suffix == ".affrect" and not workspace.database.exists():
         workspace = Workspace(path, path.with_suffix(".db"))
     if not workspace.config.exists() and not workspace.database.exists():
-        what = "neither an output folder of colmap-affrect nor one with a database.db"
-        advice = "give the --output-path of a run, or a COLMAP database"
+        if has_model(model_folder(path)):
+            _examine_model(diagnosis, path)
+            return
+        what = "neither an output folder of colmap-affrect nor one with a database.db or a model"
+        advice = "give the --output-path of a run, a COLMAP database or the folder of a model"
         diagnosis.add("error", path, what, advice)
         return
     if not workspace.config.exists():
@@ -180,6 +185,18 @@ def _examine_folder(diagnosis: Diagnosis, path: Path) -> None:
             if in_use:
                 return
         _examine_files(diagnosis, workspace)
+
+
+def _examine_model(diagnosis: Diagnosis, path: Path) -> None:
+    """Examine a COLMAP model of any program."""
+    try:
+        model = read_given_model(path)
+    except AffrectError as error:
+        what, _, advice = _without_path(path, error).partition("; ")
+        diagnosis.add("error", path, what, advice or "make the model again")
+        return
+    registered, points = model.num_reg_images(), model.num_points3D()
+    diagnosis.checked.append(f"{path}: a model of {registered} images and {points} points")
 
 
 def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:

@@ -1,12 +1,14 @@
 """What is said to people: errors of one line, what, where and what to do; names out of files."""
 
+import codecs
+import io
 import re
 import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, TextIO
 
 DAMAGE = (
     OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError,
@@ -136,6 +138,30 @@ def _escaped(character: str) -> str:
 def one_line(text: str) -> str:
     """Return the same in one line, line ends as JSON has them."""
     return shown(text).replace("\n", _escaped("\n"))
+
+
+def escape_what_lacks(stream: TextIO | None) -> None:
+    r"""Have a stream write characters that its encoding lacks as JSON does, and go on.
+
+    >>> import io
+    >>> stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    >>> escape_what_lacks(stream)
+    >>> stream.write("\u010d\U0001f600") and (stream.flush(), stream.buffer.getvalue())[1]
+    b'\\u010d\\ud83d\\ude00'
+    """
+    if isinstance(stream, io.TextIOWrapper):  # neither closed nor another program's
+        stream.reconfigure(errors=ESCAPED)
+
+
+def _escape_lacking(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lacking = error.object[error.start : error.end]
+    return "".join(_escaped(character) for character in lacking), error.end
+
+
+ESCAPED = "colmap_affrect.escaped"  # how streams write what their encoding lacks
+codecs.register_error(ESCAPED, _escape_lacking)
 
 
 def say(line: str) -> None:

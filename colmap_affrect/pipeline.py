@@ -6,15 +6,16 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks
+from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks, SizeOf
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
-from colmap_affrect.colmap.database_copy import read_names, schema_version
+from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.images.reading import header_size
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
@@ -118,7 +119,7 @@ def run(
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
     _check_extension(options.extend, mapper, output_path, overwrite=overwrite)
-    _check_by_hand(options.by_hand, names, mapper)
+    _check_by_hand(options.by_hand, names, mapper, lambda name: header_size(image_path / name))
     forecast = Forecast(len(names), _num_pairs(names, options.pairs))
     workspace = Workspace(output_path)
     context = _context_of(workspace, options, executor, replace(progress, forecast=forecast))
@@ -161,8 +162,10 @@ def _context_of(
     )
 
 
-def _check_by_hand(by_hand: ByHand, names: Collection[str], mapper: Mapper) -> Marks:
-    marks = by_hand.marks(names)  # refuses what names other photographs
+def _check_by_hand(
+    by_hand: ByHand, names: Collection[str], mapper: Mapper, size_of: SizeOf
+) -> Marks:
+    marks = by_hand.marks(names, size_of)  # refuses what names other photographs, or lies outside
     if by_hand.tie_points_path and mapper.options.name != MAPPERS.default:
         raise OptionError(
             f"--tie-points: the {mapper.options.name} mapper takes none; use --mapper sparse"
@@ -215,7 +218,8 @@ def map_from_database(
     _check_extension(extend, mapper, output_path, overwrite=overwrite)
     if extend:
         read_given_model(extend.model_path, "--extend ")
-    _check_by_hand(by_hand, read_names(database_path), mapper)
+    sizes = read_sizes(database_path)
+    _check_by_hand(by_hand, read_names(database_path), mapper, sizes.get)
     context = Context(Workspace(output_path), progress=progress, by_hand=by_hand)
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()
@@ -234,14 +238,11 @@ def map_and_report(
     page: bool = True,
 ) -> ReconstructionReport:
     """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
-    workspace, options, names = context.workspace, mapper.options, image_names(context)
-    gone = [] if workspace.is_foreign else sorted(set(context.features.names()) - set(names))
-    if gone and not earlier:
-        path = context.inputs.image_path
-        raise ImageError(f"{path}: {gone[0]} has features, and is gone; run extract again")
-    names = sorted({*names, *gone})
+    workspace, options = context.workspace, mapper.options
+    names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
-    marks = _check_by_hand(context.by_hand, names, mapper)
+    sizes = read_sizes(workspace.database)
+    marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
     lost = dict.fromkeys(gone, "is gone since its features were extracted; these are used")
@@ -292,3 +293,18 @@ def map_and_report(
             workspace, result, names, pair_inliers, image_path, progress, marks=marks, looks=looks
         )
     return result
+
+
+def _names_and_gone(context: Context, *, may_be_gone: bool) -> tuple[list[str], list[str]]:
+    """Return the names of all photographs, and which are gone since they had features.
+
+    ImageError where none may be gone.
+    """
+    names = image_names(context)
+    if context.workspace.is_foreign:
+        return names, []
+    gone = sorted(set(context.features.names()) - set(names))
+    if gone and not may_be_gone:
+        path = context.inputs.image_path
+        raise ImageError(f"{path}: {gone[0]} has features, and is gone; run extract again")
+    return sorted({*names, *gone}), gone

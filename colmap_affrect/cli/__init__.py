@@ -76,7 +76,8 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
         shown_on = os.dup(2)
     except OSError:  # it is closed, and whoever closed it wants to see nothing
         shown_on = os.open(os.devnull, os.O_WRONLY)
-    terminal = os.fdopen(shown_on, "w", buffering=1, encoding="utf-8", errors="replace")
+    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+    terminal = os.fdopen(shown_on, "w", buffering=1, encoding=encoding, errors=errors.ESCAPED)
     log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
     with terminal, closing(log), redirect_stderr(terminal):
         shown = logging.StreamHandler(terminal)

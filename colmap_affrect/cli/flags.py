@@ -197,13 +197,14 @@ FLAGS: dict[str, Settings] = {
     "database_path": _path("OUT.db", "the database to make; must not exist"),
     "--descriptors": _switch("of an output folder, with the descriptors of features.h5 as 8-bit "
         "SIFT, which COLMAP's own matchers need"),
-    "--model-path": _path("MODEL", "folder of a COLMAP model, such as out/sparse/0"),
+    "--model-path": _path("MODEL", "folder of a COLMAP model, or of a run (its "
+        "largest one)"),
     "--output-path@files": _path("FOLDER", "folder for the files; nothing in it is overwritten",
         dest="target_path"),
     "--format": _value("A,B,...", "ply (points), text (COLMAP's), undistorted (photographs and "
         "model, for dense reconstruction), nerfstudio (the same with transforms.json, for "
         "Gaussian splatting too), cameras (CSV) "
-        "(default: ply,text,cameras)", type=words, default=("ply", "text", "cameras")),
+        "(default: ply,text,cameras; no text where names have blanks)", type=words, default=()),
     "--image-path@export": _path("PATH",
         "folder of the photographs, to undistort them (default: that of the run)"),
     "--output-path@model": _path("MODEL", "folder for the new model, in metres; must not exist",
@@ -225,7 +226,7 @@ FLAGS: dict[str, Settings] = {
     "--image-path@pair": _path("PATH", "folder of the photographs (default: that of the run)"),
     "--output-path@pair": _path("FILE", "PNG file to make, in no folder of photographs (default: "
         "pairs/a--b.png in the folder of the run)", dest="picture_path"),
-    "path@optional": _path("PATH", "output folder, or any COLMAP database", nargs="?"),
+    "path@optional": _path("PATH", "output folder, any COLMAP database, or a model", nargs="?"),
     "name": {"nargs": "?", "help": "print this recipe with all of its options"},
     "action": {"choices": ["list", "fetch"], "nargs": "?", "default": "list",
         "help": "fetch downloads what is missing or damaged, for a machine without network "

@@ -178,7 +178,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "align": ("give a model its scale and place, by GPS, control points or a distance",
         "--model-path! --output-path@model! --gps|--positions|--points --distance"),
     "doctor": (
-        "look for what is wrong with results or the installation, and say what to do about it",
+        "look for what is wrong with results, a database, a model or the installation, and what "
+        "helps",
         "path@optional --weights --json"),
     "recipes": ("list the recipes and what they need", "name"),
     "weights": ("list the files of weights, or fetch them beforehand", "action keys --weights"),

@@ -6,13 +6,14 @@ the others, and without the verified pairs that are not to be used.
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import cameras_of_images
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Array
@@ -32,6 +33,11 @@ COLUMNS = {
 Marks = Mapping[str, Mapping[str, Array]]
 """(2,) px from the upper left corner of the image, as COLMAP has them, by point and image name."""
 Indices = Mapping[str, Mapping[str, int]]  # numbers of keypoints, by point and image name
+SizeOf = Callable[[str], tuple[int, int] | None]  # (width, height) of a photograph by its name
+
+
+def unknown_size(_: str) -> None:
+    """Return that the size of a photograph is not known."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +48,17 @@ class ByHand(TakesPaths):
     rejected: tuple[tuple[str, str], ...] = ()  # pairs of names whose matches are wrong
     left_out: tuple[str, ...] = ()  # names of photographs that are not to be mapped
 
-    def marks(self, names: Collection[str]) -> Marks:
-        """Read the tie points; OptionError also where photographs are named that are not there."""
+    def marks(self, names: Collection[str], size_of: SizeOf = unknown_size) -> Marks:
+        """Read the tie points, as :func:`read_marks` does.
+
+        OptionError also where photographs are named that are not there.
+        """
         asked = [("--reject-pair", name) for pair in self.rejected for name in pair]
         for flag, name in [*asked, *(("--leave-out", name) for name in self.left_out)]:
             require_known(name, names, f"{flag} ")
-        return read_marks(self.tie_points_path, names) if self.tie_points_path else {}
+        if not self.tie_points_path:
+            return {}
+        return read_marks(self.tie_points_path, names, size_of)
 
     def allows(self, first: str, second: str) -> bool:
         """Tell whether a pair may be used."""
@@ -80,7 +91,9 @@ class ByHand(TakesPaths):
             images = {image.name: image.image_id for image in database.read_all_images()}
             names = {image_id: name for name, image_id in images.items()}
             places = defaultdict[str, list[Array]](list)
-            for point, marks in self.marks(images).items():
+            cameras = cameras_of_images(database)
+            sizes = {name: (cameras[i].width, cameras[i].height) for name, i in images.items()}
+            for point, marks in self.marks(images, sizes.get).items():
                 for name, place in marks.items():
                     if name not in self.left_out:
                         count = database.num_keypoints_for_image(images[name])
@@ -118,12 +131,43 @@ def _append_keypoints(database: pycolmap.Database, image_id: int, places: Array)
     database.update_keypoints(image_id, np.concatenate([known, new]))
 
 
-def read_marks(path: Path, names: Collection[str]) -> Marks:
+def require_inside(place: str, mark: Array, name: str, size: tuple[int, int] | None) -> None:
+    """Refuse a mark that is nowhere in its photograph.
+
+    At the border it may be beyond by what marks are off anyway.
+
+    Args:
+        place: the line of a table that an error names.
+        mark: (2,) px from the upper left corner.
+        name: of the photograph.
+        size: (width, height) of the photograph in px, None where it is not known.
+
+    Raises:
+        OptionError: the mark is not finite, or outside.
+    """
+    if not np.isfinite(mark).all():
+        raise OptionError(f"{place}: x and y must be finite numbers of px")
+    if size and not ((mark >= -SIGMA_PX) & (mark <= np.add(size, SIGMA_PX))).all():
+        raise OptionError(
+            f"{place}: {mark[0]:g}, {mark[1]:g} is outside of {name}, which is {size[0]} x "
+            f"{size[1]} px; give px of the photograph as it is stored, from its upper left corner"
+        )
+
+
+def read_marks(path: Path, names: Collection[str], size_of: SizeOf = unknown_size) -> Marks:
     """Read a table of points that are marked in photographs.
 
     Its columns are point, photograph, x and y, in any order, or in this order without a header;
     ``COLUMNS`` has other names for them. Photographs may lack folder and ending, where it is clear
-    which are meant. OptionError names the line that cannot be used.
+    which are meant.
+
+    Args:
+        path: the table.
+        names: of all photographs.
+        size_of: returns (width, height) of a photograph in px, None where it is not known.
+
+    Raises:
+        OptionError: names the line that cannot be used.
     """
     where = f"--tie-points {path}"
     stems = defaultdict[str, list[str]](list)
@@ -141,9 +185,11 @@ def read_marks(path: Path, names: Collection[str]) -> Marks:
         if len(found := stems.get(image, [])) != 1:
             raise OptionError(f"{place}: no such photograph, {image}{suggestion(image, names)}")
         try:
-            marks[point][found[0]] = np.array([float(number) for number in numbers])
+            mark = np.array([float(number) for number in numbers])
         except ValueError as error:
             raise OptionError(f"{place}: x and y must be numbers of px") from error
+        require_inside(place, mark, found[0], size_of(found[0]))
+        marks[point][found[0]] = mark
     if not any(len(images) > 1 for images in marks.values()):
         raise OptionError(f"{where}: no point is marked in two photographs")
     return marks

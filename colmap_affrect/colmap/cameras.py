@@ -179,7 +179,7 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
 
 def _read_model(path: Path) -> dict[str, GivenCamera]:
     folder = path if path.is_dir() else path.parent
-    model = read_given_model(folder, "--cameras-path ")
+    model = read_given_model(folder, "--cameras-path ", needs_poses=False)
     cameras = {}
     for key, camera in model.cameras.items():
         says = {

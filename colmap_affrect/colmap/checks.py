@@ -3,9 +3,11 @@
 Rows that COLMAP does not expect end the process inside COLMAP, so SQLite reads the tables.
 """
 
+import logging
 import sqlite3
+import struct
 import tomllib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap.model_files import camera_like
+from colmap_affrect.colmap.links import check_links
+from colmap_affrect.colmap.model_files import MAX_SIDE_PX, camera_like
 from colmap_affrect.colmap.tables import (
     DAMAGED,
     MAX_NUM_IMAGES,
@@ -21,21 +24,38 @@ from colmap_affrect.colmap.tables import (
     columns_of,
     open_read_only,
     read_tables,
+    require_intact_pages,
     rows_of,
 )
 from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.geometry.arrays import Singles
+
+logger = logging.getLogger(__name__)
 
 # by kind what the problems are, and what to do about them
 CHECKS: dict[str, dict[str, str]] = tomllib.loads(
     Path(__file__).with_name("checks.toml").read_text(encoding="utf-8")
 )
 
-FATAL_FOR_IMAGES = frozenset({"bad-name", "no-parent", "bad-camera", "camera-panorama"})
+FATAL_FOR_MAPPING = frozenset({"camera-panorama", "rig-without-pose"})
+"""Problems of databases that are of use to COLMAP, but cannot be mapped."""
+FATAL_FOR_IMAGES = FATAL_FOR_MAPPING | {
+    "bad-id", "bad-name", "no-parent", "bad-camera", "bad-rig", "bad-frame",
+}  # fmt: skip
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
-USELESS_KEYPOINTS = frozenset({"keypoints-not-finite", "keypoints-at-one-place"})
-FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {"keypoint-data", "match-data", "matrix-data"}
+USELESS_KEYPOINTS = frozenset({
+    "keypoints-not-finite", "keypoints-outside", "keypoints-normalised", "keypoints-at-one-place",
+})  # fmt: skip
+FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {
+    "keypoint-data", "descriptor-data", "match-data", "matrix-data",
+}  # fmt: skip
 """The same of keypoints and matches."""
+WARNED = frozenset({"keypoints-in-a-corner"})
+"""Problems that results may be right in spite of."""
+FATAL_AS_IT_IS = FATAL | {"no-frame"}
+"""The same for a database that is mapped without a copy, which would get frames."""
+FATAL_BEFORE_MAPPING = FATAL - {"rig-without-pose"}
+"""The same where nothing is mapped yet."""
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
 
 MATRICES = {  # columns that hold so many float64 or nothing, by table
@@ -44,17 +64,31 @@ MATRICES = {  # columns that hold so many float64 or nothing, by table
     "rig_sensors": {"sensor_from_rig": 7},
 }
 
+PACKED_CAMERA = struct.Struct("<IiQQBQ")  # id, model, size, prior, and how many parameters follow
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
-MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
+MAX_OUTSIDE = 0.01  # of the longer side: so far some programs find, or move, what is at the border
+MAX_OUTSIDE_PX = 2.0  # more than that
+MIN_NORMALISED = 3  # keypoints, none further from the corner than ...
+MAX_NORMALISED = 2.0  # ... so many px: their unit is a side of the image, or half of one
+MIN_IN_A_CORNER = 100  # keypoints that should fill an image, of each of so many images ...
+MIN_IMAGES_IN_A_CORNER = 3  # ... or more; none of them reaches further than ...
+IN_A_CORNER = 0.6  # ... so many sides from the upper left corner
 MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
 
 
-def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
-    """Refuse a damaged database, or one with some ``kinds`` of problems; DatabaseError."""
+def refuse_unusable(path: Path, kinds: Collection[str] = FATAL, *, warns: bool = False) -> None:
+    """Refuse a damaged database, or one with some ``kinds`` of problems; DatabaseError.
+
+    With ``warns`` other problems that make results wrong are said in a warning.
+    """
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         what, advice = CHECKS[kind]["what"], CHECKS[kind]["advice"].format(path=path)
         raise DatabaseError(f"{path}: {what} ({such_as(problems[kind])}); {advice}")
+    for kind in sorted(WARNED & problems.keys()) if warns else ():
+        check = CHECKS[kind]
+        items = such_as(problems[kind])
+        logger.warning("%s: %s (%s); %s", path, check["what"], items, check["advice"])
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
@@ -63,13 +97,11 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
     with open_read_only(path) as connection:
         try:
             connection.text_factory = lambda data: data.decode("utf-8", "replace")
-            (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-            if verdict != "ok":
-                raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
+            require_intact_pages(connection, path)
             tables = read_tables(connection)
             _check_cameras(tables, found)
             _check_images(connection, tables, found)
-            _check_links(connection, found)
+            check_links(connection, tables, found)
             _check_matrices(connection, found)
             _check_keypoints(connection, tables, found)
             _check_pairs(connection, tables, found)
@@ -97,21 +129,17 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
 
 def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
-        name = raw.decode("utf-8", "replace")
+        name = (raw or b"").decode("utf-8", "replace")
         if not name or "\0" in name or name.encode() != raw:
             found["bad-name"].append(f"image {image_id}: {name!r}")
+    for name, count in Counter(tables.names.values()).items():
+        if count > 1:
+            found["bad-name"].append(f"{name}, {count} times")
     for image_id, name in tables.names.items():
         if tables.camera_ids[image_id] not in tables.cameras:
             found["no-parent"].append(name)
         if tables.num_frames and image_id not in tables.frame_images:
             found["no-frame"].append(name)
-
-
-def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
-    tables = ("rig_sensors", "frames", "frame_data")
-    for table in [name for name in tables if columns_of(connection, name)]:
-        for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
-            found["no-parent"].append(f"row {row} of {table}, {parent}")
 
 
 def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
@@ -120,14 +148,28 @@ def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
             for row, blob in rows_of(connection, f"rowid {name}", table):
                 if blob and _array(blob, 1, columns[name], np.dtype("<f8")) is None:
                     found["matrix-data"].append(f"{name} of row {row} of {table}")
+    for row, *blobs in rows_of(connection, "pair_id camera1 camera2", "two_view_geometries"):
+        if any(blob and not _is_camera(blob) for blob in blobs):
+            found["matrix-data"].append(f"camera1 or camera2 of pair_id {row}")
     if {"qvec", "tvec"} <= columns_of(connection, "two_view_geometries"):
         query = "SELECT pair_id FROM two_view_geometries WHERE (qvec IS NULL) != (tvec IS NULL)"
         for (row,) in connection.execute(query):
             found["matrix-data"].append(f"qvec and tvec of pair_id {row}")
 
 
+def _is_camera(blob: Any) -> bool:
+    """Return whether COLMAP can read a camera that it has packed into a column."""
+    if not isinstance(blob, bytes) or len(blob) < PACKED_CAMERA.size:
+        return False
+    _, model, *_, count = PACKED_CAMERA.unpack_from(blob)
+    like = camera_like(model)
+    size = PACKED_CAMERA.size + 8 * count
+    return like is not None and count == len(like.params) and len(blob) == size
+
+
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     rows = rows_of(connection, "image_id rows cols data", "keypoints")
+    extents: dict[str, float] = {}
     for image_id, count, width, blob in rows:
         if not (name := tables.names.get(image_id)):
             continue
@@ -138,16 +180,52 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
         if keypoints is None:
             found["keypoint-data"].append(name)
         elif count:
-            for kind in keypoint_problems(keypoints):
+            camera = tables.cameras.get(tables.camera_ids[image_id])
+            size = (camera.width, camera.height) if camera else None
+            for kind in keypoint_problems(keypoints, size):
                 found[kind].append(name)
+            if size and count >= MIN_IN_A_CORNER:
+                extents[name] = extent(keypoints, size)
+    if are_in_a_corner(extents.values()):
+        found["keypoints-in-a-corner"] += sorted(extents)
+    for image_id, count, width, blob in rows_of(
+        connection, "image_id rows cols data", "descriptors"
+    ):
+        if _array(blob, count, width, np.dtype("u1")) is None:
+            found["descriptor-data"].append(tables.names.get(image_id, f"image {image_id}"))
 
 
-def keypoint_problems(keypoints: Singles) -> list[str]:
-    """Return which kinds of problems some of (N, 2 or more) keypoints have, in COLMAP's px."""
+def extent(keypoints: Singles, size: tuple[int, int]) -> float:
+    """Return how far (N, 2 or more) keypoints reach from the upper left corner, 1 for a side.
+
+    That of the side where they reach further.
+    """
+    return float((keypoints[:, :2].max(axis=0) / np.array(size, np.float64)).max())
+
+
+def are_in_a_corner(extents: Collection[float]) -> bool:
+    """Return whether the keypoints of all images end so early that these were shrunk."""
+    return len(extents) >= MIN_IMAGES_IN_A_CORNER and max(extents) < IN_A_CORNER
+
+
+def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:
+    """Return which kinds of problems some keypoints of an image have.
+
+    Args:
+        keypoints: (N, 2 or more), in COLMAP's px.
+        size: (width, height) of the image in px, None where it is not known.
+    """
     finite = np.asarray((np.abs(keypoints) <= MAX_SIDE_PX).all(axis=1))
     points, found = keypoints[finite, :2], list[str]()
     if not finite.all():
         found.append("keypoints-not-finite")
+    if size and len(points):
+        if len(points) >= MIN_NORMALISED and np.abs(points).max() <= MAX_NORMALISED < max(size):
+            found.append("keypoints-normalised")
+        margin = MAX_OUTSIDE * max(size) + MAX_OUTSIDE_PX
+        beyond = np.maximum(-points, points - np.array(size, np.float32))
+        if beyond.max() > margin:
+            found.append("keypoints-outside")
     if len(points) >= MIN_AT_ONE_PLACE:  # what more than half have is the median
         median = np.partition(points, len(points) // 2, axis=0)[len(points) // 2]
         num_there = int((points == median).all(axis=1).sum())
@@ -159,7 +237,11 @@ def keypoint_problems(keypoints: Singles) -> list[str]:
 def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:
     """Return the (rows, columns) array that is stored in a table, None if it is another size."""
     blob = b"" if blob is None else blob
-    if not isinstance(blob, bytes) or len(blob) != rows * columns * dtype.itemsize:
+    if (
+        not isinstance(blob, bytes)
+        or min(rows, columns) < 0
+        or len(blob) != rows * columns * dtype.itemsize
+    ):
         return None
     return np.frombuffer(blob, dtype).reshape(rows, columns)
 

@@ -3,6 +3,7 @@
 Everything is checked before it is written: an index out of range would later end the process.
 """
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -12,13 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.colmap.tables import MAX_NUM_IMAGES, damage_of
+from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.geometry import conventions
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
+from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.regular_files import NotAFileError, require_regular
 from colmap_affrect.project.stores import FeatureStore
+
+logger = logging.getLogger(__name__)
 
 BYTES_PER_ROW = 4096
 BYTES_OF_EMPTY_DATABASE = 1 << 19  # what :func:`require_database_space` reckons with
@@ -42,7 +46,16 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         with closing(database):
             yield database
     except RuntimeError as error:
+        if fault := damage_of(path):
+            raise DatabaseError(f"{path}: {fault}; {_mend(path)}") from error
         raise cannot_write(path, error) from error
+
+
+def _mend(path: Path) -> str:
+    """Say what mends a damaged database; those of runs are made again when they are next used."""
+    if (path.parent / "config.toml").exists():
+        return "run the same command again, which makes it again from what it was made from"
+    return "restore it; 'sqlite3 FILE .recover' may save a part of it"
 
 
 def write_frame(
@@ -85,15 +98,39 @@ def nearest_positions(
 
 
 def spatial_pairs(path: Path, options: pycolmap.SpatialPairingOptions) -> list[tuple[str, str]]:
-    """Return the pairs of COLMAP's spatial matcher; DatabaseError without two positions."""
-    with open_database(path) as database:
-        count = sum(prior.has_position() for prior in database.read_all_pose_priors())
-    if count < 2:
+    """Return the pairs of COLMAP's spatial matcher whose positions are places on earth.
+
+    DatabaseError without two such positions.
+    """
+    positions, wrong = read_positions(path)
+    if wrong:
+        listed = [f"{name} ({why})" for name, why in sorted(wrong.items())]
+        logger.warning("%s: positions that do not count: %s", path, such_as(listed))
+    if len(positions) < 2:
         raise DatabaseError(
-            f"{path}: {count} images have a position (GPS in EXIF, or pose priors); "
+            f"{path}: {len(positions)} images have a position (GPS in EXIF, or pose priors); "
             "choose pairs in another way"
         )
-    return generated_pairs(path, pycolmap.SpatialPairGenerator, options)
+    pairs = generated_pairs(path, pycolmap.SpatialPairGenerator, options)
+    return [pair for pair in pairs if not wrong.keys() & set(pair)]
+
+
+def read_positions(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
+    """Return the (3,) positions of the pose priors by image, and why others are none on earth."""
+    with open_database(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
+    positions, wrong = dict[str, Array](), dict[str, str]()
+    for prior in priors:
+        name, position = names.get(prior.corr_data_id.id), np.array(prior.position).ravel()
+        if name is None:
+            continue
+        is_on_earth = prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84
+        if is_on_earth and (why := why_not_on_earth(position)):
+            wrong[name] = why
+        else:
+            positions[name] = position
+    return positions, wrong
 
 
 def generated_pairs(

@@ -1,6 +1,9 @@
-"""Copies of COLMAP databases, made by SQLite: COLMAP migrates a database as soon as it opens it."""
+"""Copies of COLMAP databases, made by SQLite: COLMAP migrates a database as soon as it opens it.
 
-import re
+A copy holds the rows of COLMAP's tables, in tables that pycolmap has made, and nothing else that is
+in the file: triggers, views and indices of others could do anything while COLMAP writes.
+"""
+
 import sqlite3
 import tempfile
 from collections.abc import Callable, Collection, Iterator
@@ -9,11 +12,24 @@ from functools import cache
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
+from colmap_affrect.colmap.checks import (
+    FATAL,
+    FATAL_FOR_IMAGES,
+    FATAL_FOR_MAPPING,
+    refuse_unusable,
+)
 from colmap_affrect.colmap.database import open_database, write_frame
-from colmap_affrect.colmap.tables import DIGESTED, open_read_only
+from colmap_affrect.colmap.tables import columns_of, open_read_only
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import temporary_folder
+
+COPIED = (  # what is referred to comes first
+    "cameras", "rigs", "rig_sensors", "frames", "frame_data", "images", "pose_priors", "keypoints",
+    "descriptors", "matches", "two_view_geometries", "inlier_matches",
+)  # fmt: skip
+"""All tables that COLMAP has had; the last one is older than two-view geometries."""
+TYPES = ("INTEGER", "TEXT", "BLOB", "REAL")  # of columns
 
 
 def schema_version(path: Path) -> int:
@@ -43,15 +59,6 @@ def refuse_newer(path: Path) -> int:
     return version
 
 
-OWN_INDEXES = {
-    "index_name", "rig_ref_sensor_assignment", "rig_sensor_assignment", "frame_sensor_assignment",
-    "pose_prior_data_assignment",
-}  # fmt: skip
-"""That COLMAP makes; those of SQLite have no text."""
-OF_EXPRESSIONS = -2  # what SQLite has in the place of the column of an index
-PLAIN_DEFAULT = re.compile(r"-?[0-9.]+|NULL|'[^']*'", re.IGNORECASE)
-"""Values of columns that are numbers or texts, and not computed."""
-
 Change = Callable[[pycolmap.Database], None]
 
 
@@ -63,45 +70,97 @@ def copy_database(
     The copy, which appears as a whole, has the schema of the installed pycolmap, and what
     ``change`` does to it. COLMAP leaves positions of before 3.10 behind. DatabaseError when the
     target exists, for what is no intact database or one of a newer COLMAP, and for ``refused``
-    kinds of problems: databases of anybody are checked before COLMAP sees the copy.
+    kinds of problems: databases of anybody are checked before COLMAP sees the copy. What is no
+    table of COLMAP stays behind.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
-    refuse_newer(source)
+    version = refuse_newer(source)
     if refused:
         refuse_unusable(source, refused)
     with temporary_folder(target.parent) as folder:
-        new = folder / target.name
-        with open_read_only(source) as original, closing(sqlite3.connect(new)) as copy:
-            original.backup(copy)
-            _keep_tables_only(copy, source)
-        with open_database(new) as database:  # COLMAP migrates it
-            if change:
+        new, old = folder / "new.db", folder / "old.db"
+        with open_database(new):  # which makes the tables
+            pass
+        with open_read_only(source) as original, _one_line(source, target):
+            if version == newest_schema_version():
+                _copy_tables(original, new)
+            else:
+                _copy_tables(original, old, version)
+        if old.exists():
+            with open_database(old):  # COLMAP migrates it
+                pass
+            with open_read_only(old) as migrated, _one_line(source, target):
+                _copy_tables(migrated, new)
+        if change:
+            with open_database(new) as database:
                 change(database)
         new.replace(target)
 
 
-def _keep_tables_only(copy: sqlite3.Connection, source: Path) -> None:
-    """Remove what would act on its own in a copy: triggers, views, indexes that COLMAP has not.
+@contextmanager
+def _one_line(source: Path, target: Path) -> Iterator[None]:
+    """Say what SQLite refuses to write, naming the file that is copied or the one to be made."""
+    try:
+        yield
+    except sqlite3.IntegrityError as error:
+        raise DatabaseError(
+            f"{source}: has rows that COLMAP's tables cannot hold ({error}); import its images "
+            "again into a new database"
+        ) from error
+    except sqlite3.OperationalError as error:
+        if error.sqlite_errorcode in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE):
+            raise cannot_write(target, error) from error
+        raise
 
-    They could fill the disk with each row that is written. Raises DatabaseError for a table of
-    COLMAP with columns that are computed, or whose defaults are.
+
+def _copy_tables(original: sqlite3.Connection, target: Path, version: int | None = None) -> None:
+    """Copy the rows of COLMAP's tables.
+
+    Args:
+        original: where they are read, in one transaction.
+        target: a database with tables of COLMAP, or a new file.
+        version: of the tables to be made in a new file, with the columns of the original.
     """
-    made = "SELECT type, name FROM sqlite_master WHERE type != 'table' AND sql IS NOT NULL"
-    for kind, name in copy.execute(made).fetchall():
-        quoted = '"' + name.replace('"', '""') + '"'
-        columns = [row[1] for row in copy.execute(f"PRAGMA index_xinfo({quoted})")]
-        if name not in OWN_INDEXES or kind != "index" or OF_EXPRESSIONS in columns:
-            copy.execute(f"DROP {kind} {quoted}")
-    for table in DIGESTED:
-        for row in copy.execute(f"PRAGMA table_xinfo({table})"):
-            name, default, kind = row[1], row[4], row[6]
-            if kind or (isinstance(default, str) and not PLAIN_DEFAULT.fullmatch(default)):
-                raise DatabaseError(
-                    f"{source}: the column {name} of the table {table} is computed, which COLMAP "
-                    "has nowhere; copy its rows into a database that COLMAP has made"
-                )
-    copy.commit()
+    original.execute("BEGIN")
+    with closing(sqlite3.connect(target)) as copy:
+        for table in COPIED:
+            if version is not None:
+                _make_table(original, copy, table)
+            _copy_rows(original, copy, table)
+        if version is not None:
+            copy.execute(f"PRAGMA user_version = {int(version)}")
+        copy.commit()
+
+
+def _columns(connection: sqlite3.Connection, table: str) -> list[str]:
+    """Return the columns of a table whose names can be written into a statement, in order."""
+    return sorted(name for name in columns_of(connection, table) if name.isidentifier())
+
+
+def _make_table(original: sqlite3.Connection, copy: sqlite3.Connection, table: str) -> None:
+    """Make a table with the columns of the original, and none of its conditions."""
+    if not columns_of(original, table):
+        return
+    columns = []
+    for _, name, said, _, _, is_key in original.execute(f"PRAGMA table_info({table})"):
+        if str(name).isidentifier():
+            kind = str(said).upper() if str(said).upper() in TYPES else "BLOB"
+            key = " PRIMARY KEY" if is_key and kind == "INTEGER" else ""
+            columns.append(f'"{name}" {kind}{key}')
+    copy.execute(f"CREATE TABLE {table} ({', '.join(columns)})")
+
+
+def _copy_rows(original: sqlite3.Connection, copy: sqlite3.Connection, table: str) -> None:
+    """Copy the columns that both tables have."""
+    common = {*_columns(original, table)} & {*_columns(copy, table)}
+    if not common:
+        return
+    names = sorted(common)
+    listed, marks = ", ".join(f'"{name}"' for name in names), ", ".join("?" * len(names))
+    # The table is one of ours, and the names of its columns are identifiers.
+    rows = original.execute(f"SELECT {listed} FROM {table}")  # noqa: S608
+    copy.executemany(f"INSERT INTO {table} ({listed}) VALUES ({marks})", rows)  # noqa: S608
 
 
 def copy_without_features(source: Path, target: Path) -> None:
@@ -126,11 +185,13 @@ def add_frames(database: pycolmap.Database) -> None:
 
 
 @contextmanager
-def open_copy(source: Path) -> Iterator[pycolmap.Database]:
+def open_copy(
+    source: Path, refused: Collection[str] = FATAL - FATAL_FOR_MAPPING
+) -> Iterator[pycolmap.Database]:
     """Open a temporary :func:`copy_database`; the original stays as it is."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "database.db"
-        copy_database(source, copy, FATAL - {"camera-panorama"})
+        copy_database(source, copy, refused)
         with open_database(copy) as database:
             yield database
 
@@ -139,3 +200,10 @@ def read_names(source: Path) -> list[str]:
     """Return the names of the images of a database, which is only read."""
     with open_read_only(source) as connection:
         return sorted(str(name) for (name,) in connection.execute("SELECT name FROM images"))
+
+
+def read_sizes(source: Path) -> dict[str, tuple[int, int]]:
+    """Return (width, height) in px of the images of a database, which is only read."""
+    query = "SELECT name, width, height FROM images JOIN cameras USING (camera_id)"
+    with open_read_only(source) as connection:
+        return {str(name): (width, height) for name, width, height in connection.execute(query)}

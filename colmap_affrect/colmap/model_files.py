@@ -28,6 +28,9 @@ from colmap_affrect.project.regular_files import (
 Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
 Poses = dict[str, Pose]  # poses by image name
 
+MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
+FAR = 1e12  # coordinates beyond it are no places: nothing can be computed of them
+QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds
 SUMMARY = "summary.json"  # beside a model of ours; has the digests of its files as ``model``
 
 
@@ -184,25 +187,61 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
         raise why_not_written(folder, error) from error
 
 
-def read_given_model(folder: Path, option: str = "") -> pycolmap.Reconstruction:
-    """Read a model, text or binary; OptionError names the option it came by.
+def model_folder(folder: Path) -> Path:
+    """Return the folder of the largest model of a run, if its output folder is given.
 
-    Raises StoreError if it is damaged, or of ours and not as it was written.
+    A folder with a model is itself; so is one where there is none.
+    """
+    for found in (folder, folder / "sparse" / "0", folder / "sparse", folder / "0"):
+        if has_model(found):
+            return found
+    return folder
+
+
+def has_model(folder: Path) -> bool:
+    """Return whether a folder holds files of a model."""
+    return any((folder / f"images{ending}").exists() for ending in (".bin", ".txt"))
+
+
+def read_given_model(
+    folder: Path, option: str = "", *, needs_poses: bool = True
+) -> pycolmap.Reconstruction:
+    """Read a model, text or binary, of a folder or of that of a run.
+
+    Args:
+        folder: of the model, or the output folder of a run, whose largest model is read.
+        option: that it came by, with a space behind, for errors.
+        needs_poses: whether its poses are to be used; else only its cameras and names.
+
+    Raises:
+        OptionError: there is no such folder, or no model in it.
+        StoreError: the model is damaged, of ours and not as it was written, or nothing could be
+            computed with it: it has no registered image, two images of one name, or poses,
+            points or cameras that are not finite.
     """
     wanted = "give the folder that holds cameras, images and points3D as .bin or .txt"
     if not folder.is_dir():
         raise errors.OptionError(f"{option}{folder}: no such folder; {wanted}")
+    folder = model_folder(folder)
     for path in sorted(folder.glob("*.[bt][ix][nt]")):
         with errors.damage(path, wanted):
             require_regular(path)
-    if _is_binary(folder) or kept_digests(folder):
+    is_ours = bool(kept_digests(folder))
+    if _is_binary(folder) or is_ours:
         require_intact(folder)
         with errors.damage(folder, _mend(folder)):
             model = pycolmap.Reconstruction(folder)
             seen = sum(image.num_points3D for image in model.images.values())
             if seen != sum(point.track.length() for point in model.points3D.values()):
                 raise ValueError("its images and points are not of one model")
-        return model
+    else:
+        model = _read_text(folder, option, wanted)
+    if fault := "" if is_ours else _fault(model, needs_poses=needs_poses):
+        raise errors.StoreError(f"{option}{folder}: {fault}; {_mend(folder)}")
+    return model
+
+
+def _read_text(folder: Path, option: str, wanted: str) -> pycolmap.Reconstruction:
     try:
         return pycolmap.Reconstruction(folder)
     except errors.DAMAGE as error:
@@ -210,6 +249,45 @@ def read_given_model(folder: Path, option: str = "") -> pycolmap.Reconstruction:
             raise
         why = f"not a COLMAP model; {wanted} ({errors.reason(error)})"
         raise errors.OptionError(f"{option}{folder}: {why}") from error
+
+
+def _fault(model: pycolmap.Reconstruction, *, needs_poses: bool) -> str:
+    """Return why nothing can be computed with a model, empty where there is no reason."""
+    names = Counter(image.name for image in model.images.values())
+    if twice := sorted(name for name, count in names.items() if count > 1):
+        return (
+            f"two of its images are called {twice[0]} (text models cannot hold names with blanks: "
+            "use a binary one, or rename the photographs)"
+        )
+    for camera_id, camera in sorted(model.cameras.items()):
+        if not _is_usable(camera):
+            return f"camera {camera_id} has no size, or no finite and positive focal length"
+    if not needs_poses:
+        return ""
+    registered = [model.image(image_id) for image_id in model.reg_image_ids()]
+    if not registered:
+        return "the model has no images with poses"
+    for image in registered:
+        if not _is_pose(image.cam_from_world()):
+            return f"the pose of {image.name} is not finite, or no rotation"
+    for point_id, point in model.points3D.items():
+        if not (np.abs(point.xyz) < FAR).all():
+            return f"point {point_id} is at no finite place"
+    return ""
+
+
+def _is_usable(camera: pycolmap.Camera) -> bool:
+    """Return whether a camera has a size, finite parameters and a focal length, if it has one."""
+    params, sides = np.asarray(camera.params, np.float64), (camera.width, camera.height)
+    has_size = all(0 < side <= MAX_SIDE_PX for side in sides)
+    focals = params[list(camera.focal_length_idxs())]
+    return bool(has_size and (np.abs(params) < FAR).all() and (focals > 0.0).all())
+
+
+def _is_pose(pose: pycolmap.Rigid3d) -> bool:
+    """Return whether a pose has a quaternion of length 1 and a finite translation."""
+    length = float(np.linalg.norm(pose.rotation.quat))
+    return abs(length - 1.0) < QUATERNION_ERROR and bool((np.abs(pose.translation) < FAR).all())
 
 
 def num_long_tracks(model: pycolmap.Reconstruction, same_view: Mapping[int, int]) -> Counter[int]:
@@ -233,10 +311,7 @@ def seen_points(image: pycolmap.Image) -> Indices:
 
 def read_poses(model_path: Path) -> Poses:
     """Read the poses of a COLMAP model, text or binary; AffrectError when it has none."""
-    poses = model_poses(read_given_model(model_path))
-    if not poses:
-        raise errors.AffrectError(f"{model_path}: the model has no images with poses")
-    return poses
+    return model_poses(read_given_model(model_path))
 
 
 def model_poses(model: pycolmap.Reconstruction) -> Poses:

@@ -42,6 +42,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     address = f"{path.resolve().as_uri()}?{mode}"
     try:
         with closing(sqlite3.connect(address, uri=True)) as connection:
+            connection.execute("PRAGMA trusted_schema = OFF")  # no code of the file
             rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
             if missing := TABLES - {name for (name,) in rows}:
                 raise DatabaseError(
@@ -147,6 +148,26 @@ def rows_digest(path: Path) -> str:
     return digest.hexdigest()
 
 
+def require_intact_pages(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse a database that SQLite finds damaged, perhaps in an index that no row shows."""
+    (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+    if verdict != "ok":
+        raise DatabaseError(f"{path}: damaged ({str(verdict).splitlines()[-1]})")
+
+
+def damage_of(path: Path) -> str:
+    """Return how a database is damaged, empty if it is not."""
+    try:
+        with open_read_only(path) as connection:
+            require_intact_pages(connection, path)
+    except (DatabaseError, OptionError) as error:
+        return str(error).removeprefix(f"{path}: ")
+    return ""
+
+
 def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:
-    """Return the columns of a table, none if there is no such table."""
+    """Return the columns of a table, none if there is no such table; a view is none."""
+    is_table = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ? COLLATE NOCASE"
+    if not connection.execute(is_table, (table,)).fetchone():
+        return set()
     return {str(row[1]) for row in connection.execute(f"PRAGMA table_info({table})")}

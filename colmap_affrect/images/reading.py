@@ -299,7 +299,7 @@ def decoded(data: Bytes, path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any
             f"{path}: is of the format {name}, which COLMAP cannot read; convert it to PNG or "
             "JPEG (colmap-affrect convert)"
         )
-    _forget_orientation_of_tiff(data)
+    stand_upright(data)
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error:  # for one, of more pixels than OpenCV takes
@@ -316,8 +316,11 @@ def foreign_format(data: Bytes) -> str:
     return next(matching, "")
 
 
-def _forget_orientation_of_tiff(data: Bytes) -> None:
-    """Have the first picture of a TIFF stand upright: OpenCV turns it whatever the flags say."""
+def stand_upright(data: Bytes) -> None:
+    """Have the first picture of a TIFF stand upright: OpenCV turns it whatever the flags say.
+
+    EXIF is laid out as a TIFF is.
+    """
     order = {b"II": "<", b"MM": ">"}.get(data[:2].tobytes())
     if not order:
         return

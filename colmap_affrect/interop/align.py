@@ -2,19 +2,23 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.by_hand import triangulated
+from colmap_affrect.colmap.by_hand import require_inside, triangulated
+from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, FATAL_FOR_MAPPING
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.model_files import write_model
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.earth import why_not_on_earth
+from colmap_affrect.interop.consensus import agreeing
+from colmap_affrect.interop.consensus import residuals as residuals_of
 from colmap_affrect.interop.finished_models import read_finished_model
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
@@ -25,6 +29,8 @@ GEOREFERENCE = "georeference.json"  # beside a model: what COLMAP's files have n
 MIN_WIDTH = 0.01  # of known places across the line that fits them best, in units of its length
 METRIC, ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "altitude")
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+GPS_ERROR_M = 10.0  # a position on earth that is no further off is not left out
+TABLE_ERROR = 0.02  # the same of other positions, of how far they spread
 SHOWN = 12  # residuals in the summary, the largest first
 
 Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
@@ -46,6 +52,7 @@ class Alignment:
 
     scale: float  # metres for a unit of the model as it was
     residuals: Mapping[str, float]  # how far each position, point or distance is off, metres
+    left_out: Mapping[str, str] = field(default_factory=dict)  # why a position did not count
 
     def summary(self) -> str:
         """Return a few lines."""
@@ -57,14 +64,17 @@ class Alignment:
                 f"{len(largest)}, {largest[0][1]:.3g} m at most"
             )
             lines += [f"            {name} {value:.3g}" for name, value in largest[:SHOWN]]
+        lines += [f"left out    {name}: {why}" for name, why in sorted(self.left_out.items())]
         return "\n".join(lines)
 
 
 def align(model_path: PathLike, output_path: PathLike, reference: Reference) -> Alignment:
     """Write a COLMAP model in metres to a new folder; the old one stays as it is.
 
-    Positions and control points give scale, rotation and place, distances the scale alone.
-    Raises AffrectError when the reference is unreadable, or leaves open how the model lies.
+    Positions and control points give scale, rotation and place, distances the scale alone. Those
+    that are no place on earth, or do not fit the others, are left out and named. ``model_path`` may
+    be the output folder of a run. Raises AffrectError when the reference is unreadable, or leaves
+    open how the model lies.
     """
     model_path, output_path = as_path(model_path), as_path(output_path)
     if reference.distances and (reference.gps_database or reference.positions_path):
@@ -73,6 +83,7 @@ def align(model_path: PathLike, output_path: PathLike, reference: Reference) -> 
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     old = {name: image.projection_center() for name, image in images.items()}
     true, is_on_earth, marked = Places(), False, Places()
+    left_out: dict[str, str] = {}
     if reference.points_path:
         marked, true = _marked_points(model, images, reference.points_path)
     if reference.distances:
@@ -86,14 +97,55 @@ def align(model_path: PathLike, output_path: PathLike, reference: Reference) -> 
             true, is_on_earth = _table_of_positions(reference.positions_path)
         else:
             raise OptionError("give --gps, --positions, --points or --distance")
-        new_from_old, residuals, origin = _similarity(old, true, is_on_earth=is_on_earth)
+        left_out = _not_on_earth(true) if is_on_earth else {}
+        left_out |= _not_fitting(old, _without(true, left_out), is_on_earth=is_on_earth)
+        right = _without(true, left_out)
+        new_from_old, residuals, origin = _similarity(old, right, is_on_earth=is_on_earth)
     model.transform(new_from_old)
     with new_results(output_path, names=images) as (folder,):
         write_model(model, folder)
         if origin:
             content = dict(zip(ON_EARTH, origin, strict=True))
             replace_text(folder / GEOREFERENCE, json.dumps(content, indent=1) + "\n")
-    return Alignment(float(new_from_old.scale), residuals)
+    return Alignment(float(new_from_old.scale), residuals, left_out)
+
+
+def _without(places: Places, names: Collection[str]) -> Places:
+    return {name: place for name, place in places.items() if name not in names}
+
+
+def _not_on_earth(true: Places) -> dict[str, str]:
+    """Return why some positions are no place on earth, by name."""
+    found = {name: why_not_on_earth(place) for name, place in true.items()}
+    return {name: why for name, why in found.items() if why}
+
+
+def _not_fitting(old: Places, true: Places, *, is_on_earth: bool) -> dict[str, str]:
+    """Return which positions the others contradict, and by how much, by name."""
+    names = sorted(old.keys() & true.keys())
+    if len(names) < 4:
+        return {}
+    before, after = (np.array([places[name] for name in names]) for places in (old, true))
+    if is_on_earth:
+        after = np.asarray(WGS84.ellipsoid_to_enu(after, *np.median(after, axis=0)))
+        floor = GPS_ERROR_M
+    else:
+        spread = np.median(np.abs(after - np.median(after, axis=0)), axis=0)
+        floor = TABLE_ERROR * float(np.linalg.norm(spread))
+    agree = agreeing(before, after, floor)
+    found = pycolmap.estimate_sim3d(before[agree], after[agree])
+    if agree.all() or found is None:
+        return {}
+    off = residuals_of(found, before, after)
+    return {
+        name: f"{_metres(distance)} from where the others say"
+        for name, distance, agrees in zip(names, off.tolist(), agree, strict=True)
+        if not agrees
+    }
+
+
+def _metres(distance: float) -> str:
+    return f"{distance / 1000:.0f} km" if distance >= 10_000 else f"{distance:.3g} m"
 
 
 def _similarity(
@@ -123,8 +175,7 @@ def _similarity(
     new_from_old = pycolmap.estimate_sim3d(before, after)
     if new_from_old is None:
         raise OptionError("the known places do not fit the model in any scale and rotation")
-    moved = np.array([new_from_old * point for point in before])
-    residuals = np.linalg.norm(moved - after, axis=1).tolist()
+    residuals = residuals_of(new_from_old, before, after).tolist()
     return new_from_old, dict(zip(names, residuals, strict=True)), origin
 
 
@@ -150,7 +201,7 @@ def _scale(
 
 def _gps(path: Path) -> tuple[Places, bool]:
     """Return the pose priors of a database by image name, and whether they are on earth."""
-    with open_copy(path) as database:
+    with open_copy(path, FATAL_FOR_IMAGES - FATAL_FOR_MAPPING) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
     systems = {prior.coordinate_system for prior in priors}
@@ -205,7 +256,10 @@ def _marked_points(
         if any(column in row for column in METRIC):
             true[name] = _numbers(row, METRIC, place)
         if row.get("image", "") in images:
-            marks[name][images[row["image"]].image_id] = _numbers(row, ("px", "py"), place)
+            image = images[row["image"]]
+            camera, mark = model.cameras[image.camera_id], _numbers(row, ("px", "py"), place)
+            require_inside(place, mark, image.name, (camera.width, camera.height))
+            marks[name][image.image_id] = mark
     views = {name: marked for name, marked in marks.items() if len(marked) > 1}
     if not views:
         raise OptionError(f"{where}: no point is marked in two registered photographs")

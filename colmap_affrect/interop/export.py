@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import read_given_model, write_model
+from colmap_affrect.colmap.model_files import model_folder, read_given_model, write_model
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
-from colmap_affrect.errors import ImageError, OptionError, StoreError
+from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
+from colmap_affrect.images.orientation import forget_orientation
 from colmap_affrect.interop.finished_models import read_finished_model
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
@@ -22,6 +24,9 @@ from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.workspace import Workspace
 
+logger = logging.getLogger(__name__)
+
+USUAL = ("ply", "text", "cameras")  # formats that need no photographs
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
 FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL and nerfstudio
@@ -44,17 +49,25 @@ class Source:
 def export(
     model_path: PathLike,
     output_path: PathLike,
-    formats: Sequence[str],
+    formats: Sequence[str] = (),
     *,
     image_path: PathLike | None = None,
 ) -> dict[str, Path]:
     """Write a COLMAP model in some of ``FORMATS``; return what was written by format.
 
-    The output folder is made if missing; nothing in it is overwritten. ``image_path`` has the
-    photographs to undistort, by default those of the run that made the model. Raises AffrectError
-    when a format cannot hold the model, or a file exists; nothing is written then.
+    The output folder is made if missing; nothing in it is overwritten.
+
+    Args:
+        model_path: folder of a model, or the output folder of a run, whose largest model it is.
+        output_path: folder for the files.
+        formats: names of formats; by default those of ``USUAL``, without text where COLMAP could
+            not read it back.
+        image_path: the photographs to undistort, by default those of the run.
+
+    Raises:
+        AffrectError: a format cannot hold the model, or a file exists; nothing is written then.
     """
-    model_path, output_path = as_path(model_path), as_path(output_path)
+    model_path, output_path = model_folder(as_path(model_path)), as_path(output_path)
     image_path = as_path(image_path) if image_path else None
     for name in formats:
         if name not in FORMATS:
@@ -63,6 +76,8 @@ def export(
         raise OptionError(f"--image-path {image_path}: no such folder")
     photographs = image_path or Workspace(model_path.resolve().parent.parent).photographs()
     source = Source(model_path, read_finished_model(model_path), photographs)
+    if not formats:
+        formats = _usual(source)
     chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
     names = dict.fromkeys(made for _, made in chosen.values())
     targets = [output_path / name for name in names]
@@ -82,16 +97,34 @@ def _points(source: Source, folder: Path) -> Path:
 
 def _text(source: Source, folder: Path) -> Path:
     path = folder / "text"
-    for image in source.images():
-        if why := _not_in_text(image.name):
-            raise OptionError(
-                f"text: cannot hold the image name {image.name!r} ({why}); rename the photograph, "
-                "or leave that format out (--format ply,cameras)"
-            )
+    if why := _why_no_text(source):
+        raise OptionError(
+            f"text: {why}; rename the photographs and run again, or leave that format out and use "
+            "the binary model as it is"
+        )
     with native_writes(path):
         path.mkdir()
         source.model.write_text(path)
     return path
+
+
+def _usual(source: Source) -> Sequence[str]:
+    """Return the formats that are written where none is asked for."""
+    why = _why_no_text(source)
+    if not why:
+        return USUAL
+    logger.warning("text: left out, %s", why)
+    return [name for name in USUAL if name != "text"]
+
+
+def _why_no_text(source: Source) -> str:
+    """Say which names COLMAP could not read back out of files of text; empty if it can all."""
+    lost = []
+    for image in source.images():
+        why = _not_in_text(image.name)
+        if why:
+            lost.append(f"{image.name!r} ({why})")
+    return f"COLMAP could not read back the names {such_as(lost)}" if lost else ""
 
 
 def _not_in_text(name: str) -> str:
@@ -101,7 +134,7 @@ def _not_in_text(name: str) -> str:
     if name.startswith("#"):
         return "it begins as a comment does"
     if name.split() != [name]:
-        return "COLMAP ends names at a blank"
+        return "it has a blank, at which names end"
     return "" if name.isprintable() else "it has characters that do not print"
 
 
@@ -125,6 +158,7 @@ def _undistorted(source: Source, folder: Path) -> Path:
     for image in source.images():
         if not (picture := path / "images" / image.name).is_file():
             raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
+        forget_orientation(picture)  # COLMAP takes over EXIF, by which others would turn it
     return path
 
 

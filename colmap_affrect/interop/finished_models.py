@@ -9,7 +9,7 @@ from colmap_affrect.project.workspace import Workspace
 
 
 def read_finished_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a model of a run or of another program.
+    """Read a model of a run, which may be given by its output folder, or of another program.
 
     Raises WorkspaceError where a run has taken its model away to write the next one, and what
     :func:`~colmap_affrect.colmap.model_files.read_given_model` raises.
@@ -17,8 +17,8 @@ def read_finished_model(folder: Path) -> pycolmap.Reconstruction:
     try:
         return read_given_model(folder)
     except (OptionError, StoreError):
-        workspace = Workspace(folder.resolve().parent.parent)
-        if workspace.is_in_use():
+        whole = folder.resolve()
+        if any(Workspace(path).is_in_use() for path in (whole, *whole.parents[:2])):
             raise WorkspaceError(
                 f"{folder}: another colmap-affrect is writing this model; wait for it, and run the "
                 "same command again"

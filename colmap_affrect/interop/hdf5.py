@@ -20,7 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import CHECKS, USELESS_KEYPOINTS, keypoint_problems
+from colmap_affrect.colmap.checks import (
+    CHECKS,
+    USELESS_KEYPOINTS,
+    WARNED,
+    check_database,
+    keypoint_problems,
+)
 from colmap_affrect.colmap.database import (
     DESCRIPTOR_NORM,
     colmap_keypoints,
@@ -182,6 +188,7 @@ def import_h5(
                 f"mode {cameras.mode} allows): {such_as(lost)}"
             )
         counts = _fill(new, features, described, matches, pairs, progress)
+        problems = check_database(new)[1]
         num_verified = None
         if not skip_verification:
             options = VerificationOptions(random_seed=random_seed)
@@ -192,6 +199,7 @@ def import_h5(
     left_out = {
         "images without features are there without keypoints": without,
         "images that COLMAP does not take are left out": rejected,
+        **{CHECKS[kind]["what"]: problems.get(kind, []) for kind in sorted(WARNED)},
     }
     num_images = len(names) - len(rejected)
     return InterchangeReport("imported", num_images, *counts, num_verified, left_out)
@@ -250,8 +258,9 @@ def _write_keypoints(database: pycolmap.Database, image: pycolmap.Image, source:
                 f"and the photograph is {expected[0]} x {expected[1]} px; use the same photographs"
             )
     keypoints = _keypoint_rows(source, name)
-    for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints)):
-        raise StoreError(f"{source.path}: {CHECKS[kind]['what']}: {name}")
+    for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints, expected)):
+        check = CHECKS[kind]
+        raise StoreError(f"{source.path}: {check['what']}: {name}; {check['advice']}")
     database.write_keypoints(image.image_id, keypoints)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
-from colmap_affrect.colmap.checks import refuse_unusable
+from colmap_affrect.colmap.checks import FATAL_AS_IT_IS, FATAL_BEFORE_MAPPING, refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
@@ -223,7 +223,7 @@ def verify_matches(
     """
     path, pairs = as_path(database_path), None
     verification = translate.verification_options(options, None)
-    refuse_unusable(path)
+    refuse_unusable(path, FATAL_BEFORE_MAPPING, warns=True)
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
         if pairs_path is not None:
             ids = image_ids(path)
@@ -267,7 +267,7 @@ def incremental_mapping(
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
     mapper = MAPPERS.make(translate.mapper_options(options))
     database, output = as_path(database_path), as_path(output_path)
-    refuse_unusable(database)
+    refuse_unusable(database, FATAL_AS_IT_IS)
     with temporary_folder(output) as folder:
         existing = None
         if translate.given_path(input_path):

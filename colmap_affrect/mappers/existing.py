@@ -14,7 +14,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.colmap.model_files import model_folder, read_given_model
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.project.paths import TakesPaths
@@ -41,7 +41,7 @@ class Extension(TakesPaths):
     def digest(self) -> str:
         """Return a sha256 of the files of the model and of how it is extended."""
         found = hashlib.sha256(str(self.refine_existing).encode())
-        for path in sorted(self.model_path.glob("*.[bt][ix][nt]")):
+        for path in sorted(model_folder(self.model_path).glob("*.[bt][ix][nt]")):
             found.update(read_regular(path))
         return found.hexdigest()
 
@@ -133,8 +133,6 @@ def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 def _known_names(model: pycolmap.Reconstruction, path: Path, known: Collection[str]) -> list[str]:
     names = sorted(image.name for image in _registered(model))
     missing = [name for name in names if name not in known]
-    if not names:
-        raise AffrectError(f"--extend {path}: the model has no images with poses")
     if missing:
         raise AffrectError(
             f"--extend {path}: {len(missing)} of its {len(names)} images, such as {missing[0]}, "

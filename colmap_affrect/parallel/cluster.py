@@ -27,12 +27,16 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from colmap_affrect.errors import AffrectError
+from colmap_affrect.parallel.cluster_watch import ClusterWatch
 from colmap_affrect.parallel.executor import Result, Task, in_order
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Security
 
 CONNECT_TIMEOUT_S = 10.0
+CLOSE_TIMEOUT_S = 5.0
+POLL_S = 1.0  # that a result is waited for before somebody looks whether the cluster is there
+TRANSFER_S = 60.0  # that a finished result may take to come here
 TASKS_PER_THREAD = 2  # one that is being worked on and one that waits, so that no worker has to
 PACKAGES = ("colmap-affrect", "distributed", "numpy", "opencv-python-headless", "torch", "kornia")
 """Packages whose versions must be the same everywhere."""
@@ -111,21 +115,28 @@ def connected(address: str) -> Iterator[Cluster]:
     # Tasks may contain large images: dask need not warn of that.
     with config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
         _require_scheduler(address, security)
-        with Client(
-            address, timeout=CONNECT_TIMEOUT_S, security=security, set_as_default=False
-        ) as client:
+        client = Client(address, timeout=CONNECT_TIMEOUT_S, security=security, set_as_default=False)
+        try:
+            cluster = _with_workers(client, address)
             try:
-                client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
-            except TimeoutError as error:
-                raise AffrectError(
-                    f"{address}: the cluster has no workers; start some, with 'dask worker "
-                    f"{address}' on each machine"
-                ) from error
-            try:
-                yield Cluster(client, address)
+                yield cluster
             finally:
-                with suppress(OSError, RuntimeError, CancelledError):
-                    client.run(_function.cache_clear, on_error="ignore")
+                cluster.forget()
+        finally:
+            with suppress(OSError, RuntimeError, CancelledError):
+                client.close(timeout=CLOSE_TIMEOUT_S)
+
+
+def _with_workers(client: Client, address: str) -> Cluster:
+    """Return a cluster that has workers; AffrectError without."""
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+    except TimeoutError as error:
+        raise AffrectError(
+            f"{address}: the cluster has no workers; start some, with 'dask worker {address}' on "
+            "each machine"
+        ) from error
+    return Cluster(client, address)
 
 
 def _require_scheduler(address: str, security: Security) -> None:
@@ -157,14 +168,36 @@ class Cluster:
 
     def __init__(self, client: Client, address: str) -> None:
         self._client, self._address = client, address
+        self._watch = ClusterWatch(client, address)
+
+    def _result(self, future: Future) -> Any:
+        """Wait for the result of a task; AffrectError when the cluster is lost meanwhile."""
+        while not future.done():
+            try:
+                future.exception(timeout=POLL_S)  # waits, and brings no result here
+            except TimeoutError:
+                self._watch.look()
+        while future.status == "finished":
+            try:
+                return future.result(timeout=TRANSFER_S)
+            except TimeoutError:  # the worker that has it may be lost
+                self._watch.look()
+        return future.result()  # raises what the task has raised
+
+    def forget(self) -> None:
+        """Have workers free the memory of what they were given, if somebody is there."""
+        with suppress(OSError, RuntimeError, CancelledError, AffrectError):
+            self._watch.look()
+            if not self._watch.is_lost:
+                self._client.run(_function.cache_clear, on_error="ignore")
 
     def map(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
         """See :class:`~colmap_affrect.parallel.executor.Executor`.
 
-        Raises AffrectError when the scheduler is lost, several workers are lost with one task, or a
-        worker differs or does not see the files.
+        Raises AffrectError when the scheduler or all workers are lost for long, several workers are
+        lost with one task, or a worker differs or does not see the files.
         """
         from distributed import KilledWorker
 
@@ -177,10 +210,10 @@ class Cluster:
             return self._client.submit(_work, *job, pickle.dumps(task), key=key, pure=False)
 
         def num_tasks() -> int:  # that may be on their way
-            return TASKS_PER_THREAD * max(1, int(sum(self._client.nthreads().values())))
+            return TASKS_PER_THREAD * self._watch.num_threads()
 
         try:
-            yield from in_order(submit, tasks, num_tasks)
+            yield from in_order(submit, tasks, num_tasks, self._result)
         except KilledWorker as error:
             raise AffrectError(
                 f"{self._address}: {error.allowed_failures + 1} workers were lost while working on "

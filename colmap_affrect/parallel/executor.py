@@ -125,21 +125,34 @@ def map_ordered(
         cv2.setNumThreads(num_before)
 
 
+def _result(future: Any) -> Any:
+    return future.result()
+
+
 def in_order(
-    submit: Callable[[Task], Any], tasks: Iterable[Task], limit: Callable[[], int]
+    submit: Callable[[Task], Any],
+    tasks: Iterable[Task],
+    limit: Callable[[], int],
+    result: Callable[[Any], Any] = _result,
 ) -> Iterator[Any]:
-    """Yield results of futures in task order; fewer than ``limit()`` are submitted beforehand.
+    """Yield results of futures in task order.
 
     What has not ended is cancelled when the iteration ends early.
+
+    Args:
+        submit: makes a future of a task.
+        tasks: they are taken when their turn comes.
+        limit: fewer than so many are submitted beforehand.
+        result: waits for the result of a future.
     """
     pending: deque[Any] = deque()
     try:
         for task in tasks:
             pending.append(submit(task))
             while len(pending) >= limit():
-                yield pending.popleft().result()
+                yield result(pending.popleft())
         while pending:
-            yield pending.popleft().result()
+            yield result(pending.popleft())
     finally:
         for future in pending:
             future.cancel()

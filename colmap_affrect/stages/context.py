@@ -75,6 +75,8 @@ class Inputs(Options):
         if not self.from_database:
             return list_images(folder, listed if self.image_list_path else None)
         known = read_names(Path(self.from_database))
+        if not known:
+            raise ImageError(f"{self.from_database}: holds no images; import some first")
         if not self.image_list_path:
             return checked_names(folder, known, self.from_database)
         names = list_images(folder, listed)

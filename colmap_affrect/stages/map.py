@@ -9,6 +9,7 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.model_files import model_folder
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
@@ -94,7 +95,8 @@ def _inputs(context: Context, extend: Extension | None) -> str:
     verified = context.verified_digest()
     if not extend:
         return verified
-    own = extend.model_path.resolve().is_relative_to(context.workspace.sparse.resolve())
+    folder = model_folder(extend.model_path).resolve()
+    own = folder.is_relative_to(context.workspace.sparse.resolve())
     return f"{verified} {'own' if own else extend.digest()}"
 
 

@@ -12,9 +12,13 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from colmap_affrect.colmap.checks import FATAL, refuse_unusable
+from colmap_affrect.colmap.checks import (
+    FATAL_AS_IT_IS,
+    FATAL_BEFORE_MAPPING,
+    refuse_unusable,
+)
 from colmap_affrect.colmap.initial_cameras import record_cameras
-from colmap_affrect.colmap.tables import rows_digest
+from colmap_affrect.colmap.tables import damage_of, rows_digest
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import database_files
@@ -28,7 +32,6 @@ from colmap_affrect.stages.verify import copy_verified, verify_matches
 
 logger = logging.getLogger(__name__)
 
-UNUSABLE = FATAL | {"no-frame"}
 CHANGED = "was changed since the last run"
 
 
@@ -45,12 +48,12 @@ def watched(
     workspace, path = context.workspace, context.workspace.database
     if workspace.users_database:
         if path.exists() and path.stat().st_size:
-            refuse_unusable(path)
+            refuse_unusable(path, FATAL_BEFORE_MAPPING)
         yield
         return
     why = "" if discards else _why_lost(workspace)
     if maps and why == CHANGED:
-        refuse_unusable(path, UNUSABLE)
+        refuse_unusable(path, FATAL_AS_IT_IS)
         logger.warning("%s: %s, and is mapped as it is", path, CHANGED)
         workspace.is_changed = True
         record_cameras(path, workspace.cameras)
@@ -62,7 +65,8 @@ def watched(
     try:
         yield
     except AffrectError:
-        _seal(workspace)
+        if path.exists() and not damage_of(path):  # else it is looked through next time
+            _seal(workspace)
         raise
     _seal(workspace)
 
@@ -89,9 +93,11 @@ def _why_lost(workspace: Workspace) -> str:
     if not begun or _stamp(path) in sealed:
         return ""
     try:
+        if fault := damage_of(path):  # of an index perhaps, which rows do not show
+            return f"cannot be used ({fault})"
         if sealed:
             return "" if rows_digest(path) in sealed else CHANGED
-        refuse_unusable(path, UNUSABLE)  # a command was killed, and what it wrote is good
+        refuse_unusable(path, FATAL_AS_IT_IS)  # a command was killed, and what it wrote is good
     except AffrectError as error:
         reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
         return CHANGED if sealed else f"cannot be used ({reason})"

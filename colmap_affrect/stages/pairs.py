@@ -8,7 +8,7 @@ from itertools import combinations
 from pathlib import Path
 
 from colmap_affrect.colmap.database import nearest_positions
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, such_as
 from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
@@ -73,13 +73,34 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
         write_images_and_keypoints(context)
         limits = options.num_neighbors, options.max_distance_m
         near = nearest_positions(context.workspace.database, *limits)
-        pairs |= {pair for pair in near if known.issuperset(pair)}
+        by_gps = {pair for pair in near if known.issuperset(pair)}
+        _say_lonely(context, names, by_gps, options)
+        pairs |= by_gps
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
         named = known.union(context.inputs.names())  # some may have gone just now
         listed = lists.read_pairs(Path(options.match_list_path), sorted(named))
         pairs |= {pair for pair in listed if known.issuperset(pair)}
     return pairs
+
+
+def _say_lonely(
+    context: Context, names: Sequence[str], pairs: Collection[Pair], options: PairOptions
+) -> None:
+    """Say which photographs have no neighbour by their positions; AffrectError where none has."""
+    near = f"within {options.max_distance_m:g} m of another one"
+    advice = "raise --max-distance-m, or choose pairs in another way"
+    if not pairs and options.methods == ("gps",) and not options.match_list_path:
+        raise AffrectError(
+            f"{context.workspace.database}: by its position no photograph was taken {near}; "
+            f"{advice}"
+        )
+    paired = {name for pair in pairs for name in pair}
+    if lonely := [name for name in names if name not in paired]:
+        logger.warning(
+            "gps: %d of %d photographs were not taken %s, or nobody knows where (%s); %s",
+            len(lonely), len(names), near, such_as(lonely), advice,
+        )  # fmt: skip
 
 
 def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pair]) -> set[Pair]:

@@ -68,7 +68,7 @@ def copy_verified(
     workspace.require_own(image_path)
     digest = content_of(source_files(source)).digest
     if digest != workspace.made_from("copy") or not workspace.database.exists():
-        refuse_unusable(source)
+        refuse_unusable(source, warns=True)
     photographs = str(image_path.resolve()) if image_path else ""
     given = {"database": str(source.resolve()), "image_path": photographs}
     workspace.record_options("copy", given, overwrite=overwrite)

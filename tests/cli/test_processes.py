@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from command import on_photographs, run_in_process_of_its_own, start
+from exported_model import write_model
 
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
@@ -193,3 +194,23 @@ def test_want_of_memory_while_packages_are_loaded_is_one_line() -> None:
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: not enough memory; ")
+
+
+@pytest.mark.parametrize(("encoding", "shown"), [
+    ("ascii", b"out \\u010d\\u00e9\\ud83d\\ude00"),
+    ("cp1252:strict", b"out \\u010d\xe9\\ud83d\\ude00"),
+    ("utf-8", "out čé😀".encode()),
+])  # fmt: skip
+def test_output_has_any_encoding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str, shown: bytes
+) -> None:
+    """What an encoding lacks is escaped as JSON has it; the exit codes are the usual ones."""
+    write_model(tmp_path / "model")
+    monkeypatch.setenv("PYTHONIOENCODING", encoding)
+    command = [sys.executable, "-m", "colmap_affrect", "export", "--model-path", tmp_path / "model"]
+    for code in (0, 2):  # the second time the files are there
+        given = ["--output-path", tmp_path / "out čé😀", "--format", "cameras"]
+        ended = subprocess.run([*command, *given], check=False, capture_output=True)
+        printed = ended.stderr if code else ended.stdout
+        assert (ended.returncode, shown in printed) == (code, True), ended
+        assert len(printed.splitlines()) == 1

@@ -50,6 +50,26 @@ def test_what_cannot_be_used_is_refused_in_one_line(tmp_path: Path, text: str, w
         marked(tmp_path / "marks.csv", text)
 
 
+@pytest.mark.parametrize("cells", ["nan,2", "1,inf", "-inf,2", "NaN,NaN"])
+def test_marks_are_finite(tmp_path: Path, cells: str) -> None:
+    with pytest.raises(OptionError, match="line 2: x and y must be finite numbers of px"):
+        marked(tmp_path / "marks.csv", f"p,a,1,2\np,b,{cells}\n")
+
+
+@pytest.mark.parametrize("cells", ["644,2", "1,484", "-4,2", "1e308,2", "5,-3.5"])
+def test_marks_outside_of_their_photograph_are_refused(
+    tmp_path: Path, database: Path, cells: str
+) -> None:
+    (tmp_path / "marks.csv").write_text(f"p,a,-1,481.5\np,b,{cells}\n")
+    by_hand = ByHand(tmp_path / "marks.csv")
+    words = r"line 2: .* is outside of b\.jpg, which is 640 x 480 px; give px of the photograph"
+    with pytest.raises(OptionError, match=words):
+        by_hand.marks(NAMES, lambda _: (640, 480))
+    with pytest.raises(OptionError, match=words):
+        by_hand.copy_database(database, tmp_path / "mapped.db")
+    assert not (tmp_path / "mapped.db").exists()
+
+
 def test_names_that_several_photographs_have_are_refused(tmp_path: Path) -> None:
     (tmp_path / "marks.csv").write_text("p,a,1,2\np,b,1,2\n")
     with pytest.raises(OptionError, match="no such photograph, a "):

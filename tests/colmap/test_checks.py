@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ from damaged import Statement, execute
 from mapping_tasks import write_images
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import check_database
+from colmap_affrect.colmap.checks import check_database, refuse_unusable
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
+from colmap_affrect.doctor import Diagnosis, examine_database
 from colmap_affrect.errors import DatabaseError
 
 NAMES = ["a.png", "b c.png", "side/č.png"]
@@ -64,6 +66,11 @@ def changed_keypoint(row: int, column: int, value: float) -> Statement:
     return replace_data("keypoints", 2, keypoints)
 
 
+def in_units_of_sides(low: float, high: float) -> Statement:
+    places = np.linspace(low, high, 7, dtype=np.float32)
+    return replace_data("keypoints", 2, np.stack([places] * 6, axis=1))
+
+
 def at_one_place(count: int, num_there: int) -> Statement:
     keypoints = np.full((count, 6), 20, np.float32)
     keypoints[num_there:, 0] = np.arange(count - num_there)
@@ -85,9 +92,57 @@ def test_healthy_database_has_no_problem(database_path: Path) -> None:
 
 
 GEOMETRIES, OF_13 = "two_view_geometries", f"WHERE pair_id = {pair_id(1, 3)}"
+OF_RIGS = [("rigs", "rig_id"), ("frames", "rig_id")]
+OF_CAMERAS = [
+    ("cameras", "camera_id"), ("images", "camera_id"), ("rigs", "ref_sensor_id"),
+    ("frame_data", "sensor_id"),
+]  # fmt: skip
 BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     ("no-parent", ["UPDATE images SET camera_id = 9 WHERE image_id = 2"], ["b c.png"]),
     ("no-parent", ["UPDATE frames SET rig_id = 7 WHERE frame_id = 2"], ["row 2 of frames, rigs"]),
+    ("no-parent", ["UPDATE frames SET rig_id = 9"],
+     [f"row {n} of frames, rigs" for n in (1, 2, 3)]),
+    ("no-parent", ["INSERT INTO rigs VALUES (5, 9, 0)"], ["camera 9 of rig 5"]),
+    ("no-parent",
+     ["INSERT INTO rig_sensors VALUES (1, 9, 0, zeroblob(56))"], ["camera 9 of rig 1"]),
+    ("bad-id", ["UPDATE frames SET frame_id = -5 WHERE frame_id = 1",
+                "UPDATE frame_data SET frame_id = -5 WHERE frame_id = 1"],
+     ["frame_id -5 of frames"]),
+    ("bad-id", [f"UPDATE {table} SET {column} = 5000000000" for table, column in OF_RIGS],
+     ["rig_id 5000000000 of rigs"]),
+    ("bad-id", [f"UPDATE {table} SET {column} = 4294967295" for table, column in OF_CAMERAS],
+     ["camera_id 4294967295 of cameras"]),
+    ("bad-id", ["CREATE TABLE k AS SELECT * FROM keypoints", "DROP TABLE keypoints",
+                "ALTER TABLE k RENAME TO keypoints",
+                "INSERT INTO keypoints SELECT * FROM keypoints WHERE image_id = 2"],
+     ["image_id 2 of keypoints, twice"]),
+    ("bad-id", ["DROP INDEX pose_prior_data_assignment",
+                "INSERT INTO pose_priors VALUES (1, 2, 1, 0, NULL, NULL, NULL, 0)",
+                "INSERT INTO pose_priors VALUES (2, 2, 1, 0, NULL, NULL, NULL, 0)"],
+     ["pose prior of 2 of camera 1, twice"]),
+    ("bad-id", ["INSERT INTO pose_priors VALUES (1, -1, 1, 0, NULL, NULL, NULL, 0)"],
+     ["pose prior of -1 of camera 1"]),
+    ("bad-name", ["CREATE TABLE i AS SELECT * FROM images", "DROP TABLE images",
+                  "ALTER TABLE i RENAME TO images", "UPDATE images SET name = 'a.png'"],
+     ["a.png, 3 times"]),
+    ("bad-rig", ["INSERT INTO rig_sensors VALUES (1, 1, 0, zeroblob(56))"], ["camera 1, twice"]),
+    ("bad-rig", ["INSERT INTO rigs VALUES (5, 1, 9)"], ["sensor of kind 9, 1 of rig 5"]),
+    ("rig-without-pose", ["INSERT INTO rig_sensors VALUES (1, 1, 1, NULL)"], ["IMU 1 of rig 1"]),
+    ("bad-frame", ["UPDATE rigs SET ref_sensor_type = 1"],
+     [f"frame {n}: camera 1, which is not in its rig 1" for n in (1, 2, 3)]),
+    ("bad-frame", ["UPDATE frame_data SET sensor_id = 7 WHERE data_id = 1"],
+     ["frame 1: camera 7, while image 1 is of camera 1"]),
+    ("bad-frame", ["INSERT INTO frame_data VALUES (1, 99, 1, 0)"],
+     ["frame 1: camera 1, which has no image 99", "frame 1: camera 1, twice"]),
+    ("bad-frame", ["INSERT INTO frame_data VALUES (1, 1, 1, 1)"],
+     ["frame 1: IMU 1, which is not in its rig 1"]),
+    ("bad-frame", ["INSERT INTO frame_data VALUES (1, 5, 1, 9)"],
+     ["frame 1: sensor of kind 9, 1, which is no kind of sensor"]),
+    ("bad-frame", ["UPDATE frame_data SET frame_id = 2 WHERE frame_id = 1"],
+     ["frame 2: camera 1, twice"]),
+    ("bad-frame", ["DROP INDEX frame_sensor_assignment",
+                   "INSERT INTO frame_data VALUES (2, 1, 1, 0)"],
+     ["1 of camera, twice", "frame 2: camera 1, twice"]),
     ("no-frame", ["DELETE FROM frame_data WHERE data_id = 3"], ["side/č.png"]),
     ("bad-name", ["UPDATE images SET name = x'61FF' WHERE image_id = 1"], ["image 1: 'a\ufffd'"]),
     ("keypoint-data",
@@ -100,6 +155,10 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
       "UPDATE keypoints SET rows = -1 WHERE image_id = 2"],
      ["b c.png"]),
     ("keypoint-data", ["UPDATE keypoints SET data = 'text' WHERE image_id = 2"], ["b c.png"]),
+    ("descriptor-data", ["INSERT INTO descriptors VALUES (2, 0, 7, 128, zeroblob(895))"],
+     ["b c.png"]),
+    ("descriptor-data", ["INSERT INTO descriptors VALUES (2, 0, -7, -128, zeroblob(896))"],
+     ["b c.png"]),
     ("bad-camera", ["UPDATE cameras SET model = 12345"], ["camera 1: model 12345"]),
     ("bad-camera",
      ["UPDATE cameras SET width = 9223372036854775807"],
@@ -108,7 +167,16 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     ("matrix-data",
      [f"UPDATE two_view_geometries SET F = substr(zeroblob(72), 1, 71) {OF_13}"],
      [f"F of row {pair_id(1, 3)} of two_view_geometries"]),
+    ("matrix-data", [f"UPDATE two_view_geometries SET camera1 = x'0011' {OF_13}"],
+     [f"camera1 or camera2 of pair_id {pair_id(1, 3)}"]),
+    ("matrix-data", [f"UPDATE two_view_geometries SET camera2 = zeroblob(65) {OF_13}"],
+     [f"camera1 or camera2 of pair_id {pair_id(1, 3)}"]),
     ("keypoints-not-finite", [changed_keypoint(6, 1, np.nan)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(6, 0, 94.0)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(6, 1, -4.0)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(6, 1, 64.0)], ["b c.png"]),
+    *(("keypoints-normalised", [in_units_of_sides(*ends)], ["b c.png"])
+      for ends in ((0.0, 1.0), (0.0, 1.5), (-1.0, 1.0))),
     ("keypoints-at-one-place", [at_one_place(11, 10)], ["b c.png"]),
     ("match-data",
      [f"UPDATE matches SET rows = 3 {OF_13}"], ["a.png - side/č.png (raw matches)"]),
@@ -130,8 +198,40 @@ def test_what_is_broken_is_found_and_nothing_else(
     assert check_database(database_path)[1] == {kind: items}
 
 
+def test_keypoints_of_smaller_pictures_are_found(
+    database_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(3)
+    places = rng.uniform(0.0, 1.0, (100, 2)).astype(np.float32) * np.float32(SIZE)
+    execute(database_path, "DELETE FROM matches", "DELETE FROM two_view_geometries")
+    for scale in (0.4, 1.0):  # those of one image alone may be so
+        for image_id in (1, 2, 3):
+            rows = np.column_stack([places * np.float32(0.5), np.ones((100, 2), np.float32)])
+            if image_id == 2:
+                rows[:, :2] *= np.float32(2.0 * scale)
+            execute(database_path, (
+                "UPDATE keypoints SET rows = 100, cols = 4, data = ? WHERE image_id = ?",
+                [rows.astype(np.float32).tobytes(), image_id],
+            ))  # fmt: skip
+        caplog.clear()
+        refuse_unusable(database_path, warns=True)
+        found = check_database(database_path)[1]
+        assert found == ({"keypoints-in-a-corner": sorted(NAMES)} if scale < 1.0 else {})
+        assert ("all keypoints in the upper left part" in caplog.text) == (scale < 1.0)
+    diagnosis = Diagnosis()
+    assert examine_database(diagnosis, database_path)
+    assert diagnosis.num_errors == 0
+
+
 @pytest.mark.parametrize("statement", [
     "DELETE FROM frames",  # none has one: as in databases of old
+    ("UPDATE two_view_geometries SET camera1 = ?, camera2 = camera1",
+     [struct.pack("<IiQQBQ3d", 7, 0, 90, 60, 1, 3, 100.0, 45.0, 30.0)]),
+    "INSERT INTO descriptors VALUES (2, 0, 7, 128, zeroblob(896))",
+    "INSERT INTO frames VALUES (9, 1)",  # which holds nothing
+    "INSERT INTO rig_sensors VALUES (1, 1, 1, zeroblob(56))",  # an IMU, and it is known where
+    changed_keypoint(6, 0, 91.0),  # a little beyond the border
+    changed_keypoint(6, 0, 1.0),
     at_one_place(11, 9),
     replace_data("keypoints", 2, np.full((7, 4), 3, np.float32)),
     replace_data("matches", pair_id(1, 2), np.array([[4, 6]], np.uint32)),  # the last ones
@@ -141,7 +241,8 @@ def test_what_is_broken_is_found_and_nothing_else(
 ])  # fmt: skip
 def test_what_is_allowed_is_no_problem(database_path: Path, statement: Statement) -> None:
     path = database_path
-    execute(path, "DELETE FROM frame_data" if "frames" in statement else "SELECT 1", statement)
+    none_has_one = statement == "DELETE FROM frames"
+    execute(path, "DELETE FROM frame_data" if none_has_one else "SELECT 1", statement)
     assert check_database(path)[1] == {}
 
 

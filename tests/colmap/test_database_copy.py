@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import Call
+from damaged import execute
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
@@ -250,38 +251,7 @@ def test_existing_target_is_not_overwritten(database_path: Path, tmp_path: Path)
     assert (tmp_path / "there.db").read_text() == "precious"
 
 
-ACTING = {
-    "CREATE TRIGGER t AFTER INSERT ON keypoints BEGIN DELETE FROM images; END": "",
-    "CREATE VIEW v AS SELECT * FROM images": "",
-    "CREATE INDEX x ON images(name, zeroblob(1000000))": "",
-    "DROP INDEX index_name; CREATE INDEX index_name ON images(zeroblob(1000000))": "",
-    "ALTER TABLE cameras ADD COLUMN note TEXT DEFAULT 'mine'": "",
-    "ALTER TABLE cameras ADD COLUMN g AS (zeroblob(1000000))": "column g of the table cameras",
-}
-
-
-@pytest.mark.parametrize("statement", ACTING)
-def test_what_acts_on_its_own_does_not_come_into_a_copy(
-    source: Path, tmp_path: Path, statement: str
-) -> None:
-    given = Path(shutil.copy(source, tmp_path / "given.db"))
-    with closing(sqlite3.connect(given)) as connection:
-        connection.executescript(statement)
-    if refused := ACTING[statement]:
-        with pytest.raises(DatabaseError, match=refused):
-            copy_database(given, tmp_path / "copy.db")
-        assert not (tmp_path / "copy.db").exists()
-        return
-    copy_database(given, tmp_path / "copy.db")
-    made = "SELECT type, name FROM sqlite_master WHERE type != 'table' AND sql IS NOT NULL"
-    left = set(rows(tmp_path / "copy.db", made))
-    copy_database(source, tmp_path / "usual.db")
-    assert left <= set(rows(tmp_path / "usual.db", made))
-    count = "SELECT COUNT(*) FROM keypoints"
-    assert rows(tmp_path / "copy.db", count) == rows(source, count)
-
-
-@pytest.mark.parametrize("name", ["new.db", ".lock", "results"])
+@pytest.mark.parametrize("name", ["new.db", "old.db", ".lock", "results"])
 def test_an_exported_database_may_have_any_name(source: Path, tmp_path: Path, name: str) -> None:
     export_database(source, tmp_path / name)
     assert rows(tmp_path / name, "SELECT COUNT(*) FROM images") == [(6,)]
@@ -294,3 +264,84 @@ def test_pipes_in_the_place_of_a_database_are_refused(tmp_path: Path, suffix: st
     os.mkfifo(tmp_path / f"x.db{suffix}")
     with pytest.raises(OptionError, match="is not a file, but a pipe"):
         schema_version(tmp_path / "x.db")
+
+
+FOREIGN = {
+    "trigger": "CREATE TRIGGER t AFTER INSERT ON keypoints BEGIN DELETE FROM images; END",
+    "trigger of change": """CREATE TRIGGER t AFTER UPDATE ON cameras
+        BEGIN UPDATE cameras SET params = zeroblob(300000000); END""",
+    "view": "CREATE VIEW v AS SELECT zeroblob(300000000)",
+    "index": "CREATE INDEX i ON images(length(name))",
+    "index of a name of COLMAP's": """DROP INDEX index_name;
+        CREATE INDEX index_name ON images(zeroblob(1000000))""",
+    "table": "CREATE TABLE more AS SELECT zeroblob(3000000) AS data",
+    "column": "ALTER TABLE images ADD COLUMN more BLOB AS (zeroblob(300000000))",
+    "column with a default": "ALTER TABLE cameras ADD COLUMN note TEXT DEFAULT 'mine'",
+}
+"""What others may have put into a database beside COLMAP's tables."""
+
+
+def whole(path: Path) -> list[tuple[object, ...]]:
+    """Return what a database holds: how it is made, and all rows."""
+    made = rows(path, "SELECT type, name, sql FROM sqlite_master ORDER BY name")
+    return [
+        *made,
+        *(row for name in tables_of(path) for row in rows(path, f"SELECT * FROM {name}")),
+    ]
+
+
+def tables_of(path: Path) -> list[str]:
+    """Return the names of the tables of a database."""
+    made = rows(path, "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name")
+    return [str(name) for (name,) in made]
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_copies_hold_the_tables_of_colmap_alone(source: Path, tmp_path: Path, case: str) -> None:
+    path = Path(shutil.copy(source, tmp_path / "given.db"))
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(FOREIGN[case])
+    copy_database(source, tmp_path / "plain.db")
+    copy_database(path, tmp_path / "copy.db")
+    assert whole(tmp_path / "copy.db") == whole(tmp_path / "plain.db")
+    assert len(tables_of(source)) == 12
+    for name in tables_of(source):
+        query = f"SELECT * FROM {name}"
+        assert sorted(rows(tmp_path / "copy.db", query)) == sorted(rows(source, query)), name
+    with open_database(tmp_path / "copy.db") as database:
+        database.clear_keypoints()
+        database.write_keypoints(1, np.zeros((1, 2), np.float32))
+        database.update_camera(database.read_camera(1))
+        assert database.num_images() == 6
+
+
+def test_triggers_of_old_databases_stay_behind(source: Path, tmp_path: Path) -> None:
+    export_database(source, tmp_path / "old.db")
+    execute(tmp_path / "old.db", FOREIGN["trigger"], FOREIGN["view"])
+    copy_database(tmp_path / "old.db", tmp_path / "copy.db")
+    made = rows(tmp_path / "copy.db", "SELECT name FROM sqlite_master WHERE type != 'table'")
+    assert not {("t",), ("v",)} & {*made}
+    query = "SELECT image_id, rows, data FROM keypoints"
+    assert rows(tmp_path / "copy.db", query) == rows(source, query)
+    assert schema_version(tmp_path / "copy.db") == newest_schema_version()
+
+
+def test_views_are_no_tables(source: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(source, tmp_path / "given.db"))
+    execute(path, "ALTER TABLE frames RENAME TO f", "CREATE VIEW frames AS SELECT * FROM f")
+    copy_database(path, tmp_path / "copy.db")
+    assert rows(tmp_path / "copy.db", "SELECT * FROM frames") == []
+
+
+def test_rows_that_no_table_can_hold_are_one_line(source: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(source, tmp_path / "given.db"))
+    execute(
+        path,
+        "CREATE TABLE c AS SELECT * FROM cameras",
+        "DROP TABLE cameras",
+        "ALTER TABLE c RENAME TO cameras",
+        "UPDATE cameras SET prior_focal_length = NULL",
+    )
+    with pytest.raises(DatabaseError, match="has rows that COLMAP's tables cannot hold"):
+        copy_database(path, tmp_path / "copy.db")
+    assert not (tmp_path / "copy.db").exists()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import random
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
@@ -14,10 +16,11 @@ from colmap_affrect.colmap.model_files import (
     RECORDS,
     SUMMARY,
     file_digests,
+    model_folder,
     read_given_model,
     registered_names,
 )
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import OptionError, StoreError
 
 
 @pytest.fixture(scope="module")
@@ -98,3 +101,82 @@ def test_tracks_and_keypoints_name_each_other(
     what = "is not as it was written" if is_ours else "images and points are not of one model"
     with pytest.raises(StoreError, match=what):
         read_given_model(tmp_path)
+
+
+def _first(model: pycolmap.Reconstruction) -> pycolmap.Image:
+    return model.image(min(model.reg_image_ids()))
+
+
+def set_pose(model: pycolmap.Reconstruction, quaternion: list[float], x: float) -> None:
+    image = _first(model)
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(quaternion)), np.array([x, 0.0, 0.0]))
+    model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+
+
+def set_focal(model: pycolmap.Reconstruction, value: float) -> None:
+    camera = model.cameras[_first(model).camera_id]
+    params = np.array(camera.params)
+    params[camera.focal_length_idxs()] = value
+    camera.params = params
+
+
+def set_point(model: pycolmap.Reconstruction, x: float) -> None:
+    model.points3D[min(model.points3D)].xyz = np.array([x, 0.0, 0.0])
+
+
+def deregister(model: pycolmap.Reconstruction) -> None:
+    for frame_id in list(model.reg_frame_ids()):
+        model.deregister_frame(frame_id)
+
+
+def name_twice(model: pycolmap.Reconstruction) -> None:
+    _first(model).name = model.image(max(model.reg_image_ids())).name
+
+
+NAN, INF, UPRIGHT = float("nan"), float("inf"), [0.0, 0.0, 0.0, 1.0]
+UNSOUND: dict[str, tuple[Callable[[pycolmap.Reconstruction], None], str]] = {
+    "rotation": (lambda model: set_pose(model, [NAN, 0.0, 0.0, 1.0], 0.0), "the pose of .* is not"),
+    "no rotation": (lambda model: set_pose(model, [0.0] * 4, 0.0), "the pose of .* is not finite"),
+    "translation": (lambda model: set_pose(model, UPRIGHT, NAN), "the pose of .* is not finite"),
+    "infinite": (lambda model: set_pose(model, UPRIGHT, INF), "the pose of .* is not finite"),
+    "huge": (lambda model: set_pose(model, UPRIGHT, 1e300), "the pose of .* is not finite"),
+    "focal length": (lambda model: set_focal(model, NAN), "camera 1 has no size, or no finite"),
+    "negative focal length": (lambda model: set_focal(model, -5.0), "camera 1 has no size"),
+    "point": (lambda model: set_point(model, NAN), "point 1 is at no finite place"),
+    "no image": (deregister, "the model has no images with poses"),
+    "two of one name": (name_twice, "two of its images are called"),
+}
+
+
+@pytest.mark.parametrize("case", UNSOUND)
+def test_models_that_nothing_can_be_computed_with_are_refused(
+    model_path: Path, tmp_path: Path, case: str
+) -> None:
+    change, said = UNSOUND[case]
+    model = pycolmap.Reconstruction(model_path)
+    change(model)
+    (changed := tmp_path / "changed").mkdir()
+    model.write(changed)
+    with pytest.raises(StoreError, match=said):
+        read_given_model(changed)
+    for path in changed.iterdir():
+        path.unlink()
+    model.write_text(changed)
+    with pytest.raises((StoreError, OptionError)):
+        read_given_model(changed)
+
+
+def test_model_of_cameras_alone_needs_no_pose(model_path: Path) -> None:
+    model = pycolmap.Reconstruction(model_path)
+    set_pose(model, UPRIGHT, NAN)
+    model.write(model_path)
+    assert len(read_given_model(model_path, needs_poses=False).images) == 12
+
+
+def test_folder_of_a_run_stands_for_its_largest_model(model_path: Path, tmp_path: Path) -> None:
+    (out := tmp_path / "out" / "sparse").mkdir(parents=True)
+    shutil.copytree(model_path, out / "0")
+    for folder in (out.parent, out, out / "0"):
+        assert model_folder(folder) == out / "0"
+        assert read_given_model(folder).num_reg_images() == 12
+    assert model_folder(tmp_path / "none") == tmp_path / "none"

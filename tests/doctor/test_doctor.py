@@ -161,6 +161,18 @@ def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     assert main(["export", *target, "--quiet"]) == 0
 
 
+def test_model_of_another_program_is_examined(tmp_path: Path, folders: Folders) -> None:
+    shutil.copytree(folders.out / "sparse" / "0", tmp_path / "model")
+    (tmp_path / "model" / "summary.json").unlink()
+    assert findings(tmp_path / "model") == []
+    model = pycolmap.Reconstruction(tmp_path / "model")
+    model.cameras[1].params = [float("nan")] * len(model.cameras[1].params)
+    model.write(tmp_path / "model")
+    (found,) = findings(tmp_path / "model")
+    assert (found.severity, found.advice) == ("error", "make the model again")
+    assert "camera 1 has no size, or no finite and positive focal length" in found.what
+
+
 def test_folder_in_use_is_left_alone(folders: Folders) -> None:
     (folders.out / "features.h5").unlink()
     with Workspace(folders.out).locked():

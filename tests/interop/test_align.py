@@ -13,6 +13,7 @@ from exported_model import write_model
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.interop.align import Reference, align
+from colmap_affrect.interop.consensus import agreeing
 
 ORIGIN = (49.5, 15.25, 300.0)
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
@@ -95,6 +96,81 @@ def test_positions_of_a_database_are_taken_from_its_priors(tmp_path: Path) -> No
     assert align(tmp_path / "model", tmp_path / "new", reference).scale == pytest.approx(2.5)
 
 
+WRONG = {
+    "nowhere": [0.0, 0.0, 0.0],
+    "no latitude": [96.0, 15.25, 300.0],
+    "swapped": [15.25, 49.5, 300.0],
+    "a street further on": [49.502, 15.25, 300.0],
+}
+"""Positions that receivers and people write down."""
+
+
+def write_gps(path: Path, places: dict[str, list[float]]) -> None:
+    """Write a database of photographs with positions."""
+    with pycolmap.Database.open(path) as database:
+        camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 150.0, 160, 120)
+        database.write_camera(camera)
+        for name, place in places.items():
+            image_id = database.write_image(pycolmap.Image(name=name, camera_id=1))
+            prior = pycolmap.PosePrior(
+                corr_data_id=database.read_image(image_id).data_id,
+                position=np.array(place),
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84,
+            )
+            database.write_pose_prior(prior)
+
+
+def ring(folder: Path) -> dict[str, list[float]]:
+    """Write a model of nine photographs round a place; return their positions, 2 m wrong or so."""
+    rng, model = np.random.default_rng(5), write_model(folder)
+    for number in range(5, 10):
+        turned = pycolmap.Rotation3d(np.array([0.0, 0.7 * number, 0.0]))
+        center = np.array([3.0 * np.sin(number), 0.3 * number, 3.0 * np.cos(number)])
+        image = pycolmap.Image(name=f"{number}.png", camera_id=1, image_id=number)
+        pose = pycolmap.Rigid3d(turned, -turned.matrix() @ center)
+        model.add_image_with_trivial_frame(image, pose)
+    model.write(folder)
+    places = {name: 20.0 * place for name, place in true_centers(model).items()}
+    errors = rng.normal(0.0, 2.0, (len(places), 3))
+    return {
+        name: on_earth(place + error, ORIGIN)
+        for (name, place), error in zip(places.items(), errors, strict=True)
+    }
+
+
+@pytest.mark.parametrize("kinds", [
+    [], ["nowhere", "nowhere"], ["no latitude"], ["swapped", "nowhere"], ["a street further on"],
+    ["nowhere", "no latitude", "swapped", "a street further on"],
+])  # fmt: skip
+def test_positions_that_are_wrong_are_left_out_and_named(
+    tmp_path: Path, call: Call, kinds: list[str]
+) -> None:
+    places = ring(tmp_path / "model")
+    wrong = dict(zip(places, kinds, strict=False))
+    write_gps(tmp_path / "gps.db", places | {name: WRONG[kind] for name, kind in wrong.items()})
+    given = ["--model-path", tmp_path / "model", "--output-path", tmp_path / "new"]
+    done = call("align", *given, "--gps", tmp_path / "gps.db")
+    assert (done.code, done.stderr) == (0, [])
+    lines = done.stdout.splitlines()
+    assert float(lines[0].split()[1]) == pytest.approx(50.0, rel=0.1)
+    left_out = {line.split()[2].rstrip(":") for line in lines if line.startswith("left out")}
+    assert left_out == wrong.keys()
+    new = centers(pycolmap.Reconstruction(tmp_path / "new"))
+    assert max(np.linalg.norm(center) for center in new.values()) < 300
+
+
+@pytest.mark.parametrize("count", [4, 5, 6, 9, 30])
+def test_honest_positions_all_count(count: int) -> None:
+    """Few places fit some similarity well by chance: the others are not wrong for that."""
+    rng = np.random.default_rng(count)
+    for _ in range(20):
+        before = rng.normal(0.0, 10.0, (count, 3))
+        after = before * 3.0 + rng.normal(0.0, 3.0, (count, 3))
+        assert agreeing(before, after, 10.0).all()
+        after[1] = [1e6, 0.0, 0.0]
+        assert agreeing(before, after, 10.0).tolist() == [True, False, *[True] * (count - 2)]
+
+
 def test_distances_of_photographs_and_marked_points_give_the_scale(
     tmp_path: Path, call: Call
 ) -> None:
@@ -134,6 +210,15 @@ def test_positions_that_leave_the_model_open_are_refused(
     with pytest.raises(OptionError, match=message):
         align(tmp_path / "model", tmp_path / "new", Reference(positions_path=table))
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("cells", ["164,5", "5,-4", "1e308,5", "nan,5"])
+def test_marks_outside_of_their_photograph_are_refused(tmp_path: Path, cells: str) -> None:
+    write_model(tmp_path / "model")
+    table = tmp_path / "points.csv"
+    table.write_text(f"point,image,px,py,x,y,z\np,a.png,{cells},1,2,3\n")
+    with pytest.raises(OptionError, match=r"line 2: (.* is outside of a\.png|px is not finite)"):
+        align(tmp_path / "model", tmp_path / "new", Reference(points_path=table))
 
 
 def test_nothing_is_overwritten_and_no_model_is_said(tmp_path: Path) -> None:

@@ -123,16 +123,6 @@ def test_command_names_what_it_wrote(tmp_path: Path, call: Call) -> None:
     assert all(name in help_text for name in FORMATS)
 
 
-@pytest.mark.parametrize("name", ["IMG 1.png", " a.png", "a.png ", "#a.png", "a\u3000b.png", ""])
-def test_names_that_text_cannot_hold_are_refused(tmp_path: Path, name: str) -> None:
-    model = write_model(tmp_path / "model")
-    model.find_image_with_name("a.png").name = name
-    model.write(tmp_path / "model")
-    with pytest.raises(OptionError, match="text: cannot hold the image name"):
-        export(tmp_path / "model", tmp_path / "out", ["text", "ply"])
-    assert not (tmp_path / "out").exists()
-
-
 def test_native_writers_that_fail_are_one_line_and_leave_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,8 +157,9 @@ def test_a_model_that_a_run_is_about_to_replace_is_not_called_damaged(tmp_path: 
     (tmp_path / "out" / "sparse").mkdir(parents=True)
     model = tmp_path / "out" / "sparse" / "0"
     with FileLock(tmp_path / "out" / ".lock"):
-        with pytest.raises(WorkspaceError, match="another colmap-affrect is writing this model"):
-            export(model, tmp_path / "new", ["ply"])
+        for given in (model, tmp_path / "out" / "sparse", tmp_path / "out"):
+            with pytest.raises(WorkspaceError, match="another colmap-affrect is writing this"):
+                export(given, tmp_path / "new", ["ply"])
         write_model(model)
         export(model, tmp_path / "new", ["ply"])
     shutil.rmtree(model)
@@ -207,3 +198,35 @@ def test_small_disks_are_one_line(tmp_path: Path, call: Call, limit: str, form: 
         assert not done.code or not list(disk.iterdir())
     finally:
         subprocess.run(["umount", disk], check=True)
+
+
+@pytest.mark.parametrize(("name", "why"), [
+    ("IMG 1.png", "a blank"), (" a.png", "a blank"), ("a.png ", "a blank"),
+    ("a\u3000b.png", "a blank"), ("a\u00a0b.png", "a blank"), ("line\nbreak.png", "a blank"),
+    ("#1.png", "begins as a comment"), ("a\u200bb.png", "characters that do not print"),
+    ("", "it is empty"),
+])  # fmt: skip
+def test_text_is_refused_where_colmap_could_not_read_the_names(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, why: str
+) -> None:
+    model = write_model(tmp_path / "model")
+    model.images[1].name = name
+    model.write(tmp_path / "model")
+    with pytest.raises(OptionError, match=f"text: COLMAP could not read back the names .*{why}"):
+        export(tmp_path / "model", tmp_path / "out", ["text", "ply"])
+    assert not (tmp_path / "out").exists()
+    assert [*export(tmp_path / "model", tmp_path / "out")] == ["ply", "cameras"]
+    assert "text: left out, COLMAP could not read back the names" in caplog.text
+
+
+@pytest.mark.usefixtures("model")
+def test_output_folder_of_a_run_is_taken_for_its_model(tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos")
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "sparse").mkdir()
+    (tmp_path / "model").rename(out / "sparse" / "0")
+    written = export(
+        out, tmp_path / "new", ["cameras", "undistorted"], image_path=tmp_path / "photos"
+    )
+    assert (written["undistorted"] / "images" / "a.png").exists()

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from h5_files import (
+    NAMES,
     Datasets,
     Files,
     hloc_group,
@@ -33,6 +34,7 @@ def files(tmp_path: Path) -> Files:
 
 
 def test_centres_move_by_half_a_pixel_once_and_in_float32(files: Files) -> None:
+    write_photos(files.photos, ["a.png"], (1100, 48))
     half = np.array([[3.25, 17.5], [1027.0, 2.0]], np.float16)
     write_h5(
         files.features,
@@ -129,6 +131,18 @@ def test_images_without_features_are_imported_and_named_and_not_exported(files: 
     assert hloc_names(targets[0]) == {"a.png", "sub/b c.png"}
 
 
+def test_keypoints_of_smaller_pictures_are_noted(files: Files) -> None:
+    half = {name: hloc_group(120, n) for n, name in enumerate(NAMES)}
+    for group in half.values():
+        group["keypoints"] = group["keypoints"] / 2
+        del group["image_size"]
+    write_h5(files.features, half)
+    write_h5(files.matches, {})
+    notes = files.import_all().summary().splitlines()[1:]
+    assert len(notes) == 1
+    assert "all keypoints in the upper left part, found in smaller pictures perhaps" in notes[0]
+
+
 def change_features(**datasets: Any) -> Callable[[Files], object]:
     groups = {"a.png": {**hloc_group(3), **datasets}, "sub/b c.png": hloc_group(4)}
     return lambda files: write_h5(files.features, groups)
@@ -179,7 +193,15 @@ ERRORS: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "not finite": (
         change_features(keypoints=[[1.0, 2.0], [np.nan, 3.0], [1e300, 2.0]]),
-        r"features\.h5: images with keypoints that are not finite.*: a\.png$",
+        r"features\.h5: images with keypoints that are not finite.*: a\.png; extract and",
+    ),
+    "of pictures twice as large": (
+        change_features(keypoints=[[1.0, 2.0], [70.0, 3.0], [100.0, 90.0]]),
+        r"features\.h5: images with keypoints outside of them.*: a\.png; extract and match with",
+    ),
+    "in units of its sides": (
+        change_features(keypoints=[[0.1, 0.2], [1.0, 0.3], [1.5, 0.9]]),
+        r"features\.h5: images with all keypoints in one corner.*: a\.png; write keypoints in px",
     ),
     "other size": (
         change_features(image_size=[48, 64]),

@@ -25,6 +25,7 @@ from verified import CAMERAS
 
 from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.parallel import cluster as cluster_module
+from colmap_affrect.parallel import cluster_watch
 from colmap_affrect.parallel.cluster import Cluster, connected, environment, require_environment
 from colmap_affrect.parallel.executor import Executor, Threads
 from colmap_affrect.progress import SILENT, Advance, Progress
@@ -41,15 +42,14 @@ RECIPE = load_recipe("unrectified-rootsift")
 DAMAGED = "damaged.png"
 
 
-@pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A scheduler and two workers of one thread each, in processes of their own."""
-    folder = tmp_path_factory.mktemp("cluster")
+@contextmanager
+def started(folder: Path, num_workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """Start a scheduler and workers of one thread each; yield its address, and all processes."""
     file = folder / "scheduler.json"
     common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
     worker = ["worker", *common, "--nthreads", "1", "--no-nanny", "--local-directory", str(folder)]
-    commands = [["scheduler", "--port", "0", *common], *[worker] * 2]
-    started = [
+    commands = [["scheduler", "--port", "0", *common], *[worker] * num_workers]
+    processes = [
         subprocess.Popen(
             [sys.executable, "-m", "dask", *command], cwd=folder, stderr=subprocess.DEVNULL
         )
@@ -60,11 +60,18 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         while not (file.exists() and file.read_text(encoding="utf-8")):
             assert time.monotonic() < deadline, "the scheduler does not start"
             time.sleep(0.1)
-        yield json.loads(file.read_text(encoding="utf-8"))["address"]
+        yield json.loads(file.read_text(encoding="utf-8"))["address"], processes
     finally:
-        for process in started:
+        for process in processes:
             process.kill()
             process.wait()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A scheduler and two workers of one thread each, in processes of their own."""
+    with started(tmp_path_factory.mktemp("cluster"), 2) as (address, _):
+        yield address
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +137,35 @@ def test_cluster_that_loses_a_worker_leaves_what_a_local_run_leaves(
     assert report.failures == expected.failures
     assert list(report.failures) == [DAMAGED]
     assert hdf5_contents(tmp_path / "cluster") == hdf5_contents(tmp_path / "local")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("number", "harm", "said"), [
+    (1, signal.SIGKILL, "the cluster has no workers any more; start some with 'dask worker"),
+    (1, signal.SIGSTOP, "none of the 1 workers is heard of any more; start some with"),
+    (0, signal.SIGSTOP, "the scheduler does not answer any more; start 'dask scheduler'"),
+    (0, signal.SIGKILL, "the scheduler was lost; start it"),
+])  # fmt: skip
+def test_cluster_that_is_lost_ends_the_run_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, harm: signal.Signals, said: str
+) -> None:
+    for name, seconds in (("SILENT_S", 3.0), ("WARN_AFTER_S", 0.5), ("GIVE_UP_AFTER_S", 3.0)):
+        monkeypatch.setattr(cluster_watch, name, seconds)
+    with started(tmp_path, 1) as (address, processes):
+        start, found = time.monotonic(), 0
+
+        def work() -> None:
+            nonlocal found
+            with connected(address) as cluster:
+                for _ in cluster.map(time.sleep, [0.3] * 1000):
+                    found += 1
+                    if found == 3:
+                        processes[number].send_signal(harm)
+
+        with pytest.raises(AffrectError, match=said):
+            work()
+        assert 3 <= found < 10
+        assert time.monotonic() - start < 60
 
 
 def test_files_that_workers_do_not_see_are_named(photos: Path, address: str) -> None:

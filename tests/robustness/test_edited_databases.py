@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import random
 import shutil
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from command import Call, on_photographs
-from damaged import Harm, cut, damage, execute, noise
+from damaged import PAGE_BYTES, Harm, cut, damage, execute, noise
 from results import database_content, model_names, results
 from small_scene import write_photographs
 
 from colmap_affrect.cli import main
 from colmap_affrect.colmap.database import image_ids
+from colmap_affrect.colmap.tables import damage_of, rows_digest
+from colmap_affrect.project.outputs import database_files
+from colmap_affrect.project.record import stamp_of
 from colmap_affrect.project.workspace import Workspace
 
 LAST_PAIR = "pair_id = (SELECT max(pair_id) FROM matches)"
@@ -91,10 +96,70 @@ def test_what_the_stores_hold_is_made_again(
     why, kept = "was changed since the last run", out / "database.changed.db"
     if case == "missing":
         why, kept = "is missing", out / "database.db"
+    if case in ("noise", "cut"):
+        assert "database.db: cannot be used (" in warning
+        why = warning.partition("database.db: ")[2].partition("; it is")[0]
     assert f"database.db: {why}; it is made again from features.h5 and matches.h5" in warning
     assert kept.exists()
     assert results(out) == results(finished / "out")
     assert again("run") == again("map") == []
+
+
+def harm(path: Path, name: str) -> None:
+    """Fill the first page of an index, or a table, with zeros."""
+    with closing(sqlite3.connect(path)) as connection:
+        query = "SELECT rootpage FROM sqlite_master WHERE name = ?"
+        (number,) = connection.execute(query, (name,)).fetchone()
+    data = bytearray(path.read_bytes())
+    data[(number - 1) * PAGE_BYTES : number * PAGE_BYTES] = bytes(PAGE_BYTES)
+    path.write_bytes(data)
+
+
+INDICES = (
+    "sqlite_autoindex_images_1", "index_name", "rig_ref_sensor_assignment",
+    "rig_sensor_assignment", "frame_sensor_assignment", "pose_prior_data_assignment",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("index", INDICES)
+def test_damaged_index_is_found_and_made_again(
+    finished: Path, out: Path, again: Again, index: str
+) -> None:
+    path = out / "database.db"
+    before = rows_digest(path)
+    harm(path, index)
+    assert rows_digest(path) == before  # the rows do not show it
+    (warning,) = again("map" if index == "index_name" else "run")
+    assert "database.db: cannot be used (damaged" in warning
+    assert "made again from features.h5 and matches.h5" in warning
+    assert not damage_of(path)
+    assert results(out) == results(finished / "out")
+    assert again("run") == []
+
+
+def test_damage_that_came_meanwhile_is_mended_by_the_next_command(out: Path, call: Call) -> None:
+    """A file with the stamp of its seal is not looked through: COLMAP stumbles over the damage."""
+    path, seal = out / "database.db", out / "database.db.seal"
+    harm(path, "sqlite_autoindex_images_1")
+    harm(path, "two_view_geometries")
+    seal.write_text(f"{seal.read_text().splitlines()[0]}\n{stamp_of(database_files(path)[:2])}\n")
+    first, second = (call("map", "--output-path", out, "--overwrite") for _ in range(2))
+    assert (first.code, len(first.errors)) == (1, 1)
+    assert str(path) in first.errors[0]
+    assert second.code == 0
+    assert "it is made again from features.h5" in second.stderr[0]
+    assert not damage_of(path)
+
+
+@pytest.mark.parametrize("table", ["images", "frame_data", "keypoints"])
+def test_map_makes_a_damaged_database_again(
+    finished: Path, out: Path, again: Again, table: str
+) -> None:
+    """What it takes as it is are changes of other programs, which leave it whole."""
+    harm(out / "database.db", table)
+    (warning,) = again("map")
+    assert "database.db: cannot be used (" in warning
+    assert database_content(out / "database.db") == database_content(finished / "out/database.db")
 
 
 def test_database_that_was_touched_or_left_by_a_killed_command_is_used(

@@ -28,6 +28,8 @@ ROWS = [
     ("UPDATE matches SET data = x'ffffffffffffffff', rows = 1", "at which COLMAP crashes"),
     ("UPDATE two_view_geometries SET qvec = zeroblob(32), tvec = NULL", "(qvec and tvec of pair"),
     ("UPDATE cameras SET width = 'wide'", "damaged"),
+    ("UPDATE rigs SET ref_sensor_type = 1", "frames that hold images twice, or of other cameras"),
+    ("INSERT INTO rig_sensors VALUES (1, 5, 1, NULL)", "sensors of rigs whose place in the rig"),
 ]
 """What is done to a database, and what is said of it; more kinds are in the tests of checks."""
 
@@ -65,7 +67,8 @@ def test_hostile_rows_are_one_line(
     execute(path, statement)
     before = path.read_bytes()
     commands = [["map"], ["extract", "--image-path", healthy.parent / "photos"]]
-    for command in commands if "cameras" in statement or "images" in statement else commands[:1]:
+    is_of_images = any(table in statement for table in ("cameras", "images", "rig"))
+    for command in commands if is_of_images else commands[:1]:
         out = ["--output-path", path.parent / "out", "--from-database", path]
         ended = call(*command, "-q", *out)
         assert (ended.code, len(ended.stderr)) == (1, 1)
@@ -148,3 +151,26 @@ def test_random_matches_are_rejected(
                 write_matches(database, image_id - 1, image_id, same)
     verify(path, VerificationOptions())
     assert verified_pairs(path, 1) == {}
+
+
+def test_database_without_images_is_one_line(healthy: Path, path: Path, call: Call) -> None:
+    execute(path, *(f"DELETE FROM {table}" for table in ("images", "keypoints", "frame_data")))
+    execute(path, "DELETE FROM matches", "DELETE FROM two_view_geometries")
+    photos, out = healthy.parent / "photos", path.with_name("out")
+    for command in ("run", "extract"):
+        given = ["--image-path", photos, "--output-path", out, "--from-database", path]
+        ended = call(command, "-q", *given)
+        assert (ended.code, len(ended.stderr)) == (1, 1)
+        assert ended.stderr[0] == f"error: {path}: holds no images; import some first"
+        assert not out.exists()
+
+
+def test_triggers_of_a_received_database_do_nothing(healthy: Path, path: Path, call: Call) -> None:
+    for table in ("keypoints", "images", "frames"):
+        execute(
+            path, f"CREATE TRIGGER t{table} AFTER INSERT ON {table} BEGIN DELETE FROM images; END"
+        )
+    out = path.with_name("out")
+    given = ["--image-path", healthy.parent / "photos", "--output-path", out]
+    assert call("extract", "-q", *given, "--from-database", path, *FAST[:2]).code == 0
+    assert read_names(out / "database.db") == read_names(healthy)

@@ -14,7 +14,7 @@ from synthetic import write_image
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, nearest_positions, open_database
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages import pairs as stage
@@ -148,6 +148,26 @@ def test_nearest_positions_take_cartesian_ones_and_images_without(rooms: Workspa
     positions = {"1.png": (0.0, 0.0, 0.0), "2.png": (3.0, 4.0, 9.0), "3.png": (0.0, 20.0, 0.0)}
     write_positions(rooms.database, positions, CARTESIAN)
     assert nearest_positions(rooms.database, 5, 5.1) == [("1.png", "2.png")]
+
+
+def test_positions_that_are_none_on_earth_do_not_count(
+    rooms: Workspace, caplog: pytest.LogCaptureFixture
+) -> None:
+    nowhere = (0.0, 0.0, 0.0)
+    positions = {"1.png": (50.0, 14.0, 0.0), "2.png": nowhere, "3.png": nowhere}
+    write_positions(rooms.database, {**positions, "4.png": (50.0, 14.001, 0.0)})
+    stage.choose_pairs(Context(rooms), PairOptions(methods=("gps",)))
+    assert rooms.pairs.read_text().splitlines() == ["1.png 4.png"]
+    assert "2.png (latitude 0, longitude 0: no position was known)" in caplog.text
+    assert "gps: 2 of 4 photographs were not taken within 100 m of another one" in caplog.text
+
+
+def test_no_pair_by_gps_is_an_error(rooms: Workspace) -> None:
+    far = {"1.png": (50.0, 14.0, 0.0), "2.png": (96.0, 14.0, 0.0), "3.png": (14.0, 50.0, 0.0)}
+    write_positions(rooms.database, far)
+    with pytest.raises(AffrectError, match="by its position no photograph was taken within 100 m"):
+        stage.choose_pairs(Context(rooms), PairOptions(methods=("gps",)))
+    assert not rooms.pairs.exists()
 
 
 @pytest.mark.parametrize(("values", "named"), [

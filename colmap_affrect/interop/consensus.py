@@ -1,0 +1,63 @@
+"""Which places agree with each other, where some of them may be wrong."""
+
+import itertools
+import math
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.arrays import Array, Bools
+
+MAX_NUM_TRIPLES = 500  # similarities that are tried, each by three places
+GROSS = 5.0  # times the median residual: beyond is no error of measuring any more
+SMALL_SAMPLE = 5.0  # few places fit too well by chance, of which the median says too little
+FAR_BEYOND = 10.0  # times how far three places spread is the fourth, if these alone tell it
+
+
+def residuals(new_from_old: pycolmap.Sim3d, before: Array, after: Array) -> Array:
+    """Return how far (N, 3) places are from where they should be, (N,)."""
+    moved = np.array([new_from_old * point for point in before])
+    return np.asarray(np.linalg.norm(moved - after, axis=1))
+
+
+def agreeing(before: Array, after: Array, floor: float) -> Bools:
+    """Return which places one similarity moves to where they should be, (N,).
+
+    The similarity with the smallest median residual counts, so that up to half of the places may be
+    wrong; but one more than the three that give it must agree. Of four places, where there is
+    none, one may be wrong that is far beyond the others. Of three and fewer all agree.
+
+    Args:
+        before: (N, 3) places in a model.
+        after: (N, 3) where they should be.
+        floor: a residual up to which a place agrees in any case, in the unit of ``after``.
+    """
+    count = len(before)
+    agree = np.ones(count, np.bool_)
+    if count < 4:
+        return agree
+    rank = 2 if count == 4 else max(count // 2, 3)  # of the residual that counts
+    best = np.full(count, np.inf)
+    for triple in _triples(count):
+        found = pycolmap.estimate_sim3d(before[triple], after[triple])
+        if found is None:
+            continue
+        off = residuals(found, before, after)
+        if np.isfinite(off).all() and np.sort(off)[rank] < np.sort(best)[rank]:
+            best = off
+    median = float(np.sort(best)[rank])
+    if not math.isfinite(median):
+        return agree
+    if count == 4:
+        three = after[np.argsort(best)[:3]]
+        floor = max(floor, FAR_BEYOND * float(np.ptp(three, axis=0).max()))
+    most = max(floor, GROSS * median * (1.0 + SMALL_SAMPLE / (count - 3)))
+    return np.asarray(best <= most)
+
+
+def _triples(count: int) -> list[list[int]]:
+    """Return triples of different numbers below ``count``: all, or as many by chance."""
+    if math.comb(count, 3) <= MAX_NUM_TRIPLES:
+        return [list(triple) for triple in itertools.combinations(range(count), 3)]
+    rng = np.random.default_rng(0)
+    return [rng.choice(count, 3, replace=False).tolist() for _ in range(MAX_NUM_TRIPLES)]
