@@ -5,6 +5,7 @@ import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks, SizeOf
 from colmap_affrect.colmap.cameras import read_camera_records
@@ -26,6 +27,7 @@ from colmap_affrect.progress import SILENT, Forecast, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, TakesPaths, as_path
 from colmap_affrect.project.report import (
+    ModelSummary,
     ReconstructionReport,
     StageReport,
     installed_versions,
@@ -251,8 +253,8 @@ def map_and_report(
     verified = num_verified_inliers(context)
     pair_inliers = {pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)}
     missing = unregistered(context, names, models, pair_inliers)
-    cameras = read_camera_records(workspace.cameras)
     again = matched_again(context)
+    strongest = max(pair_inliers.values(), default=0)
     result = ReconstructionReport(
         images_total=len(names),
         unregistered=missing,
@@ -266,19 +268,9 @@ def map_and_report(
         verification=context.verification.to_mapping(),
         mapping=options.to_mapping(),
         guided={} if copied else guided_counts(context),
-        cameras=tuple(
-            record.to_report(camera_id, models[0] if models else None)
-            for camera_id, record in cameras.items()
-        ),
+        cameras=_cameras_of(workspace, models),
         extended=tuple(before),
-        advice=advice(
-            context,
-            missing,
-            models,
-            max(pair_inliers.values(), default=0),
-            again.untried,
-            again.effort,
-        ),
+        advice=advice(context, missing, models, strongest, again.untried, again.effort),
         by_hand=context.by_hand.texts(),
         effort=again.effort if again.tried or again.untried else "",
         matched_again=again.tried,
@@ -293,6 +285,13 @@ def map_and_report(
             workspace, result, names, pair_inliers, image_path, progress, marks=marks, looks=looks
         )
     return result
+
+
+def _cameras_of(workspace: Workspace, models: Sequence[ModelSummary]) -> tuple[dict[str, Any], ...]:
+    """Return what a report has of the cameras, as the largest model has them."""
+    largest = models[0] if models else None
+    records = read_camera_records(workspace.cameras)
+    return tuple(record.to_report(camera_id, largest) for camera_id, record in records.items())
 
 
 def _names_and_gone(context: Context, *, may_be_gone: bool) -> tuple[list[str], list[str]]:

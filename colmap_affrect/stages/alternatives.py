@@ -49,7 +49,7 @@ def score(models: Sequence[ModelSummary]) -> float:
     (1.5, 3.0, 0.0)
     """
     expected = (sum(model.probabilities.values()) - 1.0 for model in models)
-    return sum(max(0.0, number) for number in expected)
+    return sum((max(0.0, number) for number in expected), 0.0)
 
 
 def present_score(context: Context) -> float:
