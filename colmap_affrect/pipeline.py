@@ -18,6 +18,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
+from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
@@ -38,12 +39,13 @@ from colmap_affrect.stages.climb import climb
 from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
 from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.map import image_names, map_images, unregistered
 from colmap_affrect.stages.match import load_matchers, match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
-from colmap_affrect.stages.verify import copy_verified, num_verified_inliers, verify_matches
+from colmap_affrect.stages.verify import num_verified_inliers, verify_matches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +175,10 @@ def map_from_database(
     output_path: PathLike,
     *,
     image_path: PathLike | None = None,
+    cameras: CameraOptions | None = None,
+    matches_path: PathLike | None = None,
+    match_type: MatchType = "raw",
+    match_list_path: PathLike | None = None,
     mapping: MapperOptions | None = None,
     verification: VerificationOptions | None = None,
     extend: Extension | None = None,
@@ -183,8 +189,24 @@ def map_from_database(
 ) -> ReconstructionReport:
     """Map a database of any program; it is copied and stays as it is.
 
-    Pairs without two-view geometry are verified. ``image_path`` is the folder of the photographs,
-    for the colours of the points; see :func:`run` for all else.
+    Pairs without two-view geometry are verified; where no images are matched, they are matched by
+    their descriptors.
+
+    Args:
+        database_path: the database.
+        output_path: folder for all results, made if missing.
+        image_path: folder of the photographs, for the colours of the points.
+        cameras: what is known of the cameras of its images; which images share one stays.
+        matches_path: a file of matches (:mod:`colmap_affrect.pairs.given_matches`).
+        match_type: what it has, ``raw`` matches or ``inliers``.
+        match_list_path: pairs to match by descriptors; None: all.
+        mapping: the mapper and its options.
+        verification: of pairs that are not verified.
+        extend: a model that the images are registered into.
+        by_hand: tie points, wrong pairs, photographs to leave out.
+        overwrite: discard results that are there.
+        page: also write ``report.html``.
+        progress: where to show progress.
     """
     database_path, output_path = as_path(database_path), as_path(output_path)
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
@@ -193,11 +215,19 @@ def map_from_database(
     if extend:
         read_given_model(extend.model_path, "--extend ")
     _check_by_hand(by_hand, read_names(database_path), mapper)
+    foreign = ForeignDatabase(
+        database_path,
+        as_path(image_path) if image_path else None,
+        cameras or CameraOptions(),
+        as_path(matches_path) if matches_path else None,
+        match_type,
+        as_path(match_list_path) if match_list_path else None,
+    )
+    foreign.check()
     context = Context(Workspace(output_path), progress=progress, by_hand=by_hand)
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()
-        photos = as_path(image_path) if image_path else None
-        report = copy_verified(context, database_path, photos, chosen, overwrite=overwrite)
+        report = copy_verified(context, foreign, chosen, overwrite=overwrite)
         return map_and_report(context, mapper, extend, earlier=[report], page=page)
 
 

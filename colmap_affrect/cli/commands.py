@@ -103,6 +103,10 @@ def map(options: argparse.Namespace) -> None:
             options.from_database,
             options.output_path,
             image_path=options.image_path,
+            cameras=given.over(CameraOptions(), options, "cameras"),
+            matches_path=options.matches_path,
+            match_type=options.match_type or "raw",
+            match_list_path=options.match_list_path,
             mapping=given.mapping(options),
             verification=given.verification(options),
             extend=extend,
@@ -110,9 +114,8 @@ def map(options: argparse.Namespace) -> None:
             progress=given.progress(options),
             **how,
         )
-    elif options.image_path:
-        raise OptionError("--image-path: only with --from-database; else that of extract is used")
     else:
+        given.refuse_without_database(options)
         with given.context(options) as context:
             mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
             report = pipeline.map_and_report(context, mapper, extend, **how)
@@ -170,6 +173,8 @@ def import_h5(options: argparse.Namespace) -> None:
         options.features_path,
         options.matches_path,
         options.database_path,
+        match_type=options.match_type or "raw",
+        match_list_path=options.match_list_path,
         cameras=given.over(CameraOptions(), options, "cameras"),
         random_seed=options.random_seed or 0,
         progress=given.progress(options),

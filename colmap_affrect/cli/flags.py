@@ -171,6 +171,13 @@ FLAGS: dict[str, Settings] = {
     "--output-path@photographs": _path("PATH", "new folder for them", dest="target_path"),
     "--features-path": _path("FILE", "HDF5 file of features"),
     "--matches-path": _path("FILE", "HDF5 file of matches"),
+    "--matches-path@given": _path("FILE", "matches of hloc or deep-image-matching (HDF5), or a "
+        "list of COLMAP's matches_importer (default: those of the database, else images are "
+        "matched by their descriptors)"),
+    "--match-type": _value("TYPE", "what --matches-path has: raw matches, or inliers, which are "
+        "taken for verified (default: raw)", choices=["raw", "inliers"]),
+    "--match-list-path@given": _path("FILE", "pairs to match by their descriptors, where there are "
+        "no matches (default: all pairs)", dest="match_list_path"),
     "--database-path": _path("FILE", "the database to make; must not exist"),
     "--database-path@read": _path("FILE", "any COLMAP database; a copy of it is read"),
     "--colmap": _value("VERSION", "whose tables to write; COLMAP 3.8 to 3.13 read those of 3.8",

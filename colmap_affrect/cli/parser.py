@@ -110,13 +110,15 @@ def _add(parser: argparse.ArgumentParser, word: str) -> list[str]:
 VOLUME = "-q,--quiet|-v,--verbose"  # of all commands
 RESULTS = "--output-path! --overwrite"
 MASKS = "--mask-path --camera-mask-path"
-CAMERAS = """--camera-mode --camera-model --camera-params --cameras-path --focal-length-px
-    --focal-mm --film-width-mm --principal-point --ignore-exif"""
+KNOWN_CAMERAS = """--camera-model --camera-params --cameras-path --focal-length-px
+    --focal-mm --film-width-mm --principal-point"""
+CAMERAS = f"--camera-mode {KNOWN_CAMERAS} --ignore-exif"
 IMAGES = f"--image-path! --image-list-path {MASKS} --from-database {CAMERAS} --max-failures"
 RECIPE = "--recipe --set"
 PAIRS = "--match-list-path --pairs --num-neighbors --max-distance-m"
 NETWORKS = "--weights --device"
 MAPPER = "--preset --mapper --mapper-options"
+GIVEN_MATCHES = "--matches-path@given --match-type --match-list-path@given"
 BY_HAND = "--tie-points --reject-pair --leave-out"
 MODEL = f"--extend --refine-existing {BY_HAND} --random-seed --json --no-page"
 
@@ -130,7 +132,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "match": ("matches into matches.h5 and database.db", f"{RESULTS} --set {NETWORKS} --scheduler"),
     "verify": ("two-view geometries into database.db", f"{RESULTS} --preset --random-seed"),
     "map": ("COLMAP models into sparse/",
-        f"{RESULTS} --from-database@map --image-path@map {MAPPER} {MODEL}"),
+        f"{RESULTS} --from-database@map --image-path@map {GIVEN_MATCHES} {KNOWN_CAMERAS} {MAPPER} "
+        f"{MODEL}"),
     "compare": (
         "how many photographs, and which, COLMAP's SIFT and recipes register; with pictures",
         f"{RESULTS} {IMAGES} --methods --seeds --ground-truth-path --depth-path {NETWORKS} "
@@ -148,9 +151,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "show-pair": (
         "draw two photographs side by side, with lines between what was matched",
         "path pair --image-path@pair --output-path@pair"),
-    "import-h5": ("features and matches in hloc's files into a new COLMAP database",
-        "--image-path! --features-path! --matches-path! --database-path! "
-        f"{CAMERAS} --random-seed"),
+    "import-h5": (
+        "features, and perhaps matches, of hloc and others into a new COLMAP database",
+        f"--image-path! --features-path! {GIVEN_MATCHES} --database-path! {CAMERAS} --random-seed"),
     "export-h5": ("features and matches of any COLMAP database for hloc",
         "--database-path@read! --features-path! --matches-path!"),
     "export-database": (

@@ -157,7 +157,7 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
 
     def codes(lines: Iterable[str]) -> Iterator[int]:
         for count, line in enumerate(lines, start=1):
-            pair = _split(line.rstrip("\n"), number) or _split(line.strip(), number)
+            pair = split_line(line.rstrip("\n"), number) or split_line(line.strip(), number)
             if pair:
                 low, high = sorted((number[pair[0]], number[pair[1]]))
                 if low < high:
@@ -196,7 +196,7 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
     replace_text(path, (f"{first}{separator}{second}\n" for first, second in pairs))
 
 
-def _split(line: str, known: Collection[str]) -> Pair | None:
+def split_line(line: str, known: Collection[str]) -> Pair | None:
     """Return the two names of a line, either of which may hold separators."""
     for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
         for match in re.finditer(separator, line):
