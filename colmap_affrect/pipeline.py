@@ -111,7 +111,7 @@ def run(
     names = inputs.names()  # refuses what cannot be read before anything is made
     _check_extension(options.extend, mapper, output_path, overwrite=overwrite)
     _check_by_hand(options.by_hand, names, mapper)
-    forecast = Forecast(len(names), _num_pairs(names, options.pairs))
+    forecast = Forecast(len(names), _num_pairs(names, options.pairs, image_path))
     until_s, workspace = time.monotonic() + 60 * options.max_minutes, Workspace(output_path)
     given = options.by_hand, options.command
     shown = replace(progress, forecast=forecast)
@@ -161,10 +161,10 @@ def _check_extension(
         extend.refuse_discarding(output_path)
 
 
-def _num_pairs(names: Sequence[str], options: PairOptions) -> int:
+def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> int:
     """Return about how many pairs there will be."""
     if options.match_list_path:
-        return len(read_pairs(Path(options.match_list_path), names))
+        return len(read_pairs(Path(options.match_list_path), names, image_path))
     count = math.comb(len(names), 2)
     is_all = "exhaustive" in options.methods
     return count if is_all else min(count, len(names) * options.num_neighbors)

@@ -113,7 +113,8 @@ FLAGS: dict[str, Settings] = {
         "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
     "--database-descriptors": _switch(
         "descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers"),
-    "--match-list-path": _path("FILE", "pairs to match, two names per line (default: all pairs)",
+    "--match-list-path": _path("FILE", "pairs to match, two names, or paths, per line, and perhaps "
+        "a score (default: all pairs)",
         dest="pairs.match_list_path"),
     "--pairs": _value("A,B,...", "which pairs to match, all of: exhaustive, retrieval "
         "(photographs that are alike), gps (near to each other), sequence (following by name); "

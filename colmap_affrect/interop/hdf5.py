@@ -95,6 +95,7 @@ class _Wanted:
     matches_path: Path | None  # None: images are matched by their descriptors
     match_type: MatchType
     match_list_path: Path | None  # pairs to match; None: all
+    image_path: Path
     verification: VerificationOptions | None  # None: pairs stay unverified
 
 
@@ -146,6 +147,7 @@ def import_h5(
         as_path(matches_path) if matches_path else None,
         match_type,
         as_path(match_list_path) if match_list_path else None,
+        image_path,
         None if skip_verification else VerificationOptions(random_seed=random_seed),
     )
     return _import(image_path, features_path, database_path, cameras, wanted, progress)
@@ -229,7 +231,7 @@ def _matches(
         )
     names = sorted(keys)
     if wanted.match_list_path:
-        pairs: Sequence[Pair] = read_pairs(wanted.match_list_path, names)
+        pairs: Sequence[Pair] = read_pairs(wanted.match_list_path, names, wanted.image_path)
     else:
         pairs = exhaustive_pairs(names)
 

@@ -94,7 +94,7 @@ class ForeignDatabase(TakesPaths):
         names = read_names(self.path)
         self.initial_cameras().check_known(names, str(self.path))
         if self.match_list_path:
-            read_pairs(self.match_list_path, names)
+            read_pairs(self.match_list_path, names, self.image_path)
 
     def initial_cameras(self) -> InitialCameras:
         """Return the cameras that the user gives."""
@@ -185,7 +185,9 @@ def _match(context: Context, foreign: ForeignDatabase) -> None:
             f"{foreign.path}: has no matches, nor descriptors to match by; match its images first, "
             "or give --matches-path"
         )
-    pairs = read_pairs(foreign.match_list_path, names) if foreign.match_list_path else None
+    pairs = None
+    if foreign.match_list_path:
+        pairs = read_pairs(foreign.match_list_path, names, foreign.image_path)
     num = match_database(path, pairs, progress=context.progress)
     if num:
         logger.warning("%s: has no matches; %d pairs are matched now", foreign.path, num)

@@ -76,7 +76,9 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
         pairs |= {pair for pair in near if known.issuperset(pair)}
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
-        listed = lists.read_pairs(Path(options.match_list_path), context.inputs.names())
+        listed = lists.read_pairs(
+            Path(options.match_list_path), context.inputs.names(), Path(context.inputs.image_path)
+        )
         pairs |= {pair for pair in listed if known.issuperset(pair)}
     return pairs
 
