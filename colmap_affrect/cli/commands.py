@@ -210,7 +210,12 @@ def export_database(options: argparse.Namespace) -> None:
 
 def export(options: argparse.Namespace) -> None:
     written = exporting.export(
-        options.model_path, options.target_path, options.format, image_path=options.image_path
+        options.model_path,
+        options.target_path,
+        options.format,
+        image_path=options.image_path,
+        camera_model=options.camera_model or "",
+        note=show,
     )
     for name, path in written.items():
         show(f"{name:11s} {path}")

@@ -192,8 +192,10 @@ FLAGS: dict[str, Settings] = {
         dest="target_path"),
     "--format": _value("A,B,...", "ply (points), text (COLMAP's), undistorted (photographs and "
         "model, for dense reconstruction), nerfstudio (the same with transforms.json, for "
-        "Gaussian splatting too), cameras (CSV) "
+        "Gaussian splatting too), mvsnet (the same with the model as text), cameras (CSV) "
         "(default: ply,text,cameras)", type=words, default=("ply", "text", "cameras")),
+    "--camera-model@export": _value("MODEL", "COLMAP camera model of text and cameras, fitted to "
+        "the cameras, e.g. RADIAL for OpenSfM (default: their own)", dest="camera_model"),
     "--image-path@export": _path("PATH",
         "folder of the photographs, to undistort them (default: that of the run)"),
     "--output-path@model": _path("MODEL", "folder for the new model, in metres; must not exist",

@@ -161,7 +161,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "path database_path --colmap --descriptors"),
     "export": (
         "a model for other programs: points, text, undistorted photographs, tables",
-        "--model-path! --output-path@files! --format --image-path@export"),
+        "--model-path! --output-path@files! --format --camera-model@export --image-path@export"),
     "align": ("give a model its scale and place, by GPS, control points or a distance",
         "--model-path! --output-path@model! --gps|--positions|--points --distance"),
     "doctor": (

@@ -79,7 +79,7 @@ def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> Non
 
 
 @cache
-def _known_model(name: str) -> str:
+def known_model(name: str) -> str:
     """Refuse what is no camera model of COLMAP with a focal length."""
     models = [
         model
@@ -110,7 +110,7 @@ class GivenCamera(Options):
     """Of the image; empty for all others."""
     camera: str = ""
     """Label; images with the same one share a camera."""
-    model: Annotated[str, pydantic.AfterValidator(_known_model)]
+    model: Annotated[str, pydantic.AfterValidator(known_model)]
     params: Annotated[tuple[pydantic.FiniteFloat, ...], pydantic.BeforeValidator(_split)] = ()
     focal_px: Positive | None = None
     focal_mm: Positive | None = None

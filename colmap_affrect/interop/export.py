@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,14 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.interop.camera_models import with_camera_model
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.workspace import Workspace
+
+logger = logging.getLogger(__name__)
 
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
@@ -45,12 +49,25 @@ def export(
     formats: Sequence[str],
     *,
     image_path: PathLike | None = None,
+    camera_model: str = "",
+    note: Callable[[str], None] = logger.info,
 ) -> dict[str, Path]:
-    """Write a COLMAP model in some of ``FORMATS``; return what was written by format.
+    """Write a COLMAP model in some formats.
 
-    The output folder is made if missing; nothing in it is overwritten. ``image_path`` has the
-    photographs to undistort, by default those of the run that made the model. Raises AffrectError
-    when a format cannot hold the model, or a file exists; nothing is written then.
+    Args:
+        model_path: folder of the model.
+        output_path: made if missing; nothing in it is overwritten.
+        formats: some of ``FORMATS``.
+        image_path: folder of the photographs to undistort; None: that of the run that made the
+            model.
+        camera_model: of ``text`` and ``cameras``, fitted to the cameras; empty: their own.
+        note: is told how well that fits.
+
+    Returns:
+        What was written, by format.
+
+    Raises:
+        AffrectError: when a format cannot hold the model, or a file exists; nothing is written.
     """
     model_path, output_path = as_path(model_path), as_path(output_path)
     image_path = as_path(image_path) if image_path else None
@@ -61,6 +78,8 @@ def export(
         raise OptionError(f"--image-path {image_path}: no such folder")
     photographs = image_path or Workspace(model_path.resolve().parent.parent).photographs()
     source = Source(model_path, read_given_model(model_path), photographs)
+    if camera_model:
+        _change_cameras(source.model, camera_model, formats, note)
     chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
     names = dict.fromkeys(made for _, made in chosen.values())
     targets = [output_path / name for name in names]
@@ -69,6 +88,18 @@ def export(
         folder = made[0].parent
         written = {name: write(source, folder) for name, (write, _) in chosen.items()}
     return {name: output_path / path.relative_to(folder) for name, path in written.items()}
+
+
+def _change_cameras(
+    model: pycolmap.Reconstruction, name: str, formats: Sequence[str], note: Callable[[str], None]
+) -> None:
+    if not {"text", "cameras"}.intersection(formats):
+        raise OptionError("--camera-model: changes 'text' and 'cameras'; give one of these formats")
+    before = {key: camera.model_name for key, camera in model.cameras.items()}
+    differences_px = with_camera_model(model, name)
+    for old in sorted({before[key] for key in differences_px}):
+        largest = max(px for key, px in differences_px.items() if before[key] == old)
+        note(f"cameras: {name} in the place of {old}, at most {largest:.3f} px apart")
 
 
 def _points(source: Source, folder: Path) -> Path:
@@ -137,6 +168,13 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     return path / "transforms.json"
 
 
+def _mvsnet(source: Source, folder: Path) -> Path:
+    """Add to undistorted photographs their model as text, as MVSNet's programs read it."""
+    path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
+    pycolmap.Reconstruction(path / "sparse").write_text(path / "sparse")
+    return path
+
+
 def _place(source: Source) -> dict[str, Any]:
     """Return what instant-ngp puts into its unit cube, centred on the points, and where up is.
 
@@ -183,6 +221,7 @@ FORMATS: dict[str, tuple[Callable[[Source, Path], Path], str]] = {
     "text": (_text, "text"),
     "undistorted": (_undistorted, DENSE),
     "nerfstudio": (_nerfstudio, DENSE),  # comes after ``undistorted``, whose folder it uses
+    "mvsnet": (_mvsnet, DENSE),
     "cameras": (_cameras, "cameras.csv"),
 }
 """What writes each format into a folder, and what it leaves there."""
