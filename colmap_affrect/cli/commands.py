@@ -25,10 +25,11 @@ from colmap_affrect.evaluation.evaluate import EvaluateOptions
 from colmap_affrect.evaluation.truths import ScoreOptions
 from colmap_affrect.features import weights as files
 from colmap_affrect.images.conversion import convert_images
-from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs, list_images
 from colmap_affrect.interop import align as aligning
 from colmap_affrect.interop import export as exporting
 from colmap_affrect.interop import hdf5
+from colmap_affrect.interop import panoramas as panorama_views
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
 from colmap_affrect.progress import SILENT, Progress, show
@@ -180,6 +181,21 @@ def import_h5(options: argparse.Namespace) -> None:
         progress=given.progress(options),
     )
     show(report.summary())
+
+
+def panoramas(options: argparse.Namespace) -> None:
+    models = panorama_views.reconstruct_panoramas(
+        options.image_path,
+        options.target_path,
+        order=options.order,
+        random_seed=options.random_seed or 0,
+        progress=given.progress(options),
+    )
+    num_all = len(list_images(options.image_path))
+    for number, model in models.items():
+        where = options.target_path / "sparse_equirectangular" / str(number)
+        show(f"registered  {model.num_reg_images()} of {num_all} panoramas, {where}")
+    show(f"views       {options.target_path / 'sparse'}, with {options.target_path / 'images'}")
 
 
 def export_h5(options: argparse.Namespace) -> None:

@@ -151,6 +151,12 @@ FLAGS: dict[str, Settings] = {
         "map this COLMAP database of any program, verified or matched; it is copied"),
     "--image-path@map": _path("PATH",
         "folder of its photographs, for the colours of the points (with --from-database)"),
+    # panoramas
+    "--output-path@new": _path("PATH", "new folder for views and models, or that of a run that was "
+        "interrupted, which goes on", dest="target_path"),
+    "--order": _value("ORDER", "match panoramas that follow each other by name (sequence), or all "
+        "(exhaustive) (default: sequence)", choices=["sequence", "exhaustive"],
+        default="sequence"),
     # comparison and evaluation
     "--methods": _value("A,B,...", "sift-colmap (all as COLMAP does it by default), sift "
         "(with our preset), recipes by name or path; "

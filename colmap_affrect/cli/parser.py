@@ -23,6 +23,7 @@ EXAMPLES = (
     "evaluate evd --dataset-path EVD --output-path out \\\n"
     "      --recipes unrectified-rootsift,rectified,default",
     "convert --image-path scans --output-path photos",
+    "panoramas --image-path panoramas --output-path out",
     "inspect photos/a.jpg --output-path out",
     "show-pair out a.jpg b.jpg",
     "show-pair any.db a.jpg b.jpg --image-path photos --output-path pair.png",
@@ -145,6 +146,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "convert": (
         "a folder of photographs in formats that COLMAP reads: JPEG 2000, WebP, HEIC, pages",
         "--image-path! --output-path@photographs!"),
+    "panoramas": (
+        "panoramas of 360 x 180 degrees, by views of them, into COLMAP models",
+        "--image-path! --output-path@new! --order --random-seed"),
     "inspect": (
         "draw what a recipe does to one image: regions, warps, features",
         f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),

@@ -61,6 +61,22 @@ def test_rig_is_mapped_and_judged_with_few_evaluations(
     assert 0 < evaluated < most
 
 
+def test_image_of_a_rig_that_sees_next_to_nothing_is_as_sure_as_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize_rig(path)
+    with open_database(path) as database:
+        blind = {i.image_id for i in database.read_all_images() if i.camera_id == 2}
+        for pair_id in database.read_two_view_geometry_num_inliers()[0]:
+            ids = pycolmap.pair_id_to_image_pair(pair_id)
+            if blind.intersection(ids):
+                database.delete_two_view_geometry(*ids)
+    task = MappingTask(path, None)
+    (model,) = map_database(mapper_of("incremental"), task, tmp_path / "sparse", lambda _: None)
+    assert len(model.registered_names) == 12
+    assert min(model.probabilities.values()) > 0.9
+    assert not model.taken_out
+
+
 def test_first_pairs_are_of_two_frames_as_long_as_there_are_any(tmp_path: Path) -> None:
     synthesize_rig(tmp_path / "database.db")
     graph = PairGraph.read(tmp_path / "database.db")
