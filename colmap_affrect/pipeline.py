@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks
-from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
 from colmap_affrect.colmap.database_copy import read_names, schema_version
 from colmap_affrect.colmap.model_files import read_given_model
@@ -231,6 +231,12 @@ def map_from_database(
         return map_and_report(context, mapper, extend, earlier=[report], page=page)
 
 
+def _extended(record: CameraRecord, before: Sequence[str]) -> CameraRecord:
+    """Say of a camera that nobody knew but the model that is extended that it is from there."""
+    is_known = record.source == "guess" and not set(before).isdisjoint(record.names)
+    return replace(record, source="model", lens_mm=0.0) if is_known else record
+
+
 def map_and_report(
     context: Context,
     mapper: Mapper,
@@ -268,7 +274,7 @@ def map_and_report(
         mapping=options.to_mapping(),
         guided={} if copied else guided_counts(context),
         cameras=tuple(
-            record.to_report(camera_id, models[0] if models else None)
+            _extended(record, before).to_report(camera_id, models[0] if models else None)
             for camera_id, record in cameras.items()
         ),
         extended=tuple(before),

@@ -22,8 +22,9 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.tables import read_table
 
-Source = Literal["given", "exif", "exif-rescaled", "guess"]
-"""By the user; by EXIF as it is, or scaled to a photograph that was shrunk; or COLMAP's guess."""
+Source = Literal["given", "exif", "exif-rescaled", "guess", "model"]
+"""By the user; by EXIF as it is, or scaled to a photograph that was shrunk; COLMAP's guess; or, in
+reports only, of a model that is extended."""
 Given = Literal["focal", "principal-point", "distortion"]
 """Parts of intrinsics; a model without distortion counts as given once its focal length is."""
 TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
@@ -40,6 +41,7 @@ class CameraRecord:
     why: str = ""  # what was decided and for what reason, one clause
     size: tuple[int, int] = (0, 0)  # (width, height) of its images in px
     given: tuple[Given, ...] = ()  # what of the intrinsics is the user's, to be left as it is
+    lens_mm: float = 0.0  # by EXIF, where nothing tells the size of the sensor, and so the px
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that a model ended with."""
@@ -54,6 +56,7 @@ class CameraRecord:
             "focal_longer_sides": self.focal_px / longer if longer else None,
             "refined_px": model.focals_px[used] if model and used else None,
             "why": self.why,
+            "lens_mm": self.lens_mm,
         }
 
     @property

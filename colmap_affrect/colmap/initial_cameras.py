@@ -193,8 +193,9 @@ class InitialCameras:
             why = "a panorama, which no camera model fits? give the photographs that it is made of"
         if source == "given" and focal and not low <= focal / longer <= high:
             why = f"{focal / longer:.2g} longer sides; is it in px of the stored files?"
+        lens_mm = self._exif_focal(names).lens_mm if source == "guess" else 0.0
         return camera, CameraRecord(
-            tuple(sorted(names)), source, focal, why=why, size=size, given=tuple(parts)
+            tuple(sorted(names)), source, focal, why, size, tuple(parts), lens_mm
         )
 
     def _set_focal(

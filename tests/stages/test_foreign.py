@@ -163,6 +163,26 @@ def test_cameras_that_do_not_fit_are_refused_before_anything_is_made(
     assert not (tmp_path / "out").exists()
 
 
+def test_cameras_of_a_model_that_is_extended_are_not_called_unknown(
+    verified: Path, tmp_path: Path
+) -> None:
+    with open_database(verified) as database:
+        first = database.read_all_images()[0]
+    model = tmp_path / "first" / "sparse" / "0"
+    colmap_affrect.map_from_database(verified, tmp_path / "first", page=False)
+    found = pycolmap.Reconstruction(model)
+    found.deregister_frame(found.find_image_with_name(first.name).frame_id)
+    (tmp_path / "old").mkdir()
+    found.write(tmp_path / "old")
+    extension = colmap_affrect.Extension(tmp_path / "old")
+    report = colmap_affrect.map_from_database(
+        verified, tmp_path / "out", extend=extension, page=False
+    )
+    assert report.added == (first.name,)
+    line = "focal lengths: 3 of the model that is extended, 1 not known beforehand"
+    assert line in report.summary()
+
+
 def test_what_is_given_beside_a_database_is_on_record_and_comes_back(tmp_path: Path) -> None:
     given = ForeignDatabase(
         tmp_path / "any.db", tmp_path, CameraOptions(focal_length_px=7.0), tmp_path / "m.h5",
