@@ -32,6 +32,8 @@ from colmap_affrect.pipeline import run as run
 from colmap_affrect.project.report import ReconstructionReport as ReconstructionReport
 from colmap_affrect.recipes import ExtractionOptions as ExtractionOptions
 from colmap_affrect.recipes import load_recipe as load_recipe
+from colmap_affrect.stages.descriptors import match_descriptors as match_descriptors
+from colmap_affrect.stages.descriptors import match_feature_sets as match_feature_sets
 
 __version__: str
 PYCOLMAP_CAME_FIRST: bool

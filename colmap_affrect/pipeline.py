@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks, SizeOf
-from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
 from colmap_affrect.colmap.model_files import read_given_model
@@ -21,6 +21,7 @@ from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.options import EFFORT_NAMES, EffortName
+from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
@@ -42,12 +43,13 @@ from colmap_affrect.stages.climb import climb
 from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.escalate import escalate, matched_again
 from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
 from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.map import image_names, map_images, unregistered
 from colmap_affrect.stages.match import load_matchers, match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
-from colmap_affrect.stages.verify import copy_verified, num_verified_inliers, verify_matches
+from colmap_affrect.stages.verify import num_verified_inliers, verify_matches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +124,7 @@ def run(
     names = inputs.names()  # refuses what cannot be read before anything is made
     _check_extension(options.extend, mapper, output_path, overwrite=overwrite)
     _check_by_hand(options.by_hand, names, mapper, lambda name: header_size(image_path / name))
-    forecast = Forecast(len(names), _num_pairs(names, options.pairs))
+    forecast = Forecast(len(names), _num_pairs(names, options.pairs, image_path))
     workspace = Workspace(output_path)
     context = _context_of(workspace, options, executor, replace(progress, forecast=forecast))
     if options.extend:
@@ -187,10 +189,10 @@ def _check_extension(
         extend.refuse_discarding(output_path)
 
 
-def _num_pairs(names: Sequence[str], options: PairOptions) -> int:
+def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> int:
     """Return about how many pairs there will be."""
     if options.match_list_path:
-        return len(read_pairs(Path(options.match_list_path), names))
+        return len(read_pairs(Path(options.match_list_path), names, image_path))
     count = math.comb(len(names), 2)
     is_all = "exhaustive" in options.methods
     return count if is_all else min(count, len(names) * options.num_neighbors)
@@ -201,6 +203,10 @@ def map_from_database(
     output_path: PathLike,
     *,
     image_path: PathLike | None = None,
+    cameras: CameraOptions | None = None,
+    matches_path: PathLike | None = None,
+    match_type: MatchType = "raw",
+    match_list_path: PathLike | None = None,
     mapping: MapperOptions | None = None,
     verification: VerificationOptions | None = None,
     extend: Extension | None = None,
@@ -211,8 +217,24 @@ def map_from_database(
 ) -> ReconstructionReport:
     """Map a database of any program; it is copied and stays as it is.
 
-    Pairs without two-view geometry are verified. ``image_path`` is the folder of the photographs,
-    for the colours of the points; see :func:`run` for all else.
+    Pairs without two-view geometry are verified; where no images are matched, they are matched by
+    their descriptors.
+
+    Args:
+        database_path: the database.
+        output_path: folder for all results, made if missing.
+        image_path: folder of the photographs, for the colours of the points.
+        cameras: what is known of the cameras of its images; which images share one stays.
+        matches_path: a file of matches (:mod:`colmap_affrect.pairs.given_matches`).
+        match_type: what it has, ``raw`` matches or ``inliers``.
+        match_list_path: pairs to match by descriptors; None: all.
+        mapping: the mapper and its options.
+        verification: of pairs that are not verified.
+        extend: a model that the images are registered into.
+        by_hand: tie points, wrong pairs, photographs to leave out.
+        overwrite: discard results that are there.
+        page: also write ``report.html``.
+        progress: where to show progress.
     """
     database_path, output_path = as_path(database_path), as_path(output_path)
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
@@ -222,12 +244,26 @@ def map_from_database(
         read_given_model(extend.model_path, "--extend ")
     sizes = read_sizes(database_path)
     _check_by_hand(by_hand, read_names(database_path), mapper, sizes.get)
+    foreign = ForeignDatabase(
+        database_path,
+        as_path(image_path) if image_path else None,
+        cameras or CameraOptions(),
+        as_path(matches_path) if matches_path else None,
+        match_type,
+        as_path(match_list_path) if match_list_path else None,
+    )
+    foreign.check()
     context = Context(Workspace(output_path), progress=progress, by_hand=by_hand)
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()
-        photos = as_path(image_path) if image_path else None
-        report = copy_verified(context, database_path, photos, chosen, overwrite=overwrite)
+        report = copy_verified(context, foreign, chosen, overwrite=overwrite)
         return map_and_report(context, mapper, extend, earlier=[report], page=page)
+
+
+def _extended(record: CameraRecord, before: Sequence[str]) -> CameraRecord:
+    """Say of a camera that nobody knew but the model that is extended that it is from there."""
+    is_known = record.source == "guess" and not set(before).isdisjoint(record.names)
+    return replace(record, source="model", lens_mm=0.0) if is_known else record
 
 
 def map_and_report(
@@ -268,7 +304,7 @@ def map_and_report(
         verification=context.verification.to_mapping(),
         mapping=options.to_mapping(),
         guided={} if copied else guided_counts(context),
-        cameras=_cameras_of(workspace, models),
+        cameras=_cameras_of(workspace, models, before),
         extended=tuple(before),
         advice=advice(context, missing, models, strongest, again.untried, again.effort),
         by_hand=context.by_hand.texts(),
@@ -287,11 +323,21 @@ def map_and_report(
     return result
 
 
-def _cameras_of(workspace: Workspace, models: Sequence[ModelSummary]) -> tuple[dict[str, Any], ...]:
-    """Return what a report has of the cameras, as the largest model has them."""
+def _cameras_of(
+    workspace: Workspace, models: Sequence[ModelSummary], before: Sequence[str]
+) -> tuple[dict[str, Any], ...]:
+    """Return what a report has of the cameras, as the largest model has them.
+
+    Args:
+        workspace: with the record of the cameras.
+        models: the largest first.
+        before: names of the images of the model that was extended.
+    """
     largest = models[0] if models else None
-    records = read_camera_records(workspace.cameras)
-    return tuple(record.to_report(camera_id, largest) for camera_id, record in records.items())
+    found = list[dict[str, Any]]()
+    for camera_id, record in read_camera_records(workspace.cameras).items():
+        found.append(_extended(record, before).to_report(camera_id, largest))
+    return tuple(found)
 
 
 def _names_and_gone(context: Context, *, may_be_gone: bool) -> tuple[list[str], list[str]]:

@@ -25,10 +25,11 @@ from colmap_affrect.evaluation.evaluate import EvaluateOptions
 from colmap_affrect.evaluation.truths import ScoreOptions
 from colmap_affrect.features import weights as files
 from colmap_affrect.images.conversion import convert_images
-from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs, list_images
 from colmap_affrect.interop import align as aligning
 from colmap_affrect.interop import export as exporting
 from colmap_affrect.interop import hdf5
+from colmap_affrect.interop import panoramas as panorama_views
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
 from colmap_affrect.progress import SILENT, Progress, show
@@ -104,6 +105,10 @@ def map(options: argparse.Namespace) -> None:
             options.from_database,
             options.output_path,
             image_path=options.image_path,
+            cameras=given.over(CameraOptions(), options, "cameras"),
+            matches_path=options.matches_path,
+            match_type=options.match_type or "raw",
+            match_list_path=options.match_list_path,
             mapping=given.mapping(options),
             verification=given.verification(options),
             extend=extend,
@@ -111,9 +116,8 @@ def map(options: argparse.Namespace) -> None:
             progress=given.progress(options),
             **how,
         )
-    elif options.image_path:
-        raise OptionError("--image-path: only with --from-database; else that of extract is used")
     else:
+        given.refuse_without_database(options)
         with given.context(options) as context:
             mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
             report = pipeline.map_and_report(context, mapper, extend, **how)
@@ -171,11 +175,28 @@ def import_h5(options: argparse.Namespace) -> None:
         options.features_path,
         options.matches_path,
         options.database_path,
+        match_type=options.match_type or "raw",
+        match_list_path=options.match_list_path,
         cameras=given.over(CameraOptions(), options, "cameras"),
         random_seed=options.random_seed or 0,
         progress=given.progress(options),
     )
     show(report.summary())
+
+
+def panoramas(options: argparse.Namespace) -> None:
+    models = panorama_views.reconstruct_panoramas(
+        options.image_path,
+        options.target_path,
+        order=options.order,
+        random_seed=options.random_seed or 0,
+        progress=given.progress(options),
+    )
+    num_all = len(list_images(options.image_path))
+    for number, model in models.items():
+        where = options.target_path / "sparse_equirectangular" / str(number)
+        show(f"registered  {model.num_reg_images()} of {num_all} panoramas, {where}")
+    show(f"views       {options.target_path / 'sparse'}, with {options.target_path / 'images'}")
 
 
 def export_h5(options: argparse.Namespace) -> None:
@@ -206,7 +227,12 @@ def export_database(options: argparse.Namespace) -> None:
 
 def export(options: argparse.Namespace) -> None:
     written = exporting.export(
-        options.model_path, options.target_path, options.format, image_path=options.image_path
+        options.model_path,
+        options.target_path,
+        options.format,
+        image_path=options.image_path,
+        camera_model=options.camera_model or "",
+        note=show,
     )
     for name, path in written.items():
         show(f"{name:11s} {path}")

@@ -130,7 +130,8 @@ FLAGS: dict[str, Settings] = {
         "depth maps named as the images: a/b.jpg has a/b.npy, .png or .tif"),
     "--database-descriptors": _switch(
         "descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers"),
-    "--match-list-path": _path("FILE", "pairs to match, two names per line (default: all pairs)",
+    "--match-list-path": _path("FILE", "pairs to match, two names, or paths, per line, and perhaps "
+        "a score (default: all pairs)",
         dest="pairs.match_list_path"),
     "--pairs": _value("A,B,...", "which pairs to match, all of: exhaustive, retrieval "
         "(photographs that are alike), gps (near to each other), sequence (following by name); "
@@ -168,6 +169,12 @@ FLAGS: dict[str, Settings] = {
         "map this COLMAP database of any program, verified or matched; it is copied"),
     "--image-path@map": _path("PATH",
         "folder of its photographs, for the colours of the points (with --from-database)"),
+    # panoramas
+    "--output-path@new": _path("PATH", "new folder for views and models, or that of a run that was "
+        "interrupted, which goes on", dest="target_path"),
+    "--order": _value("ORDER", "match panoramas that follow each other by name (sequence), or all "
+        "(exhaustive) (default: sequence)", choices=["sequence", "exhaustive"],
+        default="sequence"),
     # comparison and evaluation
     "--methods": _value("A,B,...", "sift-colmap (all as COLMAP does it by default), sift "
         "(with our preset), recipes by name or path; "
@@ -189,6 +196,13 @@ FLAGS: dict[str, Settings] = {
     "--output-path@photographs": _path("PATH", "new folder for them", dest="target_path"),
     "--features-path": _path("FILE", "HDF5 file of features"),
     "--matches-path": _path("FILE", "HDF5 file of matches"),
+    "--matches-path@given": _path("FILE", "matches of hloc or deep-image-matching (HDF5), or a "
+        "list of COLMAP's matches_importer (default: those of the database, else images are "
+        "matched by their descriptors)"),
+    "--match-type": _value("TYPE", "what --matches-path has: raw matches, or inliers, which are "
+        "taken for verified (default: raw)", choices=["raw", "inliers"]),
+    "--match-list-path@given": _path("FILE", "pairs to match by their descriptors, where there are "
+        "no matches (default: all pairs)", dest="match_list_path"),
     "--database-path": _path("FILE", "the database to make; must not exist"),
     "--database-path@read": _path("FILE", "any COLMAP database; a copy of it is read"),
     "--colmap": _value("VERSION", "whose tables to write; COLMAP 3.8 to 3.13 read those of 3.8",
@@ -203,8 +217,10 @@ FLAGS: dict[str, Settings] = {
         dest="target_path"),
     "--format": _value("A,B,...", "ply (points), text (COLMAP's), undistorted (photographs and "
         "model, for dense reconstruction), nerfstudio (the same with transforms.json, for "
-        "Gaussian splatting too), cameras (CSV) "
+        "Gaussian splatting too), mvsnet (the same with the model as text), cameras (CSV) "
         "(default: ply,text,cameras; no text where names have blanks)", type=words, default=()),
+    "--camera-model@export": _value("MODEL", "COLMAP camera model of text and cameras, fitted to "
+        "the cameras, e.g. RADIAL for OpenSfM (default: their own)", dest="camera_model"),
     "--image-path@export": _path("PATH",
         "folder of the photographs, to undistort them (default: that of the run)"),
     "--output-path@model": _path("MODEL", "folder for the new model, in metres; must not exist",

@@ -55,6 +55,19 @@ def inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[st
     }
 
 
+def refuse_without_database(options: argparse.Namespace) -> None:
+    """Refuse what is only for the database of another program."""
+    if options.image_path:
+        raise OptionError("--image-path: only with --from-database; else that of extract is used")
+    cameras = over(CameraOptions(), options, "cameras")
+    given = options.matches_path, options.match_type, options.match_list_path
+    if cameras != CameraOptions() or any(given):
+        raise OptionError(
+            "matches and cameras are given with --from-database; of own photographs, extract and "
+            "match take them"
+        )
+
+
 def extension(options: argparse.Namespace) -> Extension | None:
     if options.refine_existing and not options.extend:
         raise OptionError("--refine-existing: only with --extend MODEL")

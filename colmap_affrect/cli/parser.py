@@ -24,6 +24,7 @@ EXAMPLES = (
     "evaluate evd --dataset-path EVD --output-path out \\\n"
     "      --recipes unrectified-rootsift,rectified,default",
     "convert --image-path scans --output-path photos",
+    "panoramas --image-path panoramas --output-path out",
     "inspect photos/a.jpg --output-path out",
     "show-pair out a.jpg b.jpg",
     "show-pair any.db a.jpg b.jpg --image-path photos --output-path pair.png",
@@ -126,13 +127,15 @@ def _add(parser: argparse.ArgumentParser, word: str) -> list[str]:
 VOLUME = "-q,--quiet|-v,--verbose"  # of all commands
 RESULTS = "--output-path! --overwrite"
 MASKS = "--mask-path --camera-mask-path"
-CAMERAS = """--camera-mode --camera-model --camera-params --cameras-path --focal-length-px
-    --focal-mm --film-width-mm --principal-point --ignore-exif"""
+KNOWN_CAMERAS = """--camera-model --camera-params --cameras-path --focal-length-px
+    --focal-mm --film-width-mm --principal-point"""
+CAMERAS = f"--camera-mode {KNOWN_CAMERAS} --ignore-exif"
 IMAGES = f"--image-path! --image-list-path {MASKS} --from-database {CAMERAS} --max-failures"
 RECIPE = "--recipe --set"
 PAIRS = "--match-list-path --pairs --num-neighbors --max-distance-m"
 NETWORKS = "--weights --device"
 MAPPER = "--preset --mapper --mapper-options"
+GIVEN_MATCHES = "--matches-path@given --match-type --match-list-path@given"
 BY_HAND = "--tie-points --reject-pair --leave-out"
 MODEL = f"--extend --refine-existing {BY_HAND} --random-seed --json --no-page"
 
@@ -146,7 +149,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "match": ("matches into matches.h5 and database.db", f"{RESULTS} --set {NETWORKS} --scheduler"),
     "verify": ("two-view geometries into database.db", f"{RESULTS} --preset --random-seed"),
     "map": ("COLMAP models into sparse/",
-        f"{RESULTS} --from-database@map --image-path@map {MAPPER} {MODEL}"),
+        f"{RESULTS} --from-database@map --image-path@map {GIVEN_MATCHES} {KNOWN_CAMERAS} {MAPPER} "
+        f"{MODEL}"),
     "compare": (
         "how many photographs, and which, COLMAP's SIFT and recipes register; with pictures",
         f"{RESULTS} {IMAGES} --methods --seeds --ground-truth-path --depth-path {NETWORKS} "
@@ -158,15 +162,18 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "convert": (
         "a folder of photographs in formats that COLMAP reads: JPEG 2000, WebP, HEIC, pages",
         "--image-path! --output-path@photographs!"),
+    "panoramas": (
+        "panoramas of 360 x 180 degrees, by views of them, into COLMAP models",
+        "--image-path! --output-path@new! --order --random-seed"),
     "inspect": (
         "draw what a recipe does to one image: regions, warps, features",
         f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),
     "show-pair": (
         "draw two photographs side by side, with lines between what was matched",
         "path pair --image-path@pair --output-path@pair"),
-    "import-h5": ("features and matches in hloc's files into a new COLMAP database",
-        "--image-path! --features-path! --matches-path! --database-path! "
-        f"{CAMERAS} --random-seed"),
+    "import-h5": (
+        "features, and perhaps matches, of hloc and others into a new COLMAP database",
+        f"--image-path! --features-path! {GIVEN_MATCHES} --database-path! {CAMERAS} --random-seed"),
     "export-h5": ("features and matches of any COLMAP database for hloc",
         "--database-path@read! --features-path! --matches-path!"),
     "export-database": (
@@ -174,7 +181,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "path database_path --colmap --descriptors"),
     "export": (
         "a model for other programs: points, text, undistorted photographs, tables",
-        "--model-path! --output-path@files! --format --image-path@export"),
+        "--model-path! --output-path@files! --format --camera-model@export --image-path@export"),
     "align": ("give a model its scale and place, by GPS, control points or a distance",
         "--model-path! --output-path@model! --gps|--positions|--points --distance"),
     "doctor": (

@@ -23,8 +23,9 @@ from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.tables import read_table
 
-Source = Literal["given", "exif", "exif-rescaled", "guess"]
-"""By the user; by EXIF as it is, or scaled to a photograph that was shrunk; or COLMAP's guess."""
+Source = Literal["given", "exif", "exif-rescaled", "guess", "model"]
+"""By the user; by EXIF as it is, or scaled to a photograph that was shrunk; COLMAP's guess; or, in
+reports only, of a model that is extended."""
 Given = Literal["focal", "principal-point", "distortion"]
 """Parts of intrinsics; a model without distortion counts as given once its focal length is."""
 TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
@@ -41,6 +42,7 @@ class CameraRecord:
     why: str = ""  # what was decided and for what reason, one clause
     size: tuple[int, int] = (0, 0)  # (width, height) of its images in px
     given: tuple[Given, ...] = ()  # what of the intrinsics is the user's, to be left as it is
+    lens_mm: float = 0.0  # by EXIF, where nothing tells the size of the sensor, and so the px
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that a model ended with."""
@@ -55,6 +57,7 @@ class CameraRecord:
             "focal_longer_sides": self.focal_px / longer if longer else None,
             "refined_px": model.focals_px[used] if model and used else None,
             "why": self.why,
+            "lens_mm": self.lens_mm,
         }
 
     @property
@@ -80,7 +83,7 @@ def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> Non
 
 
 @cache
-def _known_model(name: str) -> str:
+def known_model(name: str) -> str:
     """Refuse what is no camera model of COLMAP with a focal length."""
     models = [
         model
@@ -111,7 +114,7 @@ class GivenCamera(Options):
     """Of the image; empty for all others."""
     camera: str = ""
     """Label; images with the same one share a camera."""
-    model: Annotated[str, pydantic.AfterValidator(_known_model)]
+    model: Annotated[str, pydantic.AfterValidator(known_model)]
     params: Annotated[tuple[pydantic.FiniteFloat, ...], pydantic.BeforeValidator(_split)] = ()
     focal_px: Positive | None = None
     focal_mm: Positive | None = None

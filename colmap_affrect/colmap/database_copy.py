@@ -207,3 +207,12 @@ def read_sizes(source: Path) -> dict[str, tuple[int, int]]:
     query = "SELECT name, width, height FROM images JOIN cameras USING (camera_id)"
     with open_read_only(source) as connection:
         return {str(name): (width, height) for name, width, height in connection.execute(query)}
+
+
+def has_matches(source: Path) -> bool:
+    """Tell whether any pair of a database, which is only read, has matches or a geometry."""
+    with open_read_only(source) as connection:
+        rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        tables = {"matches", "two_view_geometries", "inlier_matches"} & {name for (name,) in rows}
+        queries = [f"SELECT EXISTS (SELECT 1 FROM {name} WHERE rows > 0)" for name in tables]  # noqa: S608
+        return any(connection.execute(query).fetchone()[0] for query in queries)

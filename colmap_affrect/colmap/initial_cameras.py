@@ -104,10 +104,7 @@ class InitialCameras:
         OptionError names the option, or file and line, and what to do.
         """
         unknown = [n for n in self._given if n and not (self.image_path / n).is_file()]
-        is_model = any(given.size for given in self._given.values())  # of more images, perhaps
-        if unknown and not (is_model and self._given.keys() & set(names)):
-            given = self.given(unknown[0])
-            raise OptionError(f"{given.where}: {unknown[0]} is not in {self.image_path}")
+        self._refuse(unknown, names, str(self.image_path))
         for group, same in self.groups(names).items():
             given = self._given_of(same)
             sizes = {name: size for name in same if (size := self.size(name))}
@@ -122,6 +119,45 @@ class InitialCameras:
                         f"{who}: {first} is {expected[0]} x {expected[1]} px, {name} is {size[0]} "
                         f"x {size[1]} px; images that share a camera must have its size"
                     )
+
+    def check_known(self, names: Sequence[str], where: str) -> None:
+        """Refuse cameras of images that are not among some, unless a model has more images."""
+        known = set(names)
+        self._refuse([n for n in self._given if n and n not in known], names, where)
+
+    def _refuse(self, unknown: Sequence[str], names: Sequence[str], where: str) -> None:
+        """Refuse cameras of unknown images; a model may have more images."""
+        is_model = any(given.size for given in self._given.values())
+        if unknown and not (is_model and self._given.keys() & set(names)):
+            given = self.given(unknown[0])
+            raise OptionError(f"{given.where}: {unknown[0]} is not in {where}")
+
+    def replace_cameras(self, database: pycolmap.Database) -> dict[int, CameraRecord]:
+        """Write what the user gives into the cameras that images of a database have.
+
+        Which images share a camera stays as it is, and of a camera whose focal length alone is
+        given, model and distortion. Returns the records of these cameras.
+        """
+        names: defaultdict[int, list[str]] = defaultdict(list)
+        for image in database.read_all_images():
+            names[image.camera_id].append(image.name)
+        records = {}
+        for camera_id, same in sorted(names.items()):
+            given, before = self._given_of(same), database.read_camera(camera_id)
+            size = (before.width, before.height)
+            if not (given.params or given.focal_px or given.focal_mm or self.options.focal_mm):
+                continue
+            if given.size and tuple(given.size) != size:
+                raise OptionError(
+                    f"{given.where}: is {given.size[0]} x {given.size[1]} px, and {same[0]} is "
+                    f"{size[0]} x {size[1]} px in the database"
+                )
+            camera, records[camera_id] = self.camera(sorted(same), size)
+            if not given.params and given.model == CameraOptions().model:
+                camera = _with_focal(before, camera, has_center=given.cx is not None)
+            camera.camera_id = camera_id
+            database.update_camera(camera)
+        return records
 
     def _given_of(self, names: Sequence[str]) -> GivenCamera:
         named = [self._given[name] for name in names if name in self._given]
@@ -157,8 +193,9 @@ class InitialCameras:
             why = "a panorama, which no camera model fits? give the photographs that it is made of"
         if source == "given" and focal and not low <= focal / longer <= high:
             why = f"{focal / longer:.2g} longer sides; is it in px of the stored files?"
+        lens_mm = self._exif_focal(names).lens_mm if source == "guess" else 0.0
         return camera, CameraRecord(
-            tuple(sorted(names)), source, focal, why=why, size=size, given=tuple(parts)
+            tuple(sorted(names)), source, focal, why, size, tuple(parts), lens_mm
         )
 
     def _set_focal(
@@ -212,6 +249,19 @@ class InitialCameras:
             return None
         same = self.groups(names).get(self.group(name), [name])
         return camera_matrix(self.camera(same, size)[0])
+
+
+def _with_focal(
+    camera: pycolmap.Camera, given: pycolmap.Camera, *, has_center: bool
+) -> pycolmap.Camera:
+    """Return a camera with the focal length of another one, and perhaps its principal point."""
+    for index in camera.focal_length_idxs():
+        camera.params[index] = given.mean_focal_length()
+    if has_center:
+        camera.principal_point_x = given.principal_point_x
+        camera.principal_point_y = given.principal_point_y
+    camera.has_prior_focal_length = given.has_prior_focal_length
+    return camera
 
 
 @cache

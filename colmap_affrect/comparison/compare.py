@@ -54,7 +54,7 @@ def compare(
     methods = parse_methods(options.methods)
     inputs, names = _checked(image_path, options)
     listed = options.pairs.match_list_path
-    pairs = list(read_pairs(Path(listed), names)) if listed else exhaustive_pairs(names)
+    pairs = list(read_pairs(Path(listed), names, image_path)) if listed else exhaustive_pairs(names)
     truth = _ground_truth(options.ground_truth_path, names)
     options = replace(options, mapping=MAPPERS.make(options.mapping).options)
     same = _same_for_all(inputs, names, pairs, options)

@@ -221,7 +221,8 @@ class MethodRun:
             advance(len(names))
         taken, pairs = list(image_ids(self.database)), None
         if listed := self.options.pairs.match_list_path:
-            pairs = [p for p in read_pairs(Path(listed), names) if set(taken) >= set(p)]
+            known = read_pairs(Path(listed), names, self.image_path)
+            pairs = [pair for pair in known if set(taken) >= set(pair)]
         num_pairs = math.comb(len(taken), 2) if pairs is None else len(pairs)
         with watch.step("match"), progress.stage("match", num_pairs, "pairs") as advance:
             match_sift(self.database, pairs)

@@ -10,7 +10,6 @@ import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices
 from colmap_affrect.geometry.conventions import pixel_from_colmap, resized_from_original
-from colmap_affrect.geometry.two_views import homogeneous
 
 Size = tuple[int, int]
 
@@ -38,32 +37,48 @@ def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], err
         for points in (points1, points2)
     ]
     zooms = {1.0, spreads[1] / spreads[0]} if min(spreads) else {1.0}
-    centers = [np.array(size) / 2 for size in sizes]
-    shares = (
-        _share_of(points1 - centers[0], points2 - centers[1], focal * max(sizes[0]), zoom, error)
-        for focal in FOCAL_LENGTHS
-        for zoom in zooms
-    )
-    return max(shares)
+    first = points1 - np.array(sizes[0]) / 2
+    second = points2 - np.array(sizes[1]) / 2
+    lenses = [(focal * max(sizes[0]), zoom) for focal in FOCAL_LENGTHS for zoom in sorted(zooms)]
+    return float(_shares_of(first, second, np.array(lenses), error).max())
 
 
-def _share_of(points1: Array, points2: Array, focal: float, zoom: float, error: float) -> float:
-    """Return the share of matches within ``error`` px of the best rotation."""
-    rays1, rays2 = _rays(points1 / focal), _rays(points2 / (focal * zoom))
+def _shares_of(points1: Array, points2: Array, lenses: Array, error: float) -> Array:
+    """Return the shares of matches within an error of the best rotation, for each lens.
+
+    Args:
+        points1: (N, 2) px from the middle of the first image.
+        points2: (N, 2) px from the middle of the second image.
+        lenses: (L, 2) focal lengths of the first image in px, and zooms of the second.
+        error: px in the second image.
+
+    Returns:
+        (L,) shares.
+    """
+    focals1 = lenses[:, 0]
+    focals2 = lenses[:, 0] * lenses[:, 1]
+    rays1 = _rays(points1 / focals1[:, None, None])  # (L, N, 3)
+    rays2 = _rays(points2 / focals2[:, None, None])
+    columns1 = np.ascontiguousarray(np.swapaxes(rays1, -1, -2))
 
     def errors_of(rotations: Array) -> Array:
-        turned = rays1 @ np.swapaxes(rotations, -1, -2)
-        depths = np.maximum(turned[..., 2:], MIN_DEPTH)
-        moved = turned[..., :2] / depths * focal * zoom - points2
-        return np.asarray(np.linalg.norm(moved, axis=-1))
+        """Return (L, S, N) px for (L, S, 3, 3) rotations."""
+        rows = rotations.reshape(len(lenses), -1, 3)  # one product is ten times as fast as many
+        turned = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
+        scales = focals2[:, None, None] / np.maximum(turned[..., 2, :], MIN_DEPTH)
+        shifts_x = turned[..., 0, :] * scales - points2[:, 0]
+        shifts_y = turned[..., 1, :] * scales - points2[:, 1]
+        return np.asarray(np.sqrt(shifts_x**2 + shifts_y**2))
 
-    picked = np.random.default_rng(0).integers(len(rays1), size=(NUM_STARTS, 2))
-    started = errors_of(_rotations(rays1[picked], rays2[picked]))
-    errors = started[np.median(started, axis=1).argmin()]
+    picked = np.random.default_rng(0).integers(len(points1), size=(NUM_STARTS, 2))
+    started = errors_of(_rotations(rays1[:, picked], rays2[:, picked]))
+    best = np.median(started, axis=2).argmin(axis=1)
+    errors = started[np.arange(len(lenses)), best]
     for _ in range(MAX_ITERATIONS):
-        kept = errors <= max(error, float(np.median(errors)))
-        errors = errors_of(_rotations(rays1[kept], rays2[kept]))
-    return float((errors <= error).mean())
+        kept = errors <= np.maximum(error, np.median(errors, axis=1))[:, None]
+        fitted = _rotations(rays1 * kept[..., None], rays2)
+        errors = errors_of(fitted[:, None])[:, 0]
+    return np.asarray((errors <= error).mean(axis=1))
 
 
 def _rotations(rays1: Array, rays2: Array) -> Array:
@@ -74,8 +89,8 @@ def _rotations(rays1: Array, rays2: Array) -> Array:
 
 
 def _rays(points: Array) -> Array:
-    rays = homogeneous(points)
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    rays = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 
 def _some(points: Array) -> Array:

@@ -67,6 +67,7 @@ class ExifFocal:
     focal_px: float | None  # of the stored file; None if EXIF does not say or cannot be trusted
     is_rescaled: bool = False  # it is not the one that COLMAP would take
     why: str = ""  # what is wrong; empty if nothing
+    lens_mm: float = 0.0  # focal length of the lens, where nothing tells how large the sensor is
 
 
 def read_camera_tags(path: Path) -> CameraTags | None:
@@ -139,7 +140,9 @@ def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFo
     if not plausible:
         key, focal = next(iter(stated.items()), ("", 0.0))
         wrong = f"EXIF's {key} would be a focal length of {focal / longer:.2g} longer sides"
-        return ExifFocal(None, why=wrong if stated else "no EXIF focal length in px")
+        if stated:
+            return ExifFocal(None, why=wrong)
+        return ExifFocal(None, why="no EXIF focal length in px", lens_mm=tags.focal_mm or 0.0)
     return _reconciled(tags, stated, plausible)
 
 

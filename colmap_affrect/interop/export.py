@@ -16,6 +16,7 @@ from colmap_affrect.colmap.model_files import model_folder, read_given_model, wr
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
 from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
 from colmap_affrect.images.orientation import forget_orientation
+from colmap_affrect.interop.camera_models import with_camera_model
 from colmap_affrect.interop.finished_models import read_finished_model
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
@@ -52,17 +53,24 @@ def export(
     formats: Sequence[str] = (),
     *,
     image_path: PathLike | None = None,
+    camera_model: str = "",
+    note: Callable[[str], None] = logger.info,
 ) -> dict[str, Path]:
-    """Write a COLMAP model in some of ``FORMATS``; return what was written by format.
+    """Write a COLMAP model in some formats.
 
     The output folder is made if missing; nothing in it is overwritten.
 
     Args:
         model_path: folder of a model, or the output folder of a run, whose largest model it is.
         output_path: folder for the files.
-        formats: names of formats; by default those of ``USUAL``, without text where COLMAP could
+        formats: some of ``FORMATS``; by default those of ``USUAL``, without text where COLMAP could
             not read it back.
         image_path: the photographs to undistort, by default those of the run.
+        camera_model: of ``text`` and ``cameras``, fitted to the cameras; empty: their own.
+        note: is told how well that fits.
+
+    Returns:
+        What was written, by format.
 
     Raises:
         AffrectError: a format cannot hold the model, or a file exists; nothing is written then.
@@ -78,6 +86,8 @@ def export(
     source = Source(model_path, read_finished_model(model_path), photographs)
     if not formats:
         formats = _usual(source)
+    if camera_model:
+        _change_cameras(source.model, camera_model, formats, note)
     chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
     names = dict.fromkeys(made for _, made in chosen.values())
     targets = [output_path / name for name in names]
@@ -86,6 +96,18 @@ def export(
         folder = made[0].parent
         written = {name: write(source, folder) for name, (write, _) in chosen.items()}
     return {name: output_path / path.relative_to(folder) for name, path in written.items()}
+
+
+def _change_cameras(
+    model: pycolmap.Reconstruction, name: str, formats: Sequence[str], note: Callable[[str], None]
+) -> None:
+    if not {"text", "cameras"}.intersection(formats):
+        raise OptionError("--camera-model: changes 'text' and 'cameras'; give one of these formats")
+    before = {key: camera.model_name for key, camera in model.cameras.items()}
+    differences_px = with_camera_model(model, name)
+    for old in sorted({before[key] for key in differences_px}):
+        largest = max(px for key, px in differences_px.items() if before[key] == old)
+        note(f"cameras: {name} in the place of {old}, at most {largest:.3f} px apart")
 
 
 def _points(source: Source, folder: Path) -> Path:
@@ -192,6 +214,13 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     return path / "transforms.json"
 
 
+def _mvsnet(source: Source, folder: Path) -> Path:
+    """Add to undistorted photographs their model as text, as MVSNet's programs read it."""
+    path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
+    pycolmap.Reconstruction(path / "sparse").write_text(path / "sparse")
+    return path
+
+
 def _place(source: Source) -> dict[str, Any]:
     """Return what instant-ngp puts into its unit cube, centred on the points, and where up is.
 
@@ -238,6 +267,7 @@ FORMATS: dict[str, tuple[Callable[[Source, Path], Path], str]] = {
     "text": (_text, "text"),
     "undistorted": (_undistorted, DENSE),
     "nerfstudio": (_nerfstudio, DENSE),  # comes after ``undistorted``, whose folder it uses
+    "mvsnet": (_mvsnet, DENSE),
     "cameras": (_cameras, "cameras.csv"),
 }
 """What writes each format into a folder, and what it leaves there."""

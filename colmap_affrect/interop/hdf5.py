@@ -1,14 +1,14 @@
-"""Features and matches in hloc's HDF5 files, into and out of COLMAP databases.
+"""Features and matches in HDF5 files, into and out of COLMAP databases.
 
 Features: a group per image name, nested at '/', with ``keypoints`` (N, 2), ``descriptors`` (D, N),
 ``scores`` (N,), ``image_size`` (width, height), and perhaps ``scales`` (N,) in sigmas, ``oris``
-(N,) in degrees from x towards y, ``lafs`` (N, 2, 3). Matches: a group per pair with ``matches0``
-(N0,), -1 where unmatched, and ``matching_scores0`` (N0,); in its key each '/' of a name is '-', and
-'/' stands between the names. (0, 0) is the centre of the first pixel.
+(N,) in degrees from x towards y, ``lafs`` (N, 2, 3). deep-image-matching's files are read, too.
+Matches: see :mod:`colmap_affrect.pairs.given_matches`. (0, 0) is the centre of the first pixel.
 
 Links and data in other files are not followed, and arrays are checked.
 """
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,9 +29,10 @@ from colmap_affrect.colmap.checks import (
 )
 from colmap_affrect.colmap.database import (
     DESCRIPTOR_NORM,
+    DESCRIPTOR_SIZE,
     colmap_keypoints,
     open_database,
-    write_matches,
+    write_descriptors,
 )
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
@@ -41,28 +42,33 @@ from colmap_affrect.errors import (
     ImageError,
     OptionError,
     StoreError,
-    damage,
     such_as,
 )
-from colmap_affrect.geometry.arrays import Singles
+from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.geometry.conventions import (
     MEASUREMENT_SIGMAS,
     colmap_from_pixel,
     pixel_from_colmap,
 )
 from colmap_affrect.images.photographs import CameraOptions, list_images, refuse_colliding_keys
-from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.matchers.base import Matches
+from colmap_affrect.pairs.given_matches import (
+    GivenMatches,
+    MatchType,
+    given_matches,
+)
+from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.given_h5 import GivenFile, opened
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.stores import PairMatches, frame_datasets, hloc_matches, pair_key
+from colmap_affrect.stages.descriptors import Arrays, matched, unit_rows, write_given_matches
 
 Datasets = dict[str, NDArray[Any]]
 
-MAX_VALUES = 1 << 28  # an array of more values is taken for damage, and not read
 SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
-MEND = "make it again with the program that wrote it"
 
 
 @dataclass(frozen=True)
@@ -89,182 +95,257 @@ class InterchangeReport:
 
 
 @dataclass(frozen=True)
-class _Source:
-    """An open HDF5 file of another program, and the shapes of its datasets by their paths."""
+class _Wanted:
+    """What is imported beside keypoints."""
 
-    path: Path
-    file: h5py.File
-    shapes: dict[str, tuple[int, ...]]
-
-    def groups_with(self, dataset: str) -> list[str]:
-        """Return the sorted paths of the groups that have a dataset."""
-        ending = f"/{dataset}"
-        found = sorted(key.removesuffix(ending) for key in self.shapes if key.endswith(ending))
-        if self.shapes and not found:
-            raise StoreError(f"{self.path}: holds no '{dataset}' of images; is it a file of hloc?")
-        return found
-
-    def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
-        """Read numbers of some of numpy's kinds, of a shape in which None is any size."""
-        stored = self.shapes[key]
-        expected = tuple(stored[:1]) if shape[0] is None else shape[:1]
-        if stored != expected + shape[1:]:
-            wanted = str(shape).replace("None", "N")
-            raise StoreError(f"{self.path}: {key} has shape {stored}, expected {wanted}")
-        if np.prod([float(size) for size in stored]) > MAX_VALUES:
-            raise StoreError(f"{self.path}: {key} of shape {stored} is too large to be true")
-        with damage(self.path, MEND):
-            if self.file[key].dtype.kind not in kinds:
-                raise ValueError(f"{key} does not hold numbers, or no whole ones")
-            return np.asarray(self.file[key][()])
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[_Source]:
-    """Open a file for reading; of links nothing is seen, data that are elsewhere are refused."""
-    if not path.is_file():
-        raise OptionError(f"{path}: no such file")
-    shapes: dict[str, tuple[int, ...]] = {}
-
-    def visit(key: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Dataset):
-            if item.external or item.is_virtual:
-                raise StoreError(f"{path}: data in other files are not followed: {key}")
-            shapes[key] = item.shape or ()
-
-    with damage(path, f"or still being written; {MEND}"):
-        file = h5py.File(path, "r")
-        try:
-            file.visititems(visit)
-        except SystemError as error:  # h5py's, for a name that is no UTF-8
-            raise ValueError(error) from error
-    with file:
-        yield _Source(path, file, shapes)
+    matches_path: Path | None  # None: images are matched by their descriptors
+    match_type: MatchType
+    match_list_path: Path | None  # pairs to match; None: all
+    image_path: Path
+    verification: VerificationOptions | None  # None: pairs stay unverified
 
 
 def import_h5(
     image_path: PathLike,
     features_path: PathLike,
-    matches_path: PathLike,
+    matches_path: PathLike | None,
     database_path: PathLike,
     *,
+    match_type: MatchType = "raw",
+    match_list_path: PathLike | None = None,
     cameras: CameraOptions | None = None,
     skip_verification: bool = False,
     random_seed: int = 0,
     progress: Progress = SILENT,
 ) -> InterchangeReport:
-    """Make a new COLMAP database from features and matches in hloc's layout.
+    """Make a new COLMAP database from features and matches of other programs.
 
     Keypoints get 6 columns where the file has ``lafs``, 4 where it has ``scales`` and ``oris``,
-    else 2. All images of the folder are imported, with or without features. ``random_seed`` is that
-    of verification.
+    else 2. All images of the folder are imported, with or without features. Descriptors of 128
+    values are kept, as 8-bit SIFT.
 
-    Raises OptionError when the database exists, StoreError for files that cannot be read, or
-    contradict the photographs or each other.
+    Args:
+        image_path: folder of the photographs.
+        features_path: HDF5 file of features.
+        matches_path: file of matches (:mod:`colmap_affrect.pairs.given_matches`); None: images are
+            matched by their descriptors.
+        database_path: the database to make.
+        match_type: ``inliers`` are taken for verified.
+        match_list_path: without matches, the pairs to match; None: all.
+        cameras: who shares a camera, and what is known of it.
+        skip_verification: leave pairs unverified.
+        random_seed: of verification.
+        progress: where to show progress.
+
+    Returns:
+        Counts, and the names of what was left out.
+
+    Raises:
+        OptionError: when the database exists.
+        StoreError: for files that cannot be read, or contradict the photographs or each other.
     """
-    features_path, matches_path = map(as_path, (features_path, matches_path))
-    image_path, database_path = map(as_path, (image_path, database_path))
+    features_path, image_path = as_path(features_path), as_path(image_path)
+    database_path = as_path(database_path)
     cameras = cameras or CameraOptions()
+    if matches_path and match_list_path:
+        raise OptionError("--match-list-path: only without --matches-path: it says what to match")
+    wanted = _Wanted(
+        as_path(matches_path) if matches_path else None,
+        match_type,
+        as_path(match_list_path) if match_list_path else None,
+        image_path,
+        None if skip_verification else VerificationOptions(random_seed=random_seed),
+    )
+    return _import(image_path, features_path, database_path, cameras, wanted, progress)
+
+
+def _import(
+    image_path: Path,
+    features_path: Path,
+    database_path: Path,
+    cameras: CameraOptions,
+    wanted: _Wanted,
+    progress: Progress,
+) -> InterchangeReport:
     names = list_images(image_path)
     InitialCameras(image_path, cameras).check(names)
     with (
         # Verification may take hours, and half a database must not be left behind.
         new_results(database_path, names=names) as (new,),
-        _opened(features_path) as features,
-        _opened(matches_path) as matches,
+        opened(features_path) as features,
     ):
-        described = features.groups_with("keypoints")
-        if unknown := sorted(set(described) - set(names)):
-            raise StoreError(
-                f"{features_path}: has features of images that are not in {image_path}: "
-                f"{such_as(unknown)}"
-            )
-        refuse_colliding_keys(described)
-        pairs = _pairs(matches, described)
-        rejected = import_images(new, image_path, names, cameras)
-        if lost := sorted(set(described) & set(rejected)):
-            raise ImageError(
-                f"{image_path}: COLMAP does not take (damaged, or of another size than camera "
-                f"mode {cameras.mode} allows): {such_as(lost)}"
-            )
-        counts = _fill(new, features, described, matches, pairs, progress)
+        keys = _keys_of(features, names, image_path)
+        refuse_colliding_keys(list(keys))
+        with _matches(wanted, features, keys) as found:
+            rejected = import_images(new, image_path, names, cameras)
+            if lost := sorted(keys.keys() & set(rejected)):
+                raise ImageError(
+                    f"{image_path}: COLMAP does not take (damaged, or of another size than camera "
+                    f"mode {cameras.mode} allows): {such_as(lost)}"
+                )
+            unkept = _fill(new, features, keys, progress)
+            _fill_matches(new, found, wanted, progress)
+        counts, num_verified = _verified(new, wanted, progress)
         problems = check_database(new)[1]
-        num_verified = None
-        if not skip_verification:
-            options = VerificationOptions(random_seed=random_seed)
-            with progress.stage("verify", len(pairs), "pairs") as advance:
-                verify(new, options, advance=advance)
-            num_verified = len(verified_pairs(new, options.min_num_inliers))
-    without = sorted(set(names) - set(rejected) - set(described))
     left_out = {
-        "images without features are there without keypoints": without,
+        "images without features are there without keypoints": sorted(
+            set(names) - set(rejected) - keys.keys()
+        ),
         "images that COLMAP does not take are left out": rejected,
         **{CHECKS[kind]["what"]: problems.get(kind, []) for kind in sorted(WARNED)},
+        "descriptors are not kept, a database takes those of 128 values": unkept,
     }
     num_images = len(names) - len(rejected)
     return InterchangeReport("imported", num_images, *counts, num_verified, left_out)
 
 
-def _fill(
-    path: Path,
-    features: _Source,
-    described: Sequence[str],
-    matches: _Source,
-    pairs: Mapping[Pair, str],
-    progress: Progress,
-) -> tuple[int, int, int]:
-    """Write keypoints and matches of images that a database has; return how many of each."""
-    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
-        images = {image.name: image for image in database.read_all_images()}
-        with progress.stage("keypoints", len(described), "images") as advance:
-            for name in described:
-                _write_keypoints(database, images[name], features)
-                advance(1)
-        with progress.stage("matches", len(pairs), "pairs") as advance:
-            for pair, key in pairs.items():
-                _write_matches(database, [images[name] for name in pair], matches, key)
-                advance(1)
-        return database.num_keypoints(), len(pairs), database.num_matches()
+def _keys_of(features: GivenFile, names: Sequence[str], image_path: Path) -> dict[str, str]:
+    """Return the key of the features of each image.
 
-
-def _pairs(source: _Source, described: Sequence[str]) -> dict[Pair, str]:
-    """Return the key of the matches of each pair of two images."""
-    names = {name.replace("/", "-"): name for name in described}
-    pairs: dict[Pair, str] = {}
-    unknown = []
-    for key in source.groups_with("matches0"):
-        first, _, second = key.partition("/")
-        if first not in names or second not in names:
+    Some programs leave out the folders of images.
+    """
+    full_names = defaultdict[str, list[str]](list)
+    for name in names:
+        full_names[PurePosixPath(name).name].append(name)
+    known, found, unknown = set(names), dict[str, str](), []
+    for key in features.groups_with("keypoints"):
+        alike = [key] if key in known else full_names.get(key, [])
+        if len(alike) == 1:
+            found[alike[0]] = key
+        else:
             unknown.append(key)
-        elif first != second and (names[second], names[first]) not in pairs:
-            pairs[names[first], names[second]] = key
     if unknown:
         raise StoreError(
-            f"{source.path}: has matches of images that have no features: {such_as(unknown)}"
+            f"{features.path}: has features of images that are not in {image_path}: "
+            f"{such_as(unknown)}"
         )
-    return pairs
+    return found
 
 
-def _write_keypoints(database: pycolmap.Database, image: pycolmap.Image, source: _Source) -> None:
+@contextmanager
+def _matches(
+    wanted: _Wanted, features: GivenFile, keys: Mapping[str, str]
+) -> Iterator[GivenMatches]:
+    """Open the matches that are given, or those that the descriptors of a file make."""
+    if wanted.matches_path:
+        with given_matches(wanted.matches_path, keys) as found:
+            yield found
+        return
+    lacking = [name for name, key in keys.items() if f"{key}/descriptors" not in features.shapes]
+    if lacking:
+        raise StoreError(
+            f"{features.path}: has no descriptors to match by (give --matches-path): "
+            f"{such_as(lacking)}"
+        )
+    names = sorted(keys)
+    if wanted.match_list_path:
+        pairs: Sequence[Pair] = read_pairs(wanted.match_list_path, names, wanted.image_path)
+    else:
+        pairs = exhaustive_pairs(names)
+
+    def read(name: str) -> Arrays:
+        points = features.read(f"{keys[name]}/keypoints", (None, 2))
+        return points, _descriptors(features, keys[name], len(points))
+
+    yield GivenMatches(features.path, tuple(pairs), lambda _: _indices_of(matched(pairs, read)))
+
+
+def _indices_of(found: Iterator[tuple[Pair, Matches]]) -> Iterator[tuple[Pair, Indices]]:
+    for pair, matches in found:
+        yield pair, matches.indices
+
+
+def _descriptors(features: GivenFile, key: str, count: int) -> NDArray[Any]:
+    """Return the (N, D) descriptors of an image; hloc has them as (D, N)."""
+    shape = features.shapes[f"{key}/descriptors"]
+    if len(shape) != 2 or count not in shape:
+        raise StoreError(
+            f"{features.path}: {key}/descriptors has shape {shape}, expected (D, {count})"
+        )
+    values = features.read(f"{key}/descriptors", shape)
+    return values.T if shape[1] == count else values
+
+
+def _fill(
+    path: Path, features: GivenFile, keys: Mapping[str, str], progress: Progress
+) -> list[str]:
+    """Write keypoints and descriptors; return the images whose descriptors are not kept."""
+    unkept = []
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        images = {image.name: image for image in database.read_all_images()}
+        with progress.stage("keypoints", len(keys), "images") as advance:
+            for name, key in keys.items():
+                _write_keypoints(database, images[name], features, key)
+                if not _keep_descriptors(database, images[name].image_id, features, key):
+                    unkept.append(name)
+                advance(1)
+    return unkept
+
+
+def _keep_descriptors(
+    database: pycolmap.Database, image_id: int, features: GivenFile, key: str
+) -> bool:
+    """Write descriptors that a database has a place for; tell if none were left out."""
+    if f"{key}/descriptors" not in features.shapes:
+        return True
+    count = database.num_keypoints_for_image(image_id)
+    values = _descriptors(features, key, count)
+    if not count:
+        return True
+    if values.shape[1] != DESCRIPTOR_SIZE or not np.isfinite(values).all():
+        return False
+    write_descriptors(database, image_id, unit_rows(values))
+    return True
+
+
+def _fill_matches(path: Path, given: GivenMatches, wanted: _Wanted, progress: Progress) -> None:
+    with (
+        open_database(path) as database,
+        pycolmap.DatabaseTransaction(database),
+        progress.stage("matches", len(given.pairs), "pairs") as advance,
+    ):
+        write_given_matches(database, given, wanted.match_type, advance)
+
+
+def _verified(
+    path: Path, wanted: _Wanted, progress: Progress
+) -> tuple[tuple[int, int, int], int | None]:
+    """Verify, if that is wanted; return numbers of keypoints, pairs, matches; verified pairs."""
+    with open_database(path) as database:
+        num_pairs = len(database.read_num_matches()[0])
+        counts = database.num_keypoints(), num_pairs, database.num_matches()
+    options = wanted.verification
+    if options is None:
+        return counts, None
+    with progress.stage("verify", num_pairs, "pairs") as advance:
+        verify(path, options, advance=advance)
+    return counts, len(verified_pairs(path, options.min_num_inliers))
+
+
+def _write_keypoints(
+    database: pycolmap.Database, image: pycolmap.Image, source: GivenFile, key: str
+) -> None:
     """Write the keypoints of an image, if it is as large as the features were found in."""
     name, camera = image.name, database.read_camera(image.camera_id)
     expected = (camera.width, camera.height)
-    if f"{name}/image_size" in source.shapes:
-        size = tuple(source.read(f"{name}/image_size", (2,)).tolist())
+    if f"{key}/image_size" in source.shapes:
+        size = tuple(source.read(f"{key}/image_size", (2,)).tolist())
+        if f"{key}/tile_idx" in source.shapes:  # deep-image-matching has (height, width)
+            size = size[::-1]
         if size != expected:
             turned = " (turned by its EXIF orientation?)" if size == expected[::-1] else ""
             raise StoreError(
                 f"{source.path}: {name} was {size[0]:g} x {size[1]:g} px for the features{turned}, "
                 f"and the photograph is {expected[0]} x {expected[1]} px; use the same photographs"
             )
-    keypoints = _keypoint_rows(source, name)
+    keypoints = _keypoint_rows(source, key)
     for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints, expected)):
         check = CHECKS[kind]
         raise StoreError(f"{source.path}: {check['what']}: {name}; {check['advice']}")
     database.write_keypoints(image.image_id, keypoints)
 
 
-def _keypoint_rows(source: _Source, name: str) -> Singles:
+def _keypoint_rows(source: GivenFile, name: str) -> Singles:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
     lafs, scales, oris = (f"{name}/{dataset}" for dataset in ("lafs", "scales", "oris"))
     with np.errstate(over="ignore"):  # what float32 cannot hold is refused later
@@ -279,19 +360,6 @@ def _keypoint_rows(source: _Source, name: str) -> Singles:
         sigmas = source.read(scales, (count,)).astype(np.float32)
         angles = np.deg2rad(source.read(oris, (count,)).astype(np.float32))
         return np.column_stack([centers, sigmas, angles])
-
-
-def _write_matches(
-    database: pycolmap.Database, images: Sequence[pycolmap.Image], source: _Source, key: str
-) -> None:
-    id1, id2 = (image.image_id for image in images)
-    num_keypoints1 = database.num_keypoints_for_image(id1)
-    column = source.read(f"{key}/matches0", (num_keypoints1,), "iu").astype(np.int64)
-    rows = np.flatnonzero(column != -1)
-    try:
-        write_matches(database, id1, id2, np.stack([rows, column[rows]], axis=1))
-    except DatabaseError as error:
-        raise StoreError(f"{source.path}: {key}: {error}") from error
 
 
 def export_h5(

@@ -5,6 +5,7 @@ database has no place for is kept in a folder beside it, ``x.affrect`` for ``x.d
 functions go on where an earlier call stopped.
 """
 
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,13 +18,14 @@ from colmap_affrect.colmap.checks import FATAL_AS_IT_IS, FATAL_BEFORE_MAPPING, r
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
-from colmap_affrect.errors import AffrectError, such_as
+from colmap_affrect.errors import AffrectError, OptionError, such_as
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.base import MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
+from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
@@ -35,6 +37,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.stages import verify as verify_stage
 from colmap_affrect.stages.context import Context, Inputs, Resources
+from colmap_affrect.stages.descriptors import described_images, match_database
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_images_and_keypoints
 from colmap_affrect.stages.guide import guide
@@ -51,7 +54,8 @@ Token = pycolmap.CancellationToken | None
 Callback = Callable[[], None] | None
 Reports = tuple[StageReport, ...]
 
-Choose = Callable[[Context, Any], Iterable[Pair]]  # by pycolmap's pairing options
+Choose = Callable[[Context, Sequence[str], Any], Iterable[Pair]]
+"""Takes the names of the images that can be matched, and pycolmap's pairing options."""
 
 ARGUMENTS = """
 
@@ -122,9 +126,12 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
             matching, asked = translate.matching_options(matching_options)
             shown = _Cancellable(progress, cancellation_token)
             with _context(database_path, device, asked, weights_path, shown) as context:
+                if names := _described(context):
+                    pairs = choose(context, names, pairing)
+                    return _match_descriptors(context, pairs, matching, verification, asked)
                 context.workspace.require("extract")
                 write_images_and_keypoints(context)
-                pairs = choose(context, pairing)
+                pairs = choose(context, context.features.names(), pairing)
                 return _match(context, pairs, matching, verification, asked, cancellation_token)
 
         matched.__name__ = matched.__qualname__ = choose.__name__
@@ -135,13 +142,17 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
 
 
 @_matching(pycolmap.ExhaustivePairingOptions)
-def match_exhaustive(context: Context, _: pycolmap.ExhaustivePairingOptions) -> Iterable[Pair]:
+def match_exhaustive(
+    _: Context, names: Sequence[str], __: pycolmap.ExhaustivePairingOptions
+) -> Iterable[Pair]:
     """Match and verify all pairs of the images that :func:`extract_features` was given."""
-    return exhaustive_pairs(context.features.names())
+    return exhaustive_pairs(names)
 
 
 @_matching(pycolmap.SequentialPairingOptions)
-def match_sequential(context: Context, options: pycolmap.SequentialPairingOptions) -> list[Pair]:
+def match_sequential(
+    context: Context, _: Sequence[str], options: pycolmap.SequentialPairingOptions
+) -> list[Pair]:
     """Match images that follow each other by name.
 
     With ``loop_detection`` also images that are alike as a whole, which needs no vocabulary tree:
@@ -152,19 +163,24 @@ def match_sequential(context: Context, options: pycolmap.SequentialPairingOption
     path = context.workspace.database
     pairs = generated_pairs(path, pycolmap.SequentialPairGenerator, in_order)
     if options.loop_detection:
+        context.workspace.require("extract")
         names = [name for name, count in context.features.num_keypoints().items() if count]
         pairs += retrieved_pairs(names, context.features.read, num_alike, context.progress)
     return pairs
 
 
 @_matching(pycolmap.SpatialPairingOptions)
-def match_spatial(context: Context, options: pycolmap.SpatialPairingOptions) -> list[Pair]:
+def match_spatial(
+    context: Context, _: Sequence[str], options: pycolmap.SpatialPairingOptions
+) -> list[Pair]:
     """Match images near to each other; DatabaseError when fewer than two have a position."""
     return spatial_pairs(context.workspace.database, options)
 
 
 @_matching(pycolmap.ImportedPairingOptions)
-def match_image_pairs(context: Context, options: pycolmap.ImportedPairingOptions) -> Iterable[Pair]:
+def match_image_pairs(
+    _: Context, names: Sequence[str], options: pycolmap.ImportedPairingOptions
+) -> Iterable[Pair]:
     """Match and verify the pairs of a list, ``match_list_path``, a file of two names per line.
 
     Raises AffrectError without one, or when it names images without features.
@@ -172,7 +188,43 @@ def match_image_pairs(context: Context, options: pycolmap.ImportedPairingOptions
     path = translate.given_path(options.match_list_path)
     if not path:
         raise AffrectError("pairing_options: give match_list_path, a file with two names per line")
-    return read_pairs(Path(path), context.features.names())
+    return read_pairs(Path(path), names)
+
+
+def _described(context: Context) -> list[str]:
+    """Return the images with descriptors of a database that no function of ours has filled."""
+    workspace = context.workspace
+    if "extract" in workspace.begun or not workspace.database.exists():
+        return []
+    return described_images(workspace.database)
+
+
+def _match_descriptors(
+    context: Context,
+    pairs: Iterable[Pair],
+    matching: MatcherOptions | None,
+    verification: VerificationOptions,
+    asked: Mapping[str, Any],
+) -> Reports:
+    """Match and verify pairs of images by the descriptors that another program has made."""
+    nearest = matching if isinstance(matching, NearestOptions) else None
+    if matching and not nearest:
+        raise OptionError("matching_options: descriptors of a database take NearestOptions alone")
+    if refused := sorted(asked.keys() & {"guided_matching", "rig_verification"}):
+        raise OptionError(f"{refused[0]}: not for descriptors of another program")
+    path, begun = context.workspace.database, time.perf_counter()
+    refuse_unusable(path)
+    listed = list(pairs)
+    if asked.get("skip_image_pairs_in_same_frame"):
+        listed = _of_different_frames(path, listed)
+    num = match_database(path, listed, nearest, progress=context.progress)
+    between = time.perf_counter()
+    reports = [StageReport("match", between - begun, num, len(listed) - num)]
+    if not asked.get("skip_geometric_verification"):
+        with context.progress.stage("verify", num, "pairs") as advance:
+            verify_database(path, verification, advance=advance)
+        reports.append(StageReport("verify", time.perf_counter() - between, num, 0))
+    return tuple(reports)
 
 
 def _match(

@@ -141,6 +141,7 @@ class Adjuster:
         options.refine_focal_length = self.refining.refine_focal_length
         options.refine_principal_point = self.refining.refine_principal_point
         options.refine_extra_params = self.refining.refine_extra_params
+        options.refine_sensor_from_rig = self.refining.refine_sensor_from_rig
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = self.noise_px
         config, registered = pycolmap.BundleAdjustmentConfig(), set(model.reg_image_ids())
@@ -202,6 +203,8 @@ class Adjuster:
         focal, extra = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())
         if not prior.sigma:  # distortion alone is refined
             fixed = [*focal, *camera.principal_point_idxs()]
+            if len(fixed) == len(camera.params):
+                return  # COLMAP holds it already
             manifold = pyceres.SubsetManifold(len(camera.params), fixed)
             problem.set_manifold(camera.params, manifold)
             return

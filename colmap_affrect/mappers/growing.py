@@ -116,7 +116,8 @@ class Grower:
         return model
 
     def _triangulate(self, mapper: pycolmap.IncrementalMapper, image_ids: Collection[int]) -> None:
-        for image_id in image_ids:
+        """Find points of images, and of those of a rig that were taken with them."""
+        for image_id in _of_frames(mapper.reconstruction, image_ids):
             mapper.triangulate_image(self.triangulation, image_id)
 
     def _refine(self, mapper: pycolmap.IncrementalMapper, max_iterations: int) -> None:
@@ -137,6 +138,17 @@ class Grower:
         """Register one more image by points that it sees; return its id."""
         ids = mapper.find_next_images(self.options, False)
         return next((i for i in ids if mapper.register_next_image(self.options, i)), None)
+
+
+def _of_frames(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> list[int]:
+    """Return images, each before the others of its frame, once."""
+    found = dict[int, None]()
+    for image_id in image_ids:
+        found[image_id] = None
+        frame = model.images[image_id].frame
+        mates = sorted(data.id for data in frame.image_ids) if frame else []
+        found |= dict.fromkeys(mates)
+    return list(found)
 
 
 def join(mapped: MappedModel, bridges: Bridges, grower: Grower, evidence: Evidence) -> MappedModel:

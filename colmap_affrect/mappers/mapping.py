@@ -150,7 +150,7 @@ def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgeme
     model, taken = mapped.reconstruction, dict[str, Judgement]()
     growths, are_new = focal_growths(model, task), True
     while model.num_reg_images() > 1:
-        found = judge(mapped, task, growths)
+        found = _best_of_frames(model, judge(mapped, task, growths))
         name = min(found, key=lambda name: found[name].probability)
         if task.extend or found[name].probability >= WRONG:
             if are_new:
@@ -164,6 +164,21 @@ def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgeme
                 taken[image.name] = found[name]
         model.deregister_frame(frame_id)
     return {}, taken
+
+
+def _best_of_frames(model: pycolmap.Reconstruction, found: Judgements) -> Judgements:
+    """Return of each image the judgement of the surest one that a rig took with it.
+
+    A rig is rigid: where one of its images stands right, the others do, which may see next to
+    nothing.
+    """
+    best = dict[int, Judgement]()
+    frames = {name: model.find_image_with_name(name).frame_id for name in found}
+    for name, judgement in found.items():
+        known = best.get(frames[name])
+        if not known or judgement.probability > known.probability:
+            best[frames[name]] = judgement
+    return {name: best[frame_id] for name, frame_id in frames.items()}
 
 
 def _summary(

@@ -235,6 +235,11 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
     return {i: model.cameras[model.images[i].camera_id] for i in model.reg_image_ids()}
 
 
+def has_rigs(model: pycolmap.Reconstruction) -> bool:
+    """Tell whether a model has a rig of several sensors."""
+    return any(rig.num_sensors() > 1 for rig in model.rigs.values())
+
+
 def _agrees(pose: Pose, cameras: Cameras, points: tuple[Array, Array]) -> tuple[Bools, Depths]:
     """Return which matches agree with a relative pose, and their depths."""
     rays1, rays2 = (

@@ -40,6 +40,7 @@ from colmap_affrect.mappers.pair_graph import (
     VerifiedPair,
     cameras_of,
     graph_of,
+    has_rigs,
     poses_of,
 )
 from colmap_affrect.mappers.tie_points import tie_points_of, tied_evidence
@@ -55,6 +56,7 @@ NUM_ITERATIONS = 100  # of a trial: three times as many change growths by 4 % at
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
 MAX_NUM_IMAGES = 100  # of models whose focal lengths are tried; larger ones have points of many
 MAX_NUM_POINTS = 2_000  # of a model, for what need not be exact
+MAX_NUM_OBSERVATIONS = 3_000  # of a model of rigs, whose images hold each other
 NUM_TURNED, MAX_PAIRS_TURNED = 4, 300
 """Pairs of an image, and of a model, that are compared with a camera that only turns."""
 USUAL_TURNED = 0.5  # share of matches that a rotation may explain of views of any two places
@@ -368,10 +370,17 @@ def _is_tried(model: pycolmap.Reconstruction) -> bool:
 
 
 def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Return a copy with every n-th point, of ``MAX_NUM_POINTS`` at most."""
+    """Return a copy with every n-th point, of ``MAX_NUM_POINTS`` at most.
+
+    A model of rigs has ``MAX_NUM_OBSERVATIONS`` at most: with the poses of the sensors as unknowns
+    too, each of them takes two or three times as long.
+    """
     fewer = pycolmap.Reconstruction(model)
     ids = sorted(fewer.point3D_ids())
-    kept = set(ids[:: max(1, -(-len(ids) // MAX_NUM_POINTS))])
+    step = math.ceil(len(ids) / MAX_NUM_POINTS)
+    if has_rigs(model):
+        step = max(step, math.ceil(model.compute_num_observations() / MAX_NUM_OBSERVATIONS))
+    kept = set(ids[:: max(1, step)])
     for point_id in ids:
         if point_id not in kept:
             fewer.delete_point3D(point_id)

@@ -159,7 +159,7 @@ class Search:
         """Return models of different images from first pairs, that with most evidence first."""
         models: dict[frozenset[int], tuple[float, pycolmap.Reconstruction]] = {}
         best, in_vain = 0.0, 0
-        pairs = sorted(first, key=lambda pair: -len(pair.matches))
+        pairs = _as_first_pairs(first, graph)
         with closing(_in_order(self.grower(graph), [pair.ids for pair in pairs])) as grown:
             for model in grown:
                 images, evidence = frozenset(model.reg_image_ids()), self.evidence.of(model)
@@ -171,6 +171,21 @@ class Search:
                 if in_vain >= self.num_seeds or (is_complete and self.evidence.is_confirmed(model)):
                     break
         return [MappedModel(m) for _, m in sorted(models.values(), key=lambda found: -found[0])]
+
+
+def _as_first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[VerifiedPair]:
+    """Return pairs in the order in which models begin with them.
+
+    Those with most inliers come first, and those of two images that a rig took at once come last:
+    cameras of a rig are near to each other, and their poses known beforehand.
+    """
+    frames = {key: image.frame_id for key, image in graph.cache.images.items()}
+
+    def order(pair: VerifiedPair) -> tuple[bool, int]:
+        first, second = pair.ids
+        return frames[first] == frames[second], -len(pair.matches)
+
+    return sorted(pairs, key=order)
 
 
 def with_own_images(models: Iterable[MappedModel]) -> list[MappedModel]:

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, priors_of
+from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, FocalPrior, priors_of
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.search import Search, with_own_images
 from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
@@ -76,7 +76,8 @@ class SparseMapper(IncrementalMapper):
             native.mapper.init_max_forward_motion = 1.0  # the evidence decides on such pairs
             best = self._best(task, graph, native, shown)
             for model in best:
-                model.reconstruction.normalize()  # as COLMAP does
+                if not has_rigs(model.reconstruction):  # which tell the scale
+                    model.reconstruction.normalize()  # as COLMAP does
         if task.extend:
             for mapped in best:
                 _extract_colors(mapped.reconstruction, task, native)
@@ -109,6 +110,11 @@ class SparseMapper(IncrementalMapper):
             constant = frozenset(key for key, record in task.cameras.items() if record.is_fixed)
         else:
             priors = {k: replace(p, sigma=p.sigma or EXIF_SIGMA) for k, p in priors.items()}
+        if not native.ba_refine_focal_length:  # then they are those of the database
+            used = {camera.camera_id: camera for camera in graph.cameras.values()}
+            priors = {k: FocalPrior(float(c.mean_focal_length()), 0.0) for k, c in used.items()}
+            if not (native.ba_refine_extra_params or native.ba_refine_principal_point):
+                constant |= used.keys()
         if task.extend:
             task.extend.constrain(native)
             constant |= native.constant_cameras

@@ -20,6 +20,7 @@ from colmap_affrect.project.regular_files import open_regular
 
 Pair = tuple[str, str]  # names of two photographs, in order
 
+SCORE = re.compile(r"[\s,]+[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?$")  # at the end of a line
 AT_ONCE = 1 << 16  # pairs that are given names together
 
 
@@ -146,20 +147,35 @@ def ordered_for_reuse(pairs: Iterable[Pair], num_images: int) -> PairList:
     return listed.at(np.lexsort((high, low, high // num_images, low // num_images)))
 
 
-def read_pairs(path: Path, names: Sequence[str]) -> PairList:
+def read_pairs(path: Path, names: Sequence[str], image_path: Path | None = None) -> PairList:
     """Read a pair list as COLMAP and hloc write it: two names per line.
 
-    Separated by spaces, a tab or a comma; names may contain spaces. Empty lines and lines with #
-    are skipped, repeated pairs count once, in either order. The pairs are sorted. OptionError when
-    there is no such file, AffrectError when it is unreadable or a name is not among ``names``.
+    Separated by spaces, a tab or a comma; names may contain spaces. A number behind them, a score,
+    has no effect; names may have backslashes for slashes, or be paths into the folder of the
+    photographs. Empty lines and lines with # are skipped, repeated pairs count once, in either
+    order.
+
+    Args:
+        path: the list.
+        names: of the images that may be in it.
+        image_path: folder of the photographs; None: paths are refused.
+
+    Returns:
+        The pairs, sorted.
+
+    Raises:
+        OptionError: when there is no such file.
+        AffrectError: when it is unreadable, or a name is not among ``names``.
     """
     ordered = sorted(set(names))
     number = {name: index for index, name in enumerate(ordered)}
+    folders = _spellings(image_path) if image_path else ()
     problems: list[tuple[int, str]] = []
 
     def codes(lines: Iterable[str]) -> Iterator[int]:
         for count, line in enumerate(lines, start=1):
-            pair = _split(line.rstrip("\n"), number) or _split(line.strip(), number)
+            pair = split_line(line.rstrip("\n"), number) or split_line(line.strip(), number)
+            pair = pair or _split_of_others(line, number, folders)
             if pair:
                 low, high = sorted((number[pair[0]], number[pair[1]]))
                 if low < high:
@@ -198,7 +214,7 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
     replace_text(path, (f"{first}{separator}{second}\n" for first, second in pairs))
 
 
-def _split(line: str, known: Collection[str]) -> Pair | None:
+def split_line(line: str, known: Collection[str]) -> Pair | None:
     """Return the two names of a line, either of which may hold separators."""
     for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
         for match in re.finditer(separator, line):
@@ -206,6 +222,22 @@ def _split(line: str, known: Collection[str]) -> Pair | None:
             if first in known and second in known:
                 return first, second
     return None
+
+
+def _split_of_others(line: str, known: Collection[str], folders: Sequence[str]) -> Pair | None:
+    """Return the two names of a line that has a score, backslashes, or paths into a folder."""
+    text = line.strip().replace("\\", "/")
+    for folder in folders:
+        text = re.sub(rf"(^|[\s,]){re.escape(folder)}/+", r"\1", text)
+    text = re.sub(r"(^|[\s,])(?:\./+)+", r"\1", text)
+    return split_line(text, known) or split_line(SCORE.sub("", text), known)
+
+
+def _spellings(folder: Path) -> tuple[str, ...]:
+    """Return how the path of a folder may begin those of the files in it, the longest first."""
+    paths = {folder, folder.absolute(), folder.resolve()}
+    found = {path.as_posix() for path in paths} - {".", "/"}
+    return tuple(sorted(found, key=len, reverse=True))
 
 
 def _suggestion(line: str, names: Sequence[str]) -> str:

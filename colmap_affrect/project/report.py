@@ -3,7 +3,7 @@
 import json
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from typing import Any
@@ -15,7 +15,7 @@ MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {  # how a summary calls where focal lengths are from; others by their own names
     "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size",
-    "guess": "not known beforehand",
+    "guess": "not known beforehand", "model": "of the model that is extended",
 }  # fmt: skip
 
 OF_LARGEST = (  # what ``report.json`` has of the largest model under its own name
@@ -24,6 +24,7 @@ OF_LARGEST = (  # what ``report.json`` has of the largest model under its own na
 )  # fmt: skip
 
 SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
+MAX_EXIF_ERROR = 1.27  # of a focal length: three standard deviations of what EXIF usually has
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
 REPORTED_PACKAGES = (
@@ -49,6 +50,38 @@ def _some(lines: Iterable[str]) -> list[str]:
     if (more := len(shown) - MAX_LINES) > 1:
         shown[MAX_LINES:] = [f"            and {more} more, see report.json"]
     return shown
+
+
+def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say where a model contradicts EXIF, and what would tell focal lengths that EXIF has in mm.
+
+    Args:
+        cameras: entries of ``report.json``.
+    """
+    notes = []
+    wrong = [camera for camera in cameras if _contradicts_exif(camera)]
+    if wrong:
+        first = wrong[0]
+        more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
+        notes.append(
+            f"EXIF may be wrong: {first['focal_px']:.0f} px by EXIF, {first['refined_px']:.0f} px "
+            f"in the model{more}; --ignore-exif leaves it out"
+        )
+    lenses_mm = sorted({camera["lens_mm"] for camera in cameras if camera.get("lens_mm")})
+    if lenses_mm:
+        notes.append(
+            f"EXIF has {', '.join(f'{mm:g}' for mm in lenses_mm[:3])} mm, and not the size of the "
+            f"sensor: --focal-mm {lenses_mm[0]:g} --film-width-mm WIDTH (its longer side) tells "
+            "the focal length"
+        )
+    return notes
+
+
+def _contradicts_exif(camera: Mapping[str, Any]) -> bool:
+    if camera["source"] not in ("exif", "exif-rescaled") or not camera.get("refined_px"):
+        return False
+    ratio = camera["refined_px"] / camera["focal_px"]
+    return not 1 / MAX_EXIF_ERROR <= ratio <= MAX_EXIF_ERROR
 
 
 def by_story(stories: Mapping[str, str]) -> list[str]:
@@ -312,6 +345,7 @@ class ReconstructionReport:
             sources = Counter(str(camera["source"]) for camera in self.cameras).most_common()
             texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]
             lines += [f"cameras     focal lengths: {', '.join(texts)}"]
+            lines += [f"            {note}" for note in camera_notes(self.cameras)]
         if self.models:
             lines += self.models[0].summary_lines()
         if len(self.models) > 1:

@@ -19,6 +19,7 @@ from colmap_affrect.project.report import (
     ModelSummary,
     ReconstructionReport,
     by_story,
+    camera_notes,
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.page import TEMPLATES, write_page
@@ -131,7 +132,10 @@ def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, An
         for camera in report.cameras[:MAX_NUM_CAMERAS]
     ]
     counts = Counter(camera["source"] for camera in report.cameras).most_common()
-    return {"cameras": cameras, "source_counts": counts, "source_texts": SOURCES}
+    notes = camera_notes(report.cameras)
+    return {
+        "cameras": cameras, "source_counts": counts, "source_texts": SOURCES, "camera_notes": notes,
+    }  # fmt: skip
 
 
 def _tie_points(

@@ -27,8 +27,9 @@ from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation
+from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.verify import copy_verified, verify_matches
+from colmap_affrect.stages.verify import verify_matches
 
 logger = logging.getLogger(__name__)
 
@@ -106,8 +107,13 @@ def _why_lost(workspace: Workspace) -> str:
 
 def _make_again(context: Context, why: str, *, follows: bool) -> None:
     workspace, begun = context.workspace, context.workspace.begun
-    original = Path(workspace.require("copy")["database"]) if workspace.is_foreign else None
-    source, hint = original or f"{workspace.features.name} and {workspace.matches.name}", ""
+    foreign = None
+    if workspace.is_foreign:
+        foreign = ForeignDatabase.of_record(workspace.require("copy"))
+    source, hint = (
+        foreign.path if foreign else f"{workspace.features.name} and {workspace.matches.name}",
+        "",
+    )
     if kept := _put_aside(workspace.database):
         again = f"map --from-database {shlex.quote(str(kept))} --output-path OTHER"
         hint = f"; 'colmap-affrect {again}' maps what was there"
@@ -115,8 +121,8 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
     workspace.rewind()
     if not (follows and "verify" in begun):
         return
-    if original:
-        copy_verified(context, original, workspace.photographs(), context.verification)
+    if foreign:
+        copy_verified(context, foreign, context.verification)
         return
     verify_matches(context)
     if "escalate" in begun:

@@ -79,7 +79,8 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
         named = known.union(context.inputs.names())  # some may have gone just now
-        listed = lists.read_pairs(Path(options.match_list_path), sorted(named))
+        folder = Path(context.inputs.image_path)
+        listed = lists.read_pairs(Path(options.match_list_path), sorted(named), folder)
         pairs |= {pair for pair in listed if known.issuperset(pair)}
     return pairs
 

@@ -1,17 +1,10 @@
-"""Verify: two-view geometries of the matched pairs, into the database.
-
-Another program's database is copied in the place of all stages before.
-"""
+"""Verify: two-view geometries of the matched pairs, into the database."""
 
 import logging
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.checks import FATAL, refuse_unusable
-from colmap_affrect.colmap.database_copy import add_frames, copy_database
-from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import (
     ExtractedPx,
     VerificationOptions,
@@ -19,12 +12,10 @@ from colmap_affrect.colmap.verification import (
     verified_pairs,
     verify,
 )
-from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.stages.context import Context, source_files
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.match import write_matches
 from colmap_affrect.stages.pairs import listed_pairs
 
@@ -46,53 +37,6 @@ def verify_matches(
     with context.progress.stage("verify", todo, "pairs") as advance:
         verify_new(context, advance)
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
-
-
-def copy_verified(
-    context: Context,
-    source: Path,
-    image_path: Path | None,
-    verification: VerificationOptions,
-    *,
-    overwrite: bool = False,
-) -> StageReport:
-    """Copy a database, and verify its matched pairs that have no two-view geometry.
-
-    The copy is made anew when the original has changed since, or with ``overwrite``. Raises
-    DatabaseError when it cannot be used, or has no matches.
-    """
-    start = time.perf_counter()
-    workspace = context.workspace
-    if image_path and not image_path.is_dir():
-        raise OptionError(f"--image-path {image_path}: no such folder")
-    workspace.require_own(image_path)
-    digest = content_of(source_files(source)).digest
-    if digest != workspace.made_from("copy") or not workspace.database.exists():
-        refuse_unusable(source, warns=True)
-    photographs = str(image_path.resolve()) if image_path else ""
-    given = {"database": str(source.resolve()), "image_path": photographs}
-    workspace.record_options("copy", given, overwrite=overwrite)
-    warnings = {}
-    if digest != (before := workspace.made_from("copy")):
-        if before:
-            warnings[str(source)] = "has changed; its copy and the models are made anew"
-            logger.warning("%s: %s", source, warnings[str(source)])
-        workspace.rewind()
-        workspace.record_made_from(copy=digest)
-    if not workspace.database.exists():
-        copy_database(source, workspace.database, FATAL, add_frames)
-    record_cameras(workspace.database, workspace.cameras)
-    workspace.record_options("verify", verification.to_mapping())
-    num_pairs = colmap_database.num_matched_pairs(workspace.database)
-    if not num_pairs:
-        raise DatabaseError(f"{source}: has no matches; match its images first")
-    todo = len(colmap_database.unverified_pairs(workspace.database))
-    if todo:
-        logger.warning("%s: %d pairs have matches only; they are verified now", source, todo)
-    with context.progress.stage("verify", todo, "pairs") as advance:
-        verify(workspace.database, verification, advance=advance)
-    wall_s = time.perf_counter() - start
-    return StageReport("verify", wall_s, todo, num_pairs - todo, warnings=warnings)
 
 
 def num_verified_inliers(context: Context) -> dict[Pair, int]:

@@ -230,6 +230,20 @@ def test_records_are_kept_and_follow_the_images_that_come_later(
     assert records[1].focal_px == 70.0
 
 
+def test_lens_in_mm_is_on_record_where_nothing_tells_the_size_of_the_sensor(tmp_path: Path) -> None:
+    tags = {"Make": "Nobody", "Model": "Knows", "FocalLength": 35.0}
+    write_photograph(tmp_path / "photos" / "a.jpg", (90, 60), tags)
+    write_photograph(tmp_path / "photos" / "b.jpg", (90, 60), {**tags, "FocalLengthIn35mmFilm": 50})
+    initial = InitialCameras(tmp_path / "photos", CameraOptions())
+    records = {name: initial.camera([name], (90, 60))[1] for name in ("a.jpg", "b.jpg")}
+    assert (records["a.jpg"].source, records["a.jpg"].lens_mm) == ("guess", 35.0)
+    assert (records["b.jpg"].source, records["b.jpg"].lens_mm) == ("exif", 0.0)
+    assert records["a.jpg"].to_report(1, None)["lens_mm"] == 35.0
+    told = CameraOptions(focal_mm=35.0, film_width_mm=24.0)
+    record = InitialCameras(tmp_path / "photos", told).camera(["a.jpg"], (90, 60))[1]
+    assert (record.source, record.lens_mm) == ("given", 0.0)
+
+
 def test_cameras_of_another_program_are_given_where_they_are_flagged(
     photos: Path, tmp_path: Path
 ) -> None:

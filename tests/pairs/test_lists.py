@@ -108,6 +108,44 @@ def test_read_pairs_takes_what_others_write(pair_list: Path, text: str, pairs: l
     assert list(read_pairs(pair_list, NAMES)) == pairs
 
 
+FOLDER = "/data/old photos"
+
+
+@pytest.mark.parametrize(("text", "pairs"), [
+    ("a.png b.png 0.713\n", [("a.png", "b.png")]),
+    ("a.png,b.png,-1.5e-3\n", [("a.png", "b.png")]),
+    ("a.png\tnew wing/b.png\t12\n", [("a.png", "new wing/b.png")]),
+    ("a.png new wing\\b.png\n", [("a.png", "new wing/b.png")]),
+    ("new wing\\a 1.png\tnew wing\\b.png\t1.\n", [("new wing/a 1.png", "new wing/b.png")]),
+    (f"{FOLDER}/a.png {FOLDER}/b.png\n", [("a.png", "b.png")]),
+    (f"{FOLDER}/new wing/b.png,{FOLDER}/a.png,.5\n", [("a.png", "new wing/b.png")]),
+    (f"{FOLDER}/a.png b.png\n".replace("/", "\\"), [("a.png", "b.png")]),
+    ("./a.png ./new wing/b.png\n", [("a.png", "new wing/b.png")]),
+])  # fmt: skip
+def test_scores_backslashes_and_paths_into_the_folder_are_read(
+    pair_list: Path, text: str, pairs: list[Pair]
+) -> None:
+    pair_list.write_text(text, encoding="utf-8")
+    assert list(read_pairs(pair_list, NAMES, Path(FOLDER))) == pairs
+
+
+def test_relative_folder_of_photographs_is_found_in_absolute_paths(
+    pair_list: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pair_list.write_text(f"{tmp_path}/photos/a.png photos/b.png\n", encoding="utf-8")
+    assert list(read_pairs(pair_list, NAMES, Path("photos"))) == [("a.png", "b.png")]
+
+
+@pytest.mark.parametrize("text", [
+    "/elsewhere/a.png /elsewhere/b.png\n", "a.png b.png 0.5 0.7\n", "a.png 0.5\n",
+])  # fmt: skip
+def test_paths_elsewhere_and_more_columns_are_refused(pair_list: Path, text: str) -> None:
+    pair_list.write_text(text, encoding="utf-8")
+    with pytest.raises(AffrectError, match=r"line 1: .* is not two names of images"):
+        read_pairs(pair_list, NAMES, Path(FOLDER))
+
+
 def test_read_pairs_lists_unknown_names_with_line_and_suggestion(pair_list: Path) -> None:
     pair_list.write_text("a.png b.png\na.png bb.png\n\nzzzz 1234\n")
     with pytest.raises(AffrectError) as error:

@@ -119,6 +119,19 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         assert part in text
 
 
+def test_summary_says_where_exif_is_wrong_or_needs_the_size_of_the_sensor() -> None:
+    camera = {"id": 1, "source": "exif", "focal_px": 270.0, "refined_px": 1081.2, "lens_mm": 0.0}
+    right = {**camera, "id": 2, "refined_px": 280.0}
+    lens = {**camera, "id": 3, "source": "guess", "lens_mm": 35.0}
+    text = replace(REPORT, cameras=(camera, right, lens)).summary()
+    assert "cameras     focal lengths: 2 from EXIF, 1 not known beforehand\n" in text
+    assert "            EXIF may be wrong: 270 px by EXIF, 1081 px in the model; --ignore" in text
+    assert "EXIF has 35 mm, and not the size of the sensor: --focal-mm 35 --film-width-mm" in text
+    text = replace(REPORT, cameras=(right, {**right, "refined_px": None})).summary()
+    assert "EXIF may be wrong" not in text
+    assert "sensor" not in text
+
+
 def test_summary_says_what_cannot_be_trusted() -> None:
     shaky = replace(SHAKY, probabilities={"a.png": 0.31, "č d.png": 0.9})
     text = replace(REPORT, models=(shaky,)).summary()

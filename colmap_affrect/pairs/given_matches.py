@@ -1,0 +1,175 @@
+"""Files of matches of other programs: those of hloc and deep-image-matching, and COLMAP's lists.
+
+- hloc: a group for each pair with ``matches0`` (N0,), -1 where unmatched. In its key each '/' of a
+  name is '-', and '/' stands between the names; older files have '_' there.
+- deep-image-matching, and notebooks of the image matching challenge: a group for the first image,
+  in it for the second one the (M, 2) matches.
+- COLMAP's text lists, as ``matches_importer`` takes them: a line of two names, a line of two
+  numbers for each match, and an empty line.
+"""
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from colmap_affrect.errors import OptionError, StoreError, damage, such_as
+from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.pairs.lists import Pair, split_line
+from colmap_affrect.project.given_h5 import GivenFile, opened
+
+MatchType = Literal["raw", "inliers"]
+"""As COLMAP has it: matches to be verified, or verified ones."""
+
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+HLOC = "matches0"
+COMPLETE = "write it anew with the program that made it"
+
+
+@dataclass(frozen=True)
+class GivenMatches:
+    """Matches of pairs of images."""
+
+    path: Path
+    pairs: tuple[Pair, ...]
+    read: Callable[[Mapping[str, int]], Iterator[tuple[Pair, Indices]]]
+    """Returns each pair with its (M, 2) features, in any order; takes how many each image has."""
+
+
+@contextmanager
+def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
+    """Open a file of matches of named images.
+
+    Args:
+        path: HDF5 file, or text.
+        names: of the images that have features.
+
+    Raises:
+        OptionError: when there is no such file.
+        StoreError: when it is damaged, or names other images.
+    """
+    if not path.is_file():
+        raise OptionError(f"{path}: no such file")
+    with path.open("rb") as file:
+        is_text = file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE and path.suffix != ".h5"
+    if is_text:
+        yield _read_list(path, names)
+        return
+    with opened(path) as source:
+        yield _of_hdf5(source, names)
+
+
+def _of_hdf5(source: GivenFile, names: Collection[str]) -> GivenMatches:
+    if any(key.endswith(f"/{HLOC}") for key in source.shapes) or not source.shapes:
+        keys = _once(_hloc_pairs(source, names))
+    else:
+        keys = _once(_nested_pairs(source, names))
+
+    def read(num_features: Mapping[str, int]) -> Iterator[tuple[Pair, Indices]]:
+        for pair, key in keys.items():
+            if key in source.shapes:
+                yield pair, source.read(key, (None, 2), "iu").astype(np.int64)
+                continue
+            column = source.read(f"{key}/{HLOC}", (num_features[pair[0]],), "iu").astype(np.int64)
+            rows = np.flatnonzero(column != -1)
+            yield pair, np.stack([rows, column[rows]], axis=1)
+
+    return GivenMatches(source.path, tuple(keys), read)
+
+
+def _once(found: Iterator[tuple[Pair, str]]) -> dict[Pair, str]:
+    """Keep each pair once, in either order, and none of an image with itself."""
+    keys: dict[Pair, str] = {}
+    for (first, second), key in found:
+        is_known = (first, second) in keys or (second, first) in keys
+        if first != second and not is_known:
+            keys[first, second] = key
+    return keys
+
+
+def _hloc_pairs(source: GivenFile, names: Collection[str]) -> Iterator[tuple[Pair, str]]:
+    """Yield the pairs of a file of hloc with their keys."""
+    by_key = {name.replace("/", "-"): name for name in names}
+    unknown = []
+    for key in source.groups_with(HLOC):
+        found = list(_splits(key, "/", by_key)) or list(_splits(key, "_", by_key))
+        if len(found) > 1:
+            both = " and ".join(f"{first}, {second}" for first, second in found[:2])
+            raise StoreError(f"{source.path}: {key} may stand for {both}; rename the images")
+        if found:
+            yield found[0], key
+        else:
+            unknown.append(key)
+    _refuse_unknown(source.path, unknown)
+
+
+def _nested_pairs(source: GivenFile, names: Collection[str]) -> Iterator[tuple[Pair, str]]:
+    """Yield the pairs of a file with a group for each first image."""
+    by_key = {name: name for name in names}
+    for name in names:
+        by_key.setdefault(Path(name).name, name)
+    unknown = []
+    for key, shape in sorted(source.shapes.items()):
+        if len(shape) != 2 or shape[1] != 2:
+            continue
+        found = list(_splits(key, "/", by_key))
+        if found:
+            yield found[0], key
+        else:
+            unknown.append(key)
+    if not any(len(shape) == 2 and shape[1] == 2 for shape in source.shapes.values()):
+        source.groups_with(HLOC)  # which says what is missing
+    _refuse_unknown(source.path, unknown)
+
+
+def _splits(key: str, separator: str, by_key: Mapping[str, str]) -> Iterator[Pair]:
+    """Yield the pairs of names that a separator in a key may stand between."""
+    parts = key.split(separator)
+    for end in range(1, len(parts)):
+        first = separator.join(parts[:end])
+        second = separator.join(parts[end:])
+        if first in by_key and second in by_key:
+            yield by_key[first], by_key[second]
+
+
+def _refuse_unknown(path: Path, keys: Collection[str]) -> None:
+    if keys:
+        raise StoreError(f"{path}: has matches of images that have no features: {such_as(keys)}")
+
+
+def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
+    """Read a text list of COLMAP."""
+    known = set(names)
+    found: dict[Pair, Indices] = {}
+    with damage(path, COMPLETE):
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        number = 0
+        while number < len(lines):
+            line = lines[number].strip()
+            number += 1
+            if not line or line.startswith("#"):
+                continue
+            pair = split_line(line, known)
+            if not pair:
+                raise StoreError(
+                    f"{path}: line {number}: {line!r} is not two names of images that have "
+                    "features, nor two numbers of features"
+                )
+            begin = number
+            while number < len(lines) and _is_match(lines[number]):
+                number += 1
+            if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
+                numbers = " ".join(lines[begin:number]).split()
+                found[pair] = np.array(numbers, np.int64).reshape(-1, 2)
+    if not found:
+        raise StoreError(f"{path}: holds no matches; give an HDF5 file, or a list of COLMAP")
+    return GivenMatches(path, tuple(found), lambda _: iter(found.items()))
+
+
+def _is_match(line: str) -> bool:
+    """Tell whether a line is of two whole numbers."""
+    parts = line.split()
+    return len(parts) == 2 and parts[0].isdecimal() and parts[1].isdecimal()

@@ -1,0 +1,73 @@
+"""HDF5 files of other programs: opened and read with care.
+
+Links and data in other files are not followed, and the shape and kind of arrays is checked.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.errors import OptionError, StoreError, damage
+
+MAX_VALUES = 1 << 28  # an array of more values is taken for damage, and not read
+MEND = "make it again with the program that wrote it"
+
+
+@dataclass(frozen=True)
+class GivenFile:
+    """An open HDF5 file of another program, and the shapes of its datasets by their paths."""
+
+    path: Path
+    file: h5py.File
+    shapes: dict[str, tuple[int, ...]]
+
+    def groups_with(self, dataset: str) -> list[str]:
+        """Return the sorted paths of the groups that have a dataset."""
+        ending = f"/{dataset}"
+        found = sorted(key.removesuffix(ending) for key in self.shapes if key.endswith(ending))
+        if self.shapes and not found:
+            raise StoreError(f"{self.path}: holds no '{dataset}' of images; is it a file of hloc?")
+        return found
+
+    def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
+        """Read numbers of some of numpy's kinds, of a shape in which None is any size."""
+        stored = self.shapes[key]
+        expected = tuple(stored[:1]) if shape[0] is None else shape[:1]
+        if stored != expected + shape[1:]:
+            wanted = str(shape).replace("None", "N")
+            raise StoreError(f"{self.path}: {key} has shape {stored}, expected {wanted}")
+        if np.prod([float(size) for size in stored]) > MAX_VALUES:
+            raise StoreError(f"{self.path}: {key} of shape {stored} is too large to be true")
+        with damage(self.path, MEND):
+            if self.file[key].dtype.kind not in kinds:
+                raise ValueError(f"{key} does not hold numbers, or no whole ones")
+            return np.asarray(self.file[key][()])
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[GivenFile]:
+    """Open a file for reading; of links nothing is seen, data that are elsewhere are refused."""
+    if not path.is_file():
+        raise OptionError(f"{path}: no such file")
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def visit(key: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset):
+            if item.external or item.is_virtual:
+                raise StoreError(f"{path}: data in other files are not followed: {key}")
+            shapes[key] = item.shape or ()
+
+    with damage(path, f"or still being written; {MEND}"):
+        file = h5py.File(path, "r")
+        try:
+            file.visititems(visit)
+        except SystemError as error:  # h5py's, for a name that is no UTF-8
+            raise ValueError(error) from error
+    with file:
+        yield GivenFile(path, file, shapes)

@@ -1,0 +1,266 @@
+"""Matches by descriptors of other programs: of arrays, files, and databases; given ones, too.
+
+What a run matches are its own features (:mod:`colmap_affrect.stages.match`). Here nothing is known
+of an image but where its keypoints are, and their descriptors.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.errors import DatabaseError, OptionError, StoreError
+from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.geometry.arrays import Floats, Singles
+from colmap_affrect.geometry.conventions import pixel_from_colmap
+from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
+from colmap_affrect.matchers.nearest import NearestNeighbors, NearestOptions
+from colmap_affrect.pairs.given_matches import GivenMatches, MatchType
+from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, ordered_for_reuse
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.progress import SILENT, Progress
+
+SIFT_SIZE = 128  # values of the one kind of descriptors that whole numbers stand for
+IMAGES_IN_MEMORY = 60
+USUAL_FEATURES = 8000  # of an image, to tell how much there is to compare
+
+Arrays = tuple[Floats, Any]
+"""(N, 2) keypoints in px, and the (N, D) descriptors of an image."""
+
+
+def match_descriptors(
+    keypoints1: Floats,
+    descriptors1: Any,
+    keypoints2: Floats,
+    descriptors2: Any,
+    options: NearestOptions | None = None,
+) -> Matches:
+    """Match the features of two images that any program has found.
+
+    Args:
+        keypoints1: (N1, 2) places in the first image in px, with any origin.
+        descriptors1: (N1, D) floats, or whole numbers of SIFT with D = 128.
+        keypoints2: (N2, 2) places in the second image in px.
+        descriptors2: (N2, D) of the same kind.
+        options: of the matcher, mutual nearest neighbours with a ratio test.
+
+    Returns:
+        Matches with ``indices`` (M, 2), rising in the first column, and ``scores`` (M,).
+
+    Raises:
+        OptionError: for arrays that do not fit.
+    """
+    sets = {"image 1": (keypoints1, descriptors1), "image 2": (keypoints2, descriptors2)}
+    pair = ("image 1", "image 2")
+    return match_feature_sets(sets, [pair], options)[pair]
+
+
+def match_feature_sets(
+    features: Mapping[str, Arrays],
+    pairs: Iterable[Pair] | None = None,
+    options: NearestOptions | None = None,
+    *,
+    progress: Progress = SILENT,
+) -> dict[Pair, Matches]:
+    """Match the features of several images that any program has found.
+
+    Args:
+        features: keypoints (N, 2) in px and descriptors (N, D) of each image, by its name.
+        pairs: names of the images to match; None: all pairs.
+        options: of the matcher, mutual nearest neighbours with a ratio test.
+        progress: where to show progress.
+
+    Returns:
+        Matches by pair, see :func:`match_descriptors`.
+
+    Raises:
+        OptionError: for arrays that do not fit, or pairs of other images.
+    """
+    listed = exhaustive_pairs(list(features)) if pairs is None else list(pairs)
+    for name in {name for pair in listed for name in pair}:
+        if name not in features:
+            raise OptionError(f"{name}: is in a pair, and has no features")
+    with progress.stage("match", len(listed), "pairs") as advance:
+        found = dict[Pair, Matches]()
+        for pair, matches in matched(listed, lambda name: features[name], options):
+            found[pair] = matches
+            advance(1)
+    return found
+
+
+def matched(
+    pairs: Sequence[Pair], read: Callable[[str], Arrays], options: NearestOptions | None = None
+) -> Iterator[tuple[Pair, Matches]]:
+    """Yield the matches of pairs; the arrays of images are read in the calling thread.
+
+    Args:
+        pairs: names of images.
+        read: returns (N, 2) keypoints and (N, D) descriptors of an image.
+        options: of the matcher.
+    """
+    context = MatcherContext(num_similarities=len(pairs) * USUAL_FEATURES**2)
+    matcher = NearestNeighbors(options or NearestOptions(), context)
+    sizes = dict[int, str]()
+
+    @lru_cache(maxsize=IMAGES_IN_MEMORY)
+    def prepared(name: str) -> Any:
+        image = _as_features(name, *read(name))
+        sizes.setdefault(image.features.descriptors.shape[1], name)
+        if len(sizes) > 1:
+            first, second = sizes.items()
+            raise OptionError(
+                f"{first[1]} has descriptors of {first[0]} values and {second[1]} of {second[0]}; "
+                "match images of one kind of features"
+            )
+        return matcher.prepare(image)
+
+    ordered = list(ordered_for_reuse(pairs, IMAGES_IN_MEMORY // 2))
+    tasks = ((prepared(first), prepared(second)) for first, second in ordered)
+    found = map_ordered(lambda both: matcher.match(*both), tasks, available_cores())
+    yield from zip(ordered, found, strict=True)
+
+
+def _as_features(name: str, keypoints: Floats, descriptors: Any) -> ImageFeatures:
+    """Check the arrays of an image, and return them as a matcher takes them."""
+    points, rows = np.asarray(keypoints, np.float64), np.asarray(descriptors)
+    if points.ndim != 2 or points.shape[1] < 2 or rows.ndim != 2 or len(rows) != len(points):
+        raise OptionError(
+            f"{name}: keypoints {points.shape} and descriptors {rows.shape} do not fit; give "
+            "(N, 2) places and (N, D) descriptors"
+        )
+    if rows.dtype.kind not in "fiu" or (rows.dtype.kind in "iu" and rows.shape[1] != SIFT_SIZE):
+        raise OptionError(
+            f"{name}: descriptors are {rows.dtype} of {rows.shape[1]} values; whole numbers are "
+            "taken for SIFT of 128 values, of others give floats (of bits -1.0 and 1.0)"
+        )
+    unit = unit_rows(rows)
+    if not (np.isfinite(points).all() and np.isfinite(unit).all()):
+        raise OptionError(f"{name}: keypoints or descriptors are not finite")
+    count = len(points)
+    lafs = lafs_from_keypoints(points[:, :2], np.ones(count), np.zeros(count))
+    features = LocalFeatures(lafs, np.ones(count, np.float32), unit)
+    return ImageFeatures(features, (0, 0), "")
+
+
+def unit_rows(descriptors: Floats) -> Singles:
+    """Return (N, D) descriptors of unit length; those of length 0 stay, and match nothing."""
+    rows = descriptors.astype(np.float32)
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))
+
+
+def described_images(path: Path) -> list[str]:
+    """Return the sorted names of the images of a database that have descriptors."""
+    with colmap_database.open_database(path) as database:
+        return sorted(
+            image.name
+            for image in database.read_all_images()
+            if database.num_descriptors_for_image(image.image_id)
+        )
+
+
+def match_database(
+    path: Path,
+    pairs: Iterable[Pair] | None = None,
+    options: NearestOptions | None = None,
+    *,
+    progress: Progress = SILENT,
+) -> int:
+    """Match images of a database by the descriptors in it, and write the raw matches into it.
+
+    Args:
+        path: database of COLMAP, which is changed.
+        pairs: names of the images to match; None: all pairs. Those that are on record are passed
+            over.
+        options: of the matcher, mutual nearest neighbours with a ratio test.
+        progress: where to show progress.
+
+    Returns:
+        How many pairs were matched.
+
+    Raises:
+        DatabaseError: when descriptors do not fit keypoints, or are of different kinds.
+    """
+    names = described_images(path)
+    listed = exhaustive_pairs(names) if pairs is None else list(pairs)
+    known = set(names)
+    with colmap_database.open_database(path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        todo = _unmatched(database, [p for p in listed if known.issuperset(p)], ids)
+
+        def read(name: str) -> Arrays:
+            return _read_arrays(database, ids[name], f"{path}: {name}")
+
+        with progress.stage("match", len(todo), "pairs") as advance:
+            try:
+                for (first, second), found in matched(todo, read, options):
+                    colmap_database.write_matches(database, ids[first], ids[second], found.indices)
+                    advance(1)
+            except OptionError as error:
+                raise DatabaseError(f"{path}: {error}") from error
+    return len(todo)
+
+
+def _unmatched(
+    database: pycolmap.Database, pairs: Sequence[Pair], ids: Mapping[str, int]
+) -> list[Pair]:
+    """Return the pairs of which no matches are on record, not even none."""
+    numbers = np.array([[ids[name] for name in pair] for pair in pairs], np.int64).reshape(-1, 2)
+    lacking = colmap_database.lack_matches(database, numbers)
+    return [pair for pair, lacks in zip(pairs, lacking, strict=True) if lacks]
+
+
+def _read_arrays(database: pycolmap.Database, image_id: int, where: str) -> Arrays:
+    """Return the keypoints, in pixel-centre px, and the descriptors of an image."""
+    points = np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
+    descriptors = database.read_descriptors(image_id)
+    if len(descriptors.data) != len(points):
+        raise DatabaseError(
+            f"{where} has {len(points)} keypoints and {len(descriptors.data)} descriptors"
+        )
+    try:
+        values = np.asarray(descriptors.to_float().data, np.float32)
+    except ValueError as error:
+        raise DatabaseError(f"{where} has descriptors of no known type") from error
+    return np.asarray(pixel_from_colmap(points)), values
+
+
+def write_given_matches(
+    database: pycolmap.Database,
+    given: GivenMatches,
+    match_type: MatchType,
+    advance: Callable[[int], None],
+) -> None:
+    """Write matches into a database; inliers as two-view geometries, too.
+
+    Args:
+        database: with the keypoints that the matches are of.
+        given: the matches.
+        match_type: what they are.
+        advance: called with the number of pairs written.
+
+    Raises:
+        StoreError: when a match points at no keypoint.
+    """
+    images = {image.name: image for image in database.read_all_images()}
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    counts = {n: database.num_keypoints_for_image(i.image_id) for n, i in images.items()}
+    for pair, indices in given.read(counts):
+        first, second = (images[name] for name in pair)
+        try:
+            colmap_database.write_matches(database, first.image_id, second.image_id, indices)
+        except DatabaseError as error:
+            raise StoreError(f"{given.path}: {pair[0]}, {pair[1]}: {error}") from error
+        if match_type == "inliers":
+            known = [cameras[image.camera_id].has_prior_focal_length for image in (first, second)]
+            geometry = pycolmap.TwoViewGeometry()
+            kinds = pycolmap.TwoViewGeometryConfiguration
+            geometry.config = kinds.CALIBRATED if all(known) else kinds.UNCALIBRATED
+            geometry.inlier_matches = indices.astype(np.uint32)
+            database.write_two_view_geometry(first.image_id, second.image_id, geometry)
+        advance(1)

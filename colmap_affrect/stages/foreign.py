@@ -1,0 +1,193 @@
+"""Another program's database is copied, in the place of all stages before mapping.
+
+What a user knows beside it goes into the copy: cameras, and matches that are in files. Images that
+nobody has matched are matched by the descriptors of the database.
+"""
+
+import logging
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cameras import CameraRecord
+from colmap_affrect.colmap.checks import FATAL, refuse_unusable
+from colmap_affrect.colmap.database_copy import add_frames, copy_database, has_matches, read_names
+from colmap_affrect.colmap.initial_cameras import InitialCameras, record_cameras
+from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.options import digest_of
+from colmap_affrect.pairs.given_matches import MatchType, given_matches
+from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.project.paths import TakesPaths
+from colmap_affrect.project.record import content_of
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.stages.context import Context, source_files
+from colmap_affrect.stages.descriptors import (
+    described_images,
+    match_database,
+    write_given_matches,
+)
+
+logger = logging.getLogger(__name__)
+
+Records = dict[int, CameraRecord]
+
+
+@dataclass(frozen=True)
+class ForeignDatabase(TakesPaths):
+    """A database of another program, and what is known beside it."""
+
+    path: Path
+    image_path: Path | None = None  # folder of the photographs
+    cameras: CameraOptions = field(default_factory=CameraOptions)  # for images of the database
+    matches_path: Path | None = None  # matches of its keypoints
+    match_type: MatchType = "raw"  # what those are
+    match_list_path: Path | None = None  # pairs to match by descriptors; None: all
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what a run keeps of it; what is not given is not there."""
+        record: dict[str, Any] = {
+            "database": str(self.path.resolve()),
+            "image_path": str(self.image_path.resolve()) if self.image_path else "",
+        }
+        if self.cameras != CameraOptions():
+            record["cameras"] = self.cameras.to_mapping()
+        if self.matches_path:
+            record["matches"] = str(self.matches_path.resolve())
+            record["match_type"] = self.match_type
+        if self.match_list_path:
+            record["match_list"] = str(self.match_list_path.resolve())
+        return record
+
+    @classmethod
+    def of_record(cls, record: dict[str, Any]) -> "ForeignDatabase":
+        """Return it from what a run keeps of it."""
+        return cls(
+            Path(record["database"]),
+            Path(record["image_path"]) if record.get("image_path") else None,
+            CameraOptions.from_mapping(record.get("cameras", {}), "config.toml"),
+            Path(record["matches"]) if "matches" in record else None,
+            record.get("match_type", "raw"),
+            Path(record["match_list"]) if "match_list" in record else None,
+        )
+
+    def digest(self) -> str:
+        """Return a digest of all files that are given."""
+        database = content_of(source_files(self.path)).digest
+        others = [self.matches_path, self.match_list_path]
+        others.append(Path(self.cameras.cameras_path) if self.cameras.cameras_path else None)
+        found = [content_of(source_files(path)).digest for path in others if path]
+        return digest_of([database, *found]) if found else database
+
+    def check(self) -> None:
+        """Refuse what names no file, or cameras of other images, before anything is made."""
+        if self.image_path and not self.image_path.is_dir():
+            raise OptionError(f"--image-path {self.image_path}: no such folder")
+        if self.matches_path and self.match_list_path:
+            raise OptionError(
+                "--match-list-path: only without --matches-path: it says what to match"
+            )
+        names = read_names(self.path)
+        self.initial_cameras().check_known(names, str(self.path))
+        if self.match_list_path:
+            read_pairs(self.match_list_path, names, self.image_path)
+
+    def initial_cameras(self) -> InitialCameras:
+        """Return the cameras that the user gives."""
+        options = self.cameras.changed(ignore_exif=True)
+        return InitialCameras(self.image_path or self.path.parent, options)
+
+
+def copy_verified(
+    context: Context,
+    foreign: ForeignDatabase,
+    verification: VerificationOptions,
+    *,
+    overwrite: bool = False,
+) -> StageReport:
+    """Copy a database, and verify its matched pairs that have no two-view geometry.
+
+    The copy is made anew when a given file has changed since, or with ``overwrite``. Raises
+    DatabaseError when it cannot be used, or has neither matches nor descriptors.
+    """
+    start = time.perf_counter()
+    workspace, source = context.workspace, foreign.path
+    foreign.check()
+    workspace.require_own(foreign.image_path)
+    digest = foreign.digest()
+    if digest != workspace.made_from("copy") or not workspace.database.exists():
+        refuse_unusable(source, warns=True)
+    workspace.record_options("copy", foreign.to_record(), overwrite=overwrite)
+    warnings = {}
+    if digest != (before := workspace.made_from("copy")):
+        if before:
+            warnings[str(source)] = "has changed; its copy and the models are made anew"
+            logger.warning("%s: %s", source, warnings[str(source)])
+        workspace.rewind()
+        workspace.record_made_from(copy=digest)
+    if not workspace.database.exists():
+        record_cameras(workspace.database, workspace.cameras, known=_copy(context, foreign))
+    record_cameras(workspace.database, workspace.cameras)
+    workspace.record_options("verify", verification.to_mapping())
+    _match(context, foreign)
+    num_pairs = colmap_database.num_matched_pairs(workspace.database)
+    if not num_pairs:
+        raise DatabaseError(f"{source}: has no matches; match its images first")
+    todo = len(colmap_database.unverified_pairs(workspace.database))
+    if todo:
+        logger.warning("%s: %d pairs have matches only; they are verified now", source, todo)
+    with context.progress.stage("verify", todo, "pairs") as advance:
+        verify(workspace.database, verification, advance=advance)
+    wall_s = time.perf_counter() - start
+    return StageReport("verify", wall_s, todo, num_pairs - todo, warnings=warnings)
+
+
+def _copy(context: Context, foreign: ForeignDatabase) -> Records:
+    """Copy a database with what is given beside it; return records of given cameras."""
+    records = Records()
+
+    def change(database: pycolmap.Database) -> None:
+        add_frames(database)
+        records.update(foreign.initial_cameras().replace_cameras(database))
+        if not (foreign.matches_path or has_matches(foreign.path)):
+            database.clear_matches()  # rows of no matches
+        if not foreign.matches_path:
+            return
+        names = [
+            image.name
+            for image in database.read_all_images()
+            if database.exists_keypoints(image.image_id)
+        ]
+        with (
+            given_matches(foreign.matches_path, names) as found,
+            context.progress.stage("matches", len(found.pairs), "pairs") as advance,
+        ):
+            write_given_matches(database, found, foreign.match_type, advance)
+
+    copy_database(foreign.path, context.workspace.database, FATAL, change)
+    return records
+
+
+def _match(context: Context, foreign: ForeignDatabase) -> None:
+    """Match the images by their descriptors where nobody has matched any."""
+    if foreign.matches_path or has_matches(foreign.path):
+        if foreign.match_list_path:
+            raise OptionError(f"--match-list-path: {foreign.path} has matches already")
+        return
+    path = context.workspace.database
+    names = described_images(path)
+    if len(names) < 2:
+        raise DatabaseError(
+            f"{foreign.path}: has no matches, nor descriptors to match by; match its images first, "
+            "or give --matches-path"
+        )
+    pairs = None
+    if foreign.match_list_path:
+        pairs = read_pairs(foreign.match_list_path, names, foreign.image_path)
+    num = match_database(path, pairs, progress=context.progress)
+    if num:
+        logger.warning("%s: has no matches; %d pairs are matched now", foreign.path, num)

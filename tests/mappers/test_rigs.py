@@ -1,0 +1,160 @@
+"""Rigs: models of them take little work, and what the caller holds stays as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pyceres
+import pytest
+from mapping_tasks import mapper_of, synthesize
+
+import colmap_affrect
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cameras import CameraRecord
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.mappers.adjustment import Settled
+from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.reliability import MAX_NUM_OBSERVATIONS, _with_fewer_points
+from colmap_affrect.mappers.search import _as_first_pairs
+
+SIZE = (1024, 768)
+
+
+def synthesize_rig(path: Path, **options: Any) -> pycolmap.Reconstruction:
+    """Make a verified database of one rig of three cameras and four frames."""
+    given = {"num_rigs": 1, "num_cameras_per_rig": 3, "num_frames_per_rig": 4, **options}
+    return synthesize(path, num_points3D=100, **given)
+
+
+def unknown_cameras(path: Path) -> dict[int, CameraRecord]:
+    """Return records of cameras of which nothing is known."""
+    with open_database(path) as database:
+        cameras = database.read_all_cameras()
+    record = CameraRecord(("a",), "guess", 1280.0, size=SIZE)
+    return {camera.camera_id: replace(record) for camera in cameras}
+
+
+@pytest.mark.parametrize(("mapper", "most"), [("incremental", 1.6e5), ("sparse", 4e5)])
+def test_rig_is_mapped_and_judged_with_few_evaluations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapper: str, most: float
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize_rig(path)
+    evaluated = 0  # residuals, in all steps
+    solve = pyceres.solve
+
+    def counting(options: Any, problem: Any, summary: Any) -> None:
+        nonlocal evaluated
+        solve(options, problem, summary)
+        steps = summary.num_successful_steps + summary.num_unsuccessful_steps
+        evaluated += steps * problem.num_residuals()
+
+    monkeypatch.setattr(pyceres, "solve", counting)
+    task = MappingTask(path, None, cameras=unknown_cameras(path))
+    (model,) = map_database(mapper_of(mapper), task, tmp_path / "sparse", lambda _: None)
+    assert len(model.registered_names) == 12
+    assert min(model.probabilities.values()) > 0.9
+    assert 0 < evaluated < most
+
+
+def test_image_of_a_rig_that_sees_next_to_nothing_is_as_sure_as_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize_rig(path)
+    with open_database(path) as database:
+        blind = {i.image_id for i in database.read_all_images() if i.camera_id == 2}
+        for pair_id in database.read_two_view_geometry_num_inliers()[0]:
+            ids = pycolmap.pair_id_to_image_pair(pair_id)
+            if blind.intersection(ids):
+                database.delete_two_view_geometry(*ids)
+    task = MappingTask(path, None)
+    (model,) = map_database(mapper_of("incremental"), task, tmp_path / "sparse", lambda _: None)
+    assert len(model.registered_names) == 12
+    assert min(model.probabilities.values()) > 0.9
+    assert not model.taken_out
+
+
+def test_first_pairs_are_of_two_frames_as_long_as_there_are_any(tmp_path: Path) -> None:
+    synthesize_rig(tmp_path / "database.db")
+    graph = PairGraph.read(tmp_path / "database.db")
+    images = graph.cache.images
+    frames = [{images[i].frame_id for i in p.ids} for p in _as_first_pairs(graph.pairs, graph)]
+    sizes = [len(frame) for frame in frames]
+    assert len(sizes) == len(graph.pairs)
+    assert sizes == sorted(sizes, reverse=True)
+    assert {*sizes} == {1, 2}
+
+
+def test_one_frame_of_a_wide_rig_is_a_model(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize_rig(path, num_frames_per_rig=1, sensor_from_rig_translation_stddev=1.0)
+    task = MappingTask(path, None)
+    (model,) = map_database(mapper_of("sparse"), task, tmp_path / "sparse", lambda _: None)
+    assert len(model.registered_names) == 3
+
+
+def test_trials_have_few_observations_of_a_rig_and_all_others_of_single_cameras(
+    tmp_path: Path,
+) -> None:
+    rig = synthesize(
+        tmp_path / "rig.db", num_rigs=1, num_cameras_per_rig=3, num_frames_per_rig=4,
+        num_points3D=600,
+    )  # fmt: skip
+    single = synthesize(tmp_path / "single.db", num_rigs=12, num_points3D=600)
+    num_all = rig.compute_num_observations()
+    assert num_all == single.compute_num_observations() > 2 * MAX_NUM_OBSERVATIONS
+    assert _with_fewer_points(single).compute_num_observations() == num_all
+    assert 0 < _with_fewer_points(rig).compute_num_observations() <= MAX_NUM_OBSERVATIONS
+
+
+def test_what_is_not_to_be_refined_stays_as_the_database_has_it(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize_rig(path, noise_px=0.5)
+    with open_database(path) as database:
+        rigs = {rig.rig_id: rig for rig in database.read_all_rigs()}
+    held = dict.fromkeys(
+        ["ba_refine_sensor_from_rig", "ba_refine_focal_length", "ba_refine_principal_point",
+         "ba_refine_extra_params"],
+        False,
+    )  # fmt: skip
+    found = colmap_affrect.incremental_mapping(path, tmp_path, tmp_path / "out", held)
+    assert found[0].num_reg_images() == 12
+    for camera in found[0].cameras.values():
+        assert camera.params.tolist() == [1280.0, 512.0, 384.0, 0.05]
+    (rig,) = found[0].rigs.values()
+    for sensor, pose in rig.non_ref_sensors.items():
+        known = rigs[rig.rig_id].non_ref_sensors[sensor]
+        assert pose.matrix() == pytest.approx(known.matrix(), abs=1e-9)
+
+
+class Step:
+    """What Ceres tells of a step."""
+
+    step_is_successful = True
+
+    def __init__(self, iteration: int, cost: float, change: float) -> None:
+        self.iteration = iteration
+        self.cost = cost
+        self.cost_change = change
+
+
+@pytest.mark.parametrize(
+    ("changes", "num_steps"),
+    [
+        ([500.0, 100.0, 1.0, 1.0], 3),  # nothing that is left brings it near to the other cost
+        ([500.0, 400.0, 30.0, 0.01, 0.01, 0.01], 6),  # it hardly gets nearer any more
+        ([500.0, 400.0, 30.0, 0.01, 0.5, 0.01], 6),  # only some steps bring little
+    ],
+)
+def test_trial_ends_once_its_cost_tells_enough(changes: list[float], num_steps: int) -> None:
+    settled = Settled(other_cost=100.0, enough=2.0, max_iterations=100)
+    cost, taken = 1100.0 if num_steps == 3 else 1050.0, 0
+    for number, change in enumerate(changes, 1):
+        cost -= change
+        taken += 1
+        if settled(Step(number, cost, change)) == pyceres.CallbackReturnType(2):
+            break
+    assert taken == num_steps
