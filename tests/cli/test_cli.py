@@ -48,7 +48,7 @@ def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
     parser = build_parser()
     assert {example.split()[0] for example in EXAMPLES} == {
         *COMMANDS, "convert", "show-pair", "import-h5", "export-h5", "export-database", "export",
-        "align",
+        "align", "panoramas",
     }  # fmt: skip
     for example in EXAMPLES:
         parser.parse_args(example.replace("\\\n", " ").split())
@@ -104,7 +104,7 @@ def test_the_name_alone_shows_the_help(call: Call) -> None:
     [
         ("rum", "invalid choice: 'rum'"),
         ("run --image-path x", "required: --output-path"),
-        ("map --output-path {out} --camera-mode single", "unknown argument --camera-mode"),
+        ("pairs --output-path {out} --camera-mode single", "unknown argument --camera-mode"),
         ("match --output_path {out} -q -v", "not allowed with argument"),
         (
             "run --image-path x --output-path {out} --recipie x",
