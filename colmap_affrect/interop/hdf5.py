@@ -51,7 +51,6 @@ from colmap_affrect.geometry.conventions import (
     pixel_from_colmap,
 )
 from colmap_affrect.images.photographs import CameraOptions, list_images, refuse_colliding_keys
-from colmap_affrect.matchers.base import Matches
 from colmap_affrect.pairs.given_matches import (
     GivenMatches,
     MatchType,
@@ -247,12 +246,14 @@ def _matches(
         points = features.read(f"{keys[name]}/keypoints", (None, 2))
         return points, _descriptors(features, keys[name], len(points))
 
-    yield GivenMatches(features.path, tuple(pairs), lambda _: _indices_of(matched(pairs, read)))
+    def matched_pairs(_: Mapping[str, int]) -> Iterator[tuple[Pair, Indices]]:
+        try:
+            for pair, matches in matched(pairs, read):
+                yield pair, matches.indices
+        except OptionError as error:
+            raise StoreError(f"{features.path}: {error}") from error
 
-
-def _indices_of(found: Iterator[tuple[Pair, Matches]]) -> Iterator[tuple[Pair, Indices]]:
-    for pair, matches in found:
-        yield pair, matches.indices
+    yield GivenMatches(features.path, tuple(pairs), matched_pairs)
 
 
 def _descriptors(features: GivenFile, key: str, count: int) -> NDArray[Any]:
@@ -348,7 +349,7 @@ def _write_keypoints(
 def _keypoint_rows(source: GivenFile, name: str) -> Singles:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
     lafs, scales, oris = (f"{name}/{dataset}" for dataset in ("lafs", "scales", "oris"))
-    with np.errstate(over="ignore"):  # what float32 cannot hold is refused later
+    with np.errstate(all="ignore"):  # what is not finite, or float32 cannot hold, is refused later
         points = source.read(f"{name}/keypoints", (None, 2)).astype(np.float32)
         centers = np.asarray(colmap_from_pixel(points))
         count = len(points)

@@ -16,6 +16,7 @@ from colmap_affrect.images.exif import read_camera_tags
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.interop import pycolmap_api as ours
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.outputs import refuse_link
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.workspace import Workspace
 
@@ -144,6 +145,8 @@ def _check_output(image_path: Path, output_path: Path) -> None:
     """Refuse to write among panoramas, or into a folder of something else."""
     if output_path.resolve().is_relative_to(image_path.resolve()):
         raise OptionError(f"{output_path}: is in the folder of the panoramas; give another one")
+    for name in ("", "images", "masks", "sparse", "sparse_equirectangular", "database.db"):
+        refuse_link(output_path / name)
     begun = Workspace.beside(output_path / "database.db").path
     is_other = output_path.exists() and not output_path.is_dir()
     if is_other or (output_path.is_dir() and any(output_path.iterdir()) and not begun.is_dir()):

@@ -149,9 +149,10 @@ def _as_features(name: str, keypoints: Floats, descriptors: Any) -> ImageFeature
 
 def unit_rows(descriptors: Floats) -> Singles:
     """Return (N, D) descriptors of unit length; those of length 0 stay, and match nothing."""
-    rows = descriptors.astype(np.float32)
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))
+    with np.errstate(all="ignore"):  # what is not finite stays so
+        rows = descriptors.astype(np.float32)
+        lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+        return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))
 
 
 def described_images(path: Path) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from h5_files import Files, hloc_group, match_group, write_h5, write_photos
@@ -166,6 +167,15 @@ def test_features_without_descriptors_and_matches_are_refused(files: Files) -> N
     write_h5(files.features, {"a.png": hloc_group(3), "sub/b c.png": hloc_group(3)})
     write_h5(files.features, {"a.png": {**hloc_group(3), "descriptors": np.zeros((8, 2))}})
     with pytest.raises(StoreError, match=r"descriptors has shape \(8, 2\), expected \(D, 3\)"):
+        files.import_all()
+
+
+def test_descriptors_that_are_not_finite_are_named_with_their_file(files: Files) -> None:
+    described(files, 64)
+    with h5py.File(files.features, "a") as file:
+        file["sub/b c.png/descriptors"][0, 0] = np.nan
+    files.matches = None
+    with pytest.raises(StoreError, match=r"features\.h5: sub/b c\.png: .* are not finite"):
         files.import_all()
 
 

@@ -49,6 +49,10 @@ def test_folder_of_something_else_is_not_written_to(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="is in the folder of the panoramas"):
         reconstruct_panoramas(tmp_path / "panoramas", tmp_path / "panoramas" / "out")
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["letter.txt"]
+    (tmp_path / "begun" / "database.affrect").mkdir(parents=True)
+    (tmp_path / "begun" / "images").symlink_to(tmp_path / "mine")
+    with pytest.raises(OptionError, match="is a symbolic link"):
+        reconstruct_panoramas(tmp_path / "panoramas", tmp_path / "begun")
 
 
 def test_all_stages_show_progress_and_no_model_is_said(

@@ -72,6 +72,7 @@ def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         assert run_in_process_of_its_own(*words).code == 0
     shutil.copy(out / "database.db", folder / "any.db")
+    shutil.copy(out / "features.h5", folder / "described.h5")
     for name in ("plain", "lens"):
         model = pycolmap.Reconstruction(out / "sparse" / "0")
         for camera in model.cameras.values() if name == "lens" else ():
@@ -103,7 +104,7 @@ NAMES = (
 
 RESULTS = {
     "ply": "points3D.ply", "text": "text", "undistorted": "dense", "nerfstudio": "dense",
-    "cameras": "cameras.csv",
+    "mvsnet": "dense", "cameras": "cameras.csv",
 }  # fmt: skip
 """What each format of ``export`` writes."""
 
@@ -131,6 +132,11 @@ def exports(base: Path, photograph: str) -> dict[str, tuple[Words, str]]:
         "export-database": (["export-database", base / "any.db", "{out}/old.db"], "old.db"),
         "import-h5": (
             ["import-h5", *images, *files, *CAMERA, "--database-path", "{out}/new.db"], "new.db"
+        ),
+        "import-h5 of descriptors": (
+            ["import-h5", *images, "--features-path", base / "described.h5", *CAMERA,
+             "--database-path", "{out}/new.db"],
+            "new.db",
         ),
         "convert": (["convert", *images, "--output-path", "{out}/converted"], "converted"),
         "inspect": (["inspect", image, *PLAIN, *to], f"{image.stem}-plan.json"),
@@ -160,8 +166,9 @@ def rename_image(base: Path, name: str) -> None:
         model.write(model_path)
     quoted = name.replace("'", "''")
     execute(base / "any.db", f"UPDATE images SET name = '{quoted}' WHERE name = 'a.png'")
-    with suppress(ValueError, RuntimeError), h5py.File(base / "features.h5", "a") as file:
-        file.copy("a.png", name)
+    for features in ("features.h5", "described.h5"):
+        with suppress(ValueError, RuntimeError), h5py.File(base / features, "a") as file:
+            file.copy("a.png", name)
     (base / "list.txt").write_text(f"{name}\nb-c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
 
 
@@ -170,7 +177,7 @@ def assert_whole(label: str, out: Path) -> None:
     found = tree(out)
     assert not [key for key, value in found.items() if value[0] == "link" or "affrect" in key]
     assert any(value[0] != "folder" for value in found.values()), "nothing was written"
-    if "undistorted" in label or "nerfstudio" in label:
+    if any(form in label for form in ("undistorted", "nerfstudio", "mvsnet")):
         pictures = [path for path in (out / "dense" / "images").rglob("*") if path.is_file()]
         model = pycolmap.Reconstruction(out / "dense" / "sparse")
         assert (len(pictures), model.num_reg_images()) == (4, 4)
@@ -354,6 +361,39 @@ def test_pipe_in_the_place_of_a_file_is_named_at_once(
         assert "Traceback" not in end.stdout + "".join(end.stderr), (command, end)
         assert end.code in (0, 1, 2), (command, end)
         assert command == "doctor" or len(end.errors) == bool(end.code), (command, end)
+
+
+GIVEN = ("features.h5", "matches.h5", "matches.txt", "pairs.txt")
+
+
+@pytest.mark.parametrize("number", range(40 * TIMES))
+def test_damaged_file_of_another_program_is_refused_or_read(
+    scene: Path, tmp_path: Path, call: Call, number: int
+) -> None:
+    chance = random.Random(f"given {number}")
+    shutil.copy(scene / "described.h5", tmp_path / "features.h5")
+    shutil.copy(scene / "matches.h5", tmp_path / "matches.h5")
+    lines = ["a.png side/č.png", *(f"{row} {row}" for row in range(40)), ""]
+    (tmp_path / "matches.txt").write_text("\n".join(lines), encoding="utf-8")
+    (tmp_path / "pairs.txt").write_text("a.png b-c.png 0.5\n", encoding="utf-8")
+    name = GIVEN[number % len(GIVEN)]
+    done = damage(tmp_path / name, chance, others=[tmp_path / other for other in GIVEN])
+    how = {
+        "matches.h5": ["--matches-path", tmp_path / name],
+        "matches.txt": ["--matches-path", tmp_path / name, "--match-type", "inliers"],
+        "pairs.txt": ["--match-list-path", tmp_path / name],
+        "features.h5": [],
+    }[name]
+    files = ["--features-path", tmp_path / "features.h5", "--image-path", scene / "photos"]
+    before = tree(tmp_path)
+    new = tmp_path / "new.db"
+    end = call("import-h5", "-q", *files, *how, *CAMERA, "--database-path", new)
+    sys.stdout.write(f"{done}: {end.stderr}\n")  # shown when the test fails
+    assert_clear(end, 0, 1, 2)
+    if end.code == 0:
+        assert call("doctor", "-q", new).code == 0
+        new.unlink()
+    assert differences(before, tree(tmp_path)) == []
 
 
 # Part 3: folders that are not ours.
