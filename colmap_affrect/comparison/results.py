@@ -179,9 +179,14 @@ class MethodResult:
 
     @property
     def stage_seconds(self) -> dict[str, float]:
-        """Seconds of every stage; of those that run once per seed, the mean."""
+        """Seconds of every stage; of those that run once per seed, the mean.
+
+        The first seed of a recipe with levels has none: escalation has verified and mapped.
+        """
         stages = dict.fromkeys(stage for seed in self.seeds for stage in seed.wall_s)
-        means = {stage: fmean(seed.wall_s[stage] for seed in self.seeds) for stage in stages}
+        means = {
+            stage: fmean(seed.wall_s.get(stage, 0.0) for seed in self.seeds) for stage in stages
+        }
         return {**self.wall_s, **means}
 
     @property

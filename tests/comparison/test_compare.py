@@ -331,3 +331,23 @@ def test_colmaps_sift_has_the_masks_of_alpha_channels(tmp_path: Path) -> None:
     with _masks_for_colmap(photographs, ["side/cut.png", "whole.png"]) as folder:
         assert read_mask(Path(folder) / "side" / "cut.png.png").mean() == 0.75
         assert read_mask(Path(folder) / "whole.png.png").all()
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("no_page")
+def test_first_seed_of_a_recipe_with_levels_has_the_models_of_escalation(
+    scene: Path, tmp_path: Path
+) -> None:
+    """Others are mapped anew from its matches."""
+    options = CompareOptions(methods=["on-demand"], seeds=(0, 1), cameras=CAMERAS)
+    (method,) = compare(scene / "images", tmp_path / "out", options).methods
+    folder = tmp_path / "out" / method.folder
+    first, second = method.seeds
+    assert first.wall_s == {}
+    assert {*second.wall_s} == {"verify", "map"}
+    assert {*method.stage_seconds} == {"extract", "match", "escalate", "verify", "map"}
+    for seed in method.seeds:
+        assert len(seed.registered_names) == NUM_IMAGES
+        assert seed.verified_pairs == NUM_IMAGES * (NUM_IMAGES - 1) // 2
+    models = [folder / name / "sparse" / "0" / "images.bin" for name in ("", "seed-0")]
+    assert models[0].read_bytes() == models[1].read_bytes()
