@@ -145,6 +145,7 @@ def test_worker_ends_with_the_process_that_was_started() -> None:
         process.communicate(timeout=5.0)  # which the worker's end of the pipe would keep open
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "closed", [(0, 1, 2), *(pytest.param((number,), marks=pytest.mark.long) for number in (1, 2))]
 )
@@ -196,6 +197,7 @@ def test_want_of_memory_while_packages_are_loaded_is_one_line() -> None:
     assert line.startswith("error: not enough memory; ")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("encoding", "shown"), [
     ("ascii", b"out \\u010d\\u00e9\\ud83d\\ude00"),
     ("cp1252:strict", b"out \\u010d\xe9\\ud83d\\ude00"),

@@ -225,6 +225,7 @@ def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
         assert again == fresh
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("before", ["_extract_missing", "write_images_and_keypoints"])
 def test_a_photograph_that_vanishes_while_a_run_works_is_left_out(
     tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, before: str

@@ -250,6 +250,7 @@ def test_photographs_that_are_likely_right_in_another_model_need_a_quarter(
     assert work.needs(models) == {EASY[0]: 0.25, EASY[1]: 0.25, NAMES[2]: 1.0}
 
 
+@pytest.mark.long
 def test_each_step_has_a_bar_that_ends_full(before: Workspace, tmp_path: Path) -> None:
     workspace, shown = copy_of(before, tmp_path), io.StringIO()
     with workspace.locked():
