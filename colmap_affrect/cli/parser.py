@@ -3,6 +3,7 @@
 import argparse
 import re
 import sys
+from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any, NoReturn
 
@@ -64,13 +65,26 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; names of flags may have underscores, and an unknown one is refused."""
         words = [_with_hyphens(word) for word in (sys.argv[1:] if args is None else args)]
+        if not self._subparsers:
+            self._refuse_unknown(self._of_other_commands(words))
         found, unknown = super().parse_known_args(words, namespace)
-        if unknown:
-            name = next((word for word in unknown if word.startswith("-")), unknown[0])
-            close = get_close_matches(name.partition("=")[0], self._option_string_actions, n=1)
-            meant = f" (did you mean {close[0]}?)" if close else ""
-            self.error(f"unknown argument {name}{meant}")
+        self._refuse_unknown(unknown)
         return found, unknown
+
+    def _refuse_unknown(self, unknown: Sequence[str]) -> None:
+        if not unknown:
+            return
+        name = next((word for word in unknown if word.startswith("-")), unknown[0])
+        close = get_close_matches(name.partition("=")[0], self._option_string_actions, n=1)
+        meant = f" (did you mean {close[0]}?)" if close else ""
+        self.error(f"unknown argument {name}{meant}")
+
+    def _of_other_commands(self, words: Sequence[str]) -> list[str]:
+        """Return flags of other commands: argparse would take them for the beginning of ours."""
+        flags = {flag for names in FLAGS for flag in names.partition("@")[0].split(",")}
+        others = {flag for flag in flags if flag.startswith("--")}
+        others -= self._option_string_actions.keys()
+        return [word for word in words if word.partition("=")[0] in others]
 
 
 def _with_hyphens(word: str) -> str:
