@@ -66,12 +66,10 @@ class Parser(argparse.ArgumentParser):
         """Parse; names of flags may have underscores, and an unknown one is refused."""
         given = list(sys.argv[1:] if args is None else args)
         words = self._with_values([_with_hyphens(word) for word in given])
+        if not self._subparsers:
+            self._refuse_unknown(self._of_other_commands(words))
         found, unknown = super().parse_known_args(words, namespace)
-        if unknown:
-            name = next((word for word in unknown if word.startswith("-")), unknown[0])
-            close = get_close_matches(name.partition("=")[0], self._option_string_actions, n=1)
-            meant = f" (did you mean {close[0]}?)" if close else ""
-            self.error(f"unknown argument {name}{meant}")
+        self._refuse_unknown(unknown)
         return found, unknown
 
     def _with_values(self, words: Sequence[str]) -> list[str]:
@@ -87,6 +85,21 @@ class Parser(argparse.ArgumentParser):
             else:
                 joined.append(word)
         return joined
+
+    def _refuse_unknown(self, unknown: Sequence[str]) -> None:
+        if not unknown:
+            return
+        name = next((word for word in unknown if word.startswith("-")), unknown[0])
+        close = get_close_matches(name.partition("=")[0], self._option_string_actions, n=1)
+        meant = f" (did you mean {close[0]}?)" if close else ""
+        self.error(f"unknown argument {name}{meant}")
+
+    def _of_other_commands(self, words: Sequence[str]) -> list[str]:
+        """Return flags of other commands: argparse would take them for the beginning of ours."""
+        flags = {flag for names in FLAGS for flag in names.partition("@")[0].split(",")}
+        others = {flag for flag in flags if flag.startswith("--")}
+        others -= self._option_string_actions.keys()
+        return [word for word in words if word.partition("=")[0] in others]
 
 
 def _with_hyphens(word: str) -> str:

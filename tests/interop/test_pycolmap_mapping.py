@@ -186,9 +186,7 @@ def test_databases_that_cannot_be_mapped_are_one_clear_line(tmp_path: Path) -> N
         database.clear_two_view_geometries()
         database.clear_matches()
         database.clear_descriptors()
-    with pytest.raises(
-        DatabaseError, match=r"any\.db: has no matches, nor descriptors to match by; match"
-    ):
+    with pytest.raises(DatabaseError, match=r"any\.db: has no matches, nor descriptors to match"):
         colmap_affrect.map_from_database(path, tmp_path / "out")
     with pytest.raises(OptionError, match="no such file"):
         colmap_affrect.map_from_database(tmp_path / "no.db", tmp_path / "none")
