@@ -191,10 +191,7 @@ def import_h5(
         problems = check_database(new)[1]
         num_verified = None
         if not skip_verification:
-            options = VerificationOptions(random_seed=random_seed)
-            with progress.stage("verify", len(pairs), "pairs") as advance:
-                verify(new, options, advance=advance)
-            num_verified = len(verified_pairs(new, options.min_num_inliers))
+            num_verified = _verify(new, len(pairs), random_seed, progress)
     without = sorted(set(names) - set(rejected) - set(described))
     left_out = {
         "images without features are there without keypoints": without,
@@ -203,6 +200,14 @@ def import_h5(
     }
     num_images = len(names) - len(rejected)
     return InterchangeReport("imported", num_images, *counts, num_verified, left_out)
+
+
+def _verify(path: Path, num_pairs: int, random_seed: int, progress: Progress) -> int:
+    """Verify all pairs of a database, and return how many hold."""
+    options = VerificationOptions(random_seed=random_seed)
+    with progress.stage("verify", num_pairs, "pairs") as advance:
+        verify(path, options, advance=advance)
+    return len(verified_pairs(path, options.min_num_inliers))
 
 
 def _fill(
