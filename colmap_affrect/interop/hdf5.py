@@ -188,21 +188,32 @@ def import_h5(
                 f"mode {cameras.mode} allows): {such_as(lost)}"
             )
         counts = _fill(new, features, described, matches, pairs, progress)
-        problems = check_database(new)[1]
+        odd = _odd_keypoints(new)
         num_verified = None
         if not skip_verification:
-            options = VerificationOptions(random_seed=random_seed)
-            with progress.stage("verify", len(pairs), "pairs") as advance:
-                verify(new, options, advance=advance)
-            num_verified = len(verified_pairs(new, options.min_num_inliers))
+            num_verified = _verify(new, len(pairs), random_seed, progress)
     without = sorted(set(names) - set(rejected) - set(described))
     left_out = {
         "images without features are there without keypoints": without,
         "images that COLMAP does not take are left out": rejected,
-        **{CHECKS[kind]["what"]: problems.get(kind, []) for kind in sorted(WARNED)},
+        **odd,
     }
     num_images = len(names) - len(rejected)
     return InterchangeReport("imported", num_images, *counts, num_verified, left_out)
+
+
+def _verify(path: Path, num_pairs: int, random_seed: int, progress: Progress) -> int:
+    """Verify all matched pairs; return how many are."""
+    options = VerificationOptions(random_seed=random_seed)
+    with progress.stage("verify", num_pairs, "pairs") as advance:
+        verify(path, options, advance=advance)
+    return len(verified_pairs(path, options.min_num_inliers))
+
+
+def _odd_keypoints(path: Path) -> dict[str, list[str]]:
+    """Return images whose keypoints are allowed, and may be wrong all the same, by what is odd."""
+    problems = check_database(path)[1]
+    return {CHECKS[kind]["what"]: problems[kind] for kind in sorted(WARNED & problems.keys())}
 
 
 def _fill(
