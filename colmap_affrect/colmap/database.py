@@ -228,6 +228,30 @@ DESCRIPTOR_NORM = 512
 SIGNED_SHIFT = 0.30  # added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0
 
 
+def read_descriptors(
+    database: pycolmap.Database, image_id: int, num_keypoints: int, where: str
+) -> Singles:
+    """Return the (N, D) descriptors of an image, as its file has them.
+
+    Args:
+        database: where they are.
+        image_id: of the image.
+        num_keypoints: N, the number that there must be.
+        where: the file and the image, for errors.
+
+    Raises:
+        DatabaseError: their number or their type is wrong.
+    """
+    descriptors = database.read_descriptors(image_id)
+    count = len(descriptors.data)
+    if count != num_keypoints:
+        raise DatabaseError(f"{where} has {num_keypoints} keypoints and {count} descriptors")
+    try:
+        return np.asarray(descriptors.to_float().data, np.float32)
+    except ValueError as error:
+        raise DatabaseError(f"{where} has descriptors of no known type") from error
+
+
 def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: Floats) -> None:
     """Write (N, 128) unit descriptors as uint8 rows of length 512, as COLMAP's SIFT has them.
 

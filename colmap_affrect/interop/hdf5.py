@@ -32,13 +32,13 @@ from colmap_affrect.colmap.database import (
     DESCRIPTOR_SIZE,
     colmap_keypoints,
     open_database,
+    read_descriptors,
     write_descriptors,
 )
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.errors import (
-    DatabaseError,
     ImageError,
     OptionError,
     StoreError,
@@ -429,16 +429,8 @@ def _feature_datasets(database: pycolmap.Database, image: pycolmap.Image, path: 
         data |= {"scales": keypoints[:, 2], "oris": np.rad2deg(keypoints[:, 3])}
     if database.exists_descriptors(image.image_id):
         where = f"{path}: {image.name}"
-        descriptors = database.read_descriptors(image.image_id)
-        if len(descriptors.data) != len(points):
-            raise DatabaseError(
-                f"{where} has {len(points)} keypoints and {len(descriptors.data)} descriptors"
-            )
-        try:
-            values = np.asarray(descriptors.to_float().data, np.float32)
-        except ValueError as error:
-            raise DatabaseError(f"{where} has descriptors of no known type") from error
-        sift = descriptors.type == pycolmap.FeatureExtractorType.SIFT
+        values = read_descriptors(database, image.image_id, len(points), where)
+        sift = database.read_descriptors(image.image_id).type == pycolmap.FeatureExtractorType.SIFT
         data["descriptors"] = (values / np.float32(DESCRIPTOR_NORM if sift else 1)).T
     return data
 

@@ -1,7 +1,7 @@
 """Climb: map, match again what lost and doubtful photographs need, and map on, until nothing helps.
 
 The first model says what is needed: where it is sure of all photographs, nothing more is done.
-Later models begin with those before. Models of learned matches alone are looked at as well, and the
+Later models begin with those before. Models of learned matches are looked at as well, and the
 best ones so far are gone back to in the end (:mod:`colmap_affrect.stages.alternatives`).
 """
 

@@ -219,15 +219,7 @@ def _unmatched(
 def _read_arrays(database: pycolmap.Database, image_id: int, where: str) -> Arrays:
     """Return the keypoints, in pixel-centre px, and the descriptors of an image."""
     points = np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
-    descriptors = database.read_descriptors(image_id)
-    if len(descriptors.data) != len(points):
-        raise DatabaseError(
-            f"{where} has {len(points)} keypoints and {len(descriptors.data)} descriptors"
-        )
-    try:
-        values = np.asarray(descriptors.to_float().data, np.float32)
-    except ValueError as error:
-        raise DatabaseError(f"{where} has descriptors of no known type") from error
+    values = colmap_database.read_descriptors(database, image_id, len(points), where)
     return np.asarray(pixel_from_colmap(points)), values
 
 
