@@ -58,6 +58,7 @@ class Workspace:
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
         self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
         self.best = path / "sparse.best"  # the best models so far, with their matches
+        self.learned = path / "sparse.learned"  # models of learned matches alone
         self.config, self.log = path / "config.toml", path / "run.log"  # options; of all runs
         self.report, self.page = path / "report.json", path / "report.html"  # of the last run
         self.cameras = path / "cameras.json"  # what is known of the database's, and from where
@@ -319,6 +320,7 @@ class Workspace:
                 self.sparse,
                 self.snapshots,
                 self.best,
+                self.learned,
                 self.report,
                 self.page,
                 self.mapped_database,

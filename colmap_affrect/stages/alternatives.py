@@ -10,7 +10,7 @@ expected to be right.
 
 import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -100,7 +100,7 @@ class Choice:
 
 
 def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
-    """Map with all learned matches, and keep on record what that is worth.
+    """Map with all learned matches, and keep the models and what they are worth.
 
     Args:
         escalation: of the workspace; its models are those of the first matches.
@@ -108,36 +108,49 @@ def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
     """
     context = escalation.context
     choice = _learned_choice(escalation)
-    found = _models_of(context, mapper, choice) if choice.matches else []
+    learned = context.workspace.learned
+    with _replaced(learned) as new:
+        new.mkdir()
+        if choice.matches:
+            _map_copy(context, mapper, choice, new)
+    found = read_summaries(learned)
     names = set(context.features.names()).difference(context.by_hand.left_out)
     is_sure = bool(found) and names.issubset(found[0].sure)
     looked_at = LookedAt(score(found), is_sure, present_score(context))
     context.matches.keep_note(LOOKED_AT, looked_at.note(context))
 
 
+def is_to_be_looked_at(context: Context) -> bool:
+    """Return whether models of learned matches may be better, and are not there to be chosen."""
+    looked_at = LookedAt.of(context)
+    if not looked_at:
+        return True
+    is_decided = looked_at.is_chosen or looked_at.score <= present_score(context)
+    return not is_decided and not context.workspace.learned.exists()
+
+
 def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
-    """Let learned matches take the place of the others if their models are better.
+    """Let learned matches and their models take the place of the others if these are worse.
 
     Args:
         escalation: of the workspace, with the models that are there.
         at_once: choose them only if they are enough.
 
     Returns:
-        Whether they were chosen, so that models must be made of them.
+        Whether they were chosen.
     """
     context = escalation.context
     looked_at = LookedAt.of(context)
-    if not looked_at or looked_at.is_chosen:
+    if not looked_at or looked_at.is_chosen or not context.workspace.learned.exists():
         return False
     # At once: as it was then, also for a run that was killed since.
     is_wanted = looked_at.is_enough if at_once else looked_at.score > present_score(context)
     choice = _learned_choice(escalation) if is_wanted else None
     if not choice or not choice.matches:
         return False
-    chosen = replace(looked_at, is_chosen=True).note(context)
-    notes = {LOOKED_AT: chosen, CLIMBING: None}  # models that are there are not gone on from
-    context.matches.choose(choice.matches, choice.measured_worths, **notes)
-    escalation.write()
+    chosen = {LOOKED_AT: replace(looked_at, is_chosen=True).note(context)}
+    _choose(context, choice, context.workspace.learned, chosen)
+    take_over_chosen(escalation)
     return True
 
 
@@ -151,8 +164,15 @@ def _learned_choice(escalation: Escalation) -> Choice:
     return Choice([learned[pair].matches for pair in changed], worths)
 
 
-def _models_of(context: Context, mapper: Mapper, choice: Choice) -> list[ModelSummary]:
-    """Map a copy of the workspace in which some pairs have other matches."""
+def _map_copy(context: Context, mapper: Mapper, choice: Choice, target: Path) -> None:
+    """Map a copy of the workspace in which some pairs have other matches.
+
+    Args:
+        context: of the workspace, which stays as it is.
+        mapper: what makes models.
+        choice: the other matches.
+        target: folder that gets the folders of the models.
+    """
     workspace = context.workspace
     with temporary_folder(workspace.path) as folder:
         branch = workspace.branch(folder / "branch")
@@ -163,61 +183,32 @@ def _models_of(context: Context, mapper: Mapper, choice: Choice) -> list[ModelSu
         other.matches.choose(choice.matches, choice.measured_worths)
         verify_matches(other, context.verification)
         guide(other, context.guiding)
-        return map_images(other, mapper)[1]
+        map_images(other, mapper)
+        for model_folder in model_folders(branch.sparse):
+            model_folder.rename(target / model_folder.name)
 
 
-# The best models so far
+# Going over to other models
 
 
-def keep_best(context: Context) -> None:
-    """Keep the models that are there, with their matches, if none were better so far.
-
-    Of small sets, and where the models are those of the verified pairs.
-    """
-    workspace = context.workspace
-    is_small = len(context.features.names()) <= SMALL
-    if not is_small or workspace.made_from("map") != context.verified_digest():
-        return
-    present = present_score(context)
-    if present < best_score(context):
-        return
-    with _replaced(workspace.best) as new:
-        new.mkdir()
-        shutil.copytree(workspace.sparse, new / "sparse")
-        shutil.copy(workspace.matches, new / workspace.matches.name)
-        replace_text(new / SCORE, json.dumps([_set_of(context), present]))
+def _choose(context: Context, choice: Choice, folder: Path, notes: Mapping[str, Any]) -> None:
+    """Choose matches, and keep in mind that the models in a folder are to follow them."""
+    there_is_a_model = {CLIMBING: context.matches.note(FINISHED), RESTORING: folder.name}
+    context.matches.choose(choice.matches, choice.measured_worths, **there_is_a_model, **notes)
 
 
-def best_score(context: Context) -> float:
-    """Return the score of the best models so far; 0 where none of these pairs are kept."""
-    path = context.workspace.best / SCORE
-    if not path.exists():
-        return 0.0
-    of_set, found = json.loads(path.read_text(encoding="utf-8"))
-    return float(found) if of_set == _set_of(context) else 0.0
-
-
-def restore_best(escalation: Escalation) -> bool:
-    """Go back to the best models so far, and to their matches, if those that are there are worse.
-
-    Returns:
-        Whether there were better ones.
-    """
+def take_over_chosen(escalation: Escalation) -> None:
+    """Let models follow the matches that were chosen, if they have not yet; a run was killed."""
     context = escalation.context
-    if not context.matches.note(RESTORING):
-        if best_score(context) <= present_score(context):
-            return False
-        before = MatchStore(context.workspace.best / context.workspace.matches.name)
-        pairs = list(escalation.num_inliers())
-        levels = context.matches.levels(pairs)
-        changed = [p for p, level in before.levels(pairs).items() if level != levels[p]]
-        worths = before.measured_worths(changed)
-        context.matches.choose(before.read(changed), worths, **{RESTORING: True})
+    name = context.matches.note(RESTORING)
+    if not name:
+        return
     escalation.write()
-    guide(context, context.guiding)
-    _take_over(context, context.workspace.best / "sparse")
+    folder = context.workspace.path / name
+    if folder.exists():
+        guide(context, context.guiding)
+        _take_over(context, folder)
     context.matches.keep_note(RESTORING, None)
-    return True
 
 
 def follow_keypoints(context: Context) -> None:
@@ -239,10 +230,62 @@ def _take_over(context: Context, sparse_path: Path) -> None:
     workspace.record_made_from(map=context.verified_digest())
 
 
-def forget_best(context: Context) -> None:
-    """Remove the copy of the best models: those that are there are as good, or of other pairs."""
+# The best models so far
+
+
+def keep_best(context: Context) -> None:
+    """Keep the models that are there, with their matches, if none were better so far.
+
+    Of small sets, and where the models are those of the verified pairs.
+    """
+    workspace = context.workspace
+    is_small = len(context.features.names()) <= SMALL
+    if not is_small or workspace.made_from("map") != context.verified_digest():
+        return
+    present = present_score(context)
+    if present < best_score(context):
+        return
+    with _replaced(workspace.best) as new:
+        new.mkdir()
+        for folder in model_folders(workspace.sparse):
+            shutil.copytree(folder, new / folder.name)
+        shutil.copy(workspace.matches, new / workspace.matches.name)
+        replace_text(new / SCORE, json.dumps([_set_of(context), present]))
+
+
+def best_score(context: Context) -> float:
+    """Return the score of the best models so far; 0 where none of these pairs are kept."""
+    path = context.workspace.best / SCORE
+    if not path.exists():
+        return 0.0
+    of_set, found = json.loads(path.read_text(encoding="utf-8"))
+    return float(found) if of_set == _set_of(context) else 0.0
+
+
+def restore_best(escalation: Escalation) -> bool:
+    """Go back to the best models so far, and to their matches, if those that are there are worse.
+
+    Returns:
+        Whether there were better ones.
+    """
+    context = escalation.context
     best = context.workspace.best
-    remove_own([best, _partial(best)])
+    if best_score(context) <= present_score(context):
+        return False
+    before = MatchStore(best / context.workspace.matches.name)
+    pairs = list(escalation.num_inliers())
+    levels = context.matches.levels(pairs)
+    changed = [p for p, level in before.levels(pairs).items() if level != levels[p]]
+    choice = Choice(list(before.read(changed)), before.measured_worths(changed))
+    _choose(context, choice, best, {})
+    take_over_chosen(escalation)
+    return True
+
+
+def forget_others(context: Context) -> None:
+    """Remove other models: those that are there are as good, or of other pairs."""
+    for folder in (context.workspace.best, context.workspace.learned):
+        remove_own([folder, _partial(folder)])
 
 
 def _partial(folder: Path) -> Path:

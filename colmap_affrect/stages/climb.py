@@ -11,16 +11,17 @@ from dataclasses import replace
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import model_folders
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING, RESTORING
+from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.alternatives import (
-    LookedAt,
     choose_learned,
     follow_keypoints,
-    forget_best,
+    forget_others,
+    is_to_be_looked_at,
     keep_best,
     look_at_learned,
     restore_best,
+    take_over_chosen,
 )
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, begin
@@ -42,13 +43,12 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         What each step did.
     """
     escalation, escalated = begin(context, recipe.escalate)
-    reports = _mapped_anew(context, mapper, recipe)
-    if context.matches.note(RESTORING):  # a run was killed meanwhile
-        restore_best(escalation)
+    take_over_chosen(escalation)
+    reports = _mapped_first(context, mapper, recipe)
     escalated = _learned(escalation, mapper, escalated)
-    if choose_learned(escalation, at_once=True):
-        reports += _mapped_anew(context, mapper, recipe)
-    elif not escalation.has_stepped and context.matches.note(LEARNING):
+    is_chosen = choose_learned(escalation, at_once=True)
+    is_untouched = not is_chosen and not escalation.has_stepped
+    if is_untouched and context.matches.note(LEARNING):
         follow_keypoints(context)
     while True:
         while step := escalation.next_step():
@@ -57,17 +57,15 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         before = context.workspace.made_from("map")
         reports += _mapped_on(context, mapper, recipe)
         has_mapped = context.workspace.made_from("map") != before  # perhaps there is no model
-        if has_mapped or restore_best(escalation):
+        if has_mapped or restore_best(escalation) or choose_learned(escalation, at_once=False):
             continue
-        if not choose_learned(escalation, at_once=False):
-            forget_best(context)
-            return [*reports, escalation.ended(escalated)]
-        reports += _mapped_anew(context, mapper, recipe)
+        forget_others(context)
+        return [*reports, escalation.ended(escalated)]
 
 
 def _learned(escalation: Escalation, mapper: Mapper, report: StageReport) -> StageReport:
     """Match pairs of a small set by learned matching, once, and look at what models it makes."""
-    if LookedAt.of(escalation.context) or not escalation.plan_learning():
+    if not is_to_be_looked_at(escalation.context) or not escalation.plan_learning():
         return report
     start = time.perf_counter()
     num_matched = escalation.learn()
@@ -77,13 +75,13 @@ def _learned(escalation: Escalation, mapper: Mapper, report: StageReport) -> Sta
     return replace(report, wall_s=wall_s, num_done=report.num_done + num_matched)
 
 
-def _mapped_anew(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
-    """Map for the first time, or after other matches were chosen for many pairs."""
+def _mapped_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
+    """Map for the first time, unless a run before has gone on from there."""
     matches = context.matches
     listed = matches.note(FINISHED)
     if matches.note(CLIMBING) == listed and model_folders(context.workspace.sparse):
         return []
-    forget_best(context)  # of other pairs, or worse
+    forget_others(context)  # of other pairs
     reports = [guide(context, recipe.guided), map_images(context, mapper)[0]]
     matches.keep_note(CLIMBING, listed)
     return reports

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,12 +30,14 @@ from colmap_affrect.stages.alternatives import (
     LookedAt,
     best_score,
     choose_learned,
-    forget_best,
+    forget_others,
+    is_to_be_looked_at,
     keep_best,
     look_at_learned,
     present_score,
     restore_best,
     score,
+    take_over_chosen,
 )
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, begin, matched_again
@@ -92,16 +95,28 @@ def levels(context: Context) -> set[int]:
     return set(context.matches.levels(escalation_of(context).pairs).values())
 
 
-def with_models(monkeypatch: pytest.MonkeyPatch, *, found: ModelSummary) -> list[Choice]:
+def with_models(
+    monkeypatch: pytest.MonkeyPatch, *, found: ModelSummary, there: Sequence[ModelSummary]
+) -> list[Choice]:
     """Say what models are there, and what a copy gives; return the choices that are mapped."""
     asked = list[Choice]()
 
-    def models_of(_: Context, __: Mapper, choice: Choice) -> list[ModelSummary]:
+    def map_copy(_: Context, __: Mapper, choice: Choice, target: Path) -> None:
         asked.append(choice)
-        return [found]
+        (target / "0").mkdir()
 
-    monkeypatch.setattr(alternatives, "_models_of", models_of)
-    monkeypatch.setattr(alternatives, "read_summaries", lambda _: [UNSURE])
+    def summaries(folder: Path) -> list[ModelSummary]:
+        is_learned = folder.name == "sparse.learned" or (folder / "learned").exists()
+        return [found] if is_learned else list(there)
+
+    def copied(folder: Path, target: Path, _: Path) -> None:
+        assert folder.parent.name == "sparse.learned"
+        target.mkdir()
+        (target.parent / "learned").touch()
+
+    monkeypatch.setattr(alternatives, "_map_copy", map_copy)
+    monkeypatch.setattr(alternatives, "read_summaries", summaries)
+    monkeypatch.setattr(alternatives, "copy_with_keypoints", copied)
     return asked
 
 
@@ -144,10 +159,9 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
 ) -> None:
     escalation = escalation_of(context)
     better = replace(UNSURE, probabilities=dict.fromkeys(NAMES[:2], 0.9))
-    asked = with_models(monkeypatch, found=better)
+    asked = with_models(monkeypatch, found=better, there=[UNSURE])
     learned = context.matches.learned(list(escalation.pairs))
     before = escalation.states()
-    context.matches.keep_note(CLIMBING, context.matches.note(FINISHED))
     look_at_learned(escalation, mapper)
     assert len(asked) == 1
     assert not choose_learned(escalation, at_once=True)  # more may be tried without them
@@ -157,7 +171,10 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     assert looked_at
     assert (looked_at.score, looked_at.score_without) == pytest.approx((0.8, 0.2))
     assert looked_at.is_chosen
-    assert context.matches.note(CLIMBING) is None  # models that are there are not gone on from
+    assert present_score(context) == looked_at.score
+    assert context.matches.note(CLIMBING) == context.matches.note(FINISHED)  # are gone on from
+    assert context.matches.note(RESTORING) is None
+    assert context.workspace.made_from("map") == context.verified_digest()
     assert levels(context) == {1}
     ids = image_ids(context.workspace.database)
     with open_database(context.workspace.database) as database:
@@ -173,7 +190,7 @@ def test_learned_models_that_are_sure_of_all_are_chosen_at_once(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sure = replace(UNSURE, registered_names=NAMES, probabilities=dict.fromkeys(NAMES, 0.95))
-    with_models(monkeypatch, found=sure)
+    with_models(monkeypatch, found=sure, there=[UNSURE])
     look_at_learned(escalation_of(context), mapper)
     assert choose_learned(escalation_of(context), at_once=True)
     assert levels(context) == {1}
@@ -182,8 +199,7 @@ def test_learned_models_that_are_sure_of_all_are_chosen_at_once(
 def test_any_learned_model_is_chosen_at_once_where_there_is_none(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_models(monkeypatch, found=UNSURE)
-    monkeypatch.setattr(alternatives, "read_summaries", lambda _: [])
+    with_models(monkeypatch, found=UNSURE, there=())
     look_at_learned(escalation_of(context), mapper)
     assert choose_learned(escalation_of(context), at_once=True)
 
@@ -191,7 +207,7 @@ def test_any_learned_model_is_chosen_at_once_where_there_is_none(
 def test_learned_models_that_are_no_better_change_nothing(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_models(monkeypatch, found=UNSURE)
+    with_models(monkeypatch, found=UNSURE, there=[UNSURE])
     before = database_content(context.workspace.database)
     look_at_learned(escalation_of(context), mapper)
     assert not choose_learned(escalation_of(context), at_once=True)
@@ -270,7 +286,7 @@ def test_best_models_and_their_matches_come_back(
     assert {levels for pair, levels in tried.items() if NAMES[0] in pair} == {0b11}
     assert map_images(context, mapper, goes_on=True)[0].num_done == 0  # nothing is mapped anew
     assert not restore_best(escalation)
-    forget_best(context)
+    forget_others(context)
     assert best_score(context) == 0.0
     assert not workspace.best.exists()
 
@@ -293,7 +309,7 @@ def test_run_killed_while_it_goes_back_does_so_afterwards(
         with pytest.raises(KeyboardInterrupt):
             restore_best(escalation)
     assert escalation.matches.note(RESTORING)
-    assert restore_best(escalation)
+    take_over_chosen(escalation)
     assert not escalation.matches.note(RESTORING)
     assert read_summaries(workspace.sparse) == summaries
     after = database_content(workspace.database)
@@ -312,7 +328,7 @@ def test_models_of_other_pairs_than_the_verified_ones_are_not_kept(
 def test_what_was_looked_at_is_of_the_listed_pairs_and_of_what_is_said_by_hand(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_models(monkeypatch, found=UNSURE)
+    with_models(monkeypatch, found=UNSURE, there=[UNSURE])
     look_at_learned(escalation_of(context), mapper)
     assert LookedAt.of(context)
     assert not LookedAt.of(replace(context, by_hand=ByHand(left_out=(NAMES[0],))))
@@ -325,7 +341,7 @@ def test_images_that_are_left_out_need_nothing_and_are_no_lack(
 ) -> None:
     others = NAMES[1:]
     sure = replace(UNSURE, registered_names=others, probabilities=dict.fromkeys(others, 0.95))
-    with_models(monkeypatch, found=sure)
+    with_models(monkeypatch, found=sure, there=[UNSURE])
     said = replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
     assert NAMES[0] not in escalation_of(said).needs([UNSURE])
     look_at_learned(escalation_of(said), mapper)
@@ -398,14 +414,13 @@ def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
 
 
 @pytest.mark.long
-def test_run_killed_after_the_choice_maps_the_chosen_matches(
+def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_choice(
     matched: Workspace, recipe: Recipe, mapper: Mapper, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """Not from the models of before: they are of other matches."""
+    """Mapping their matches a second time might end elsewhere."""
     spaces = [copy_of(matched, tmp_path / name) for name in ("whole", "killed")]
-    surest = replace(UNSURE, probabilities=dict.fromkeys("abcdefgh", 1.0))
-    monkeypatch.setattr(alternatives, "_models_of", lambda *_: [surest])
+    monkeypatch.setattr(LookedAt, "is_enough", True)
     monkeypatch.setattr(Escalation, "needs", lambda *_: {NAMES[0]: 1.0})
     monkeypatch.setattr(Escalation, "next_step", lambda _: None)
     whole, killed = (Context(space) for space in spaces)
@@ -414,22 +429,36 @@ def test_run_killed_after_the_choice_maps_the_chosen_matches(
         patch.setattr(Escalation, "write", interrupted_at_third_call())
         with pytest.raises(KeyboardInterrupt):
             climb.climb(killed, mapper, recipe)
-    goes_on = list[bool]()
-    map_once = climb.map_images
-
-    def watched(context: Context, mapper: Mapper, **how: bool) -> object:
-        goes_on.append(how.get("goes_on", False))
-        return map_once(context, mapper, **how)
-
-    monkeypatch.setattr(climb, "map_images", watched)
+    looked_at = read_summaries(killed.workspace.learned)
+    monkeypatch.setattr(alternatives, "map_images", None)
     climb.climb(killed, mapper, recipe)
-    assert goes_on[0] is False
     for context in (whole, killed):
         assert levels(context) == {1}
+        assert read_summaries(context.workspace.sparse) == looked_at
+        assert not context.workspace.learned.exists()
+        assert map_images(context, mapper, goes_on=True)[0].num_done == 0
+        model = pycolmap.Reconstruction(context.workspace.sparse / "0")
+        with open_database(context.workspace.database) as database:
+            for image in model.images.values():
+                assert image.num_points2D() == len(database.read_keypoints(image.image_id))
     contents = [database_content(space.database) for space in spaces]
     assert contents[0] == contents[1]
-    models = [read_summaries(space.sparse) for space in spaces]
-    assert models[0] == models[1]
+
+
+@pytest.mark.long
+def test_models_of_learned_matches_that_were_removed_are_made_again(
+    mapped: Workspace, mapper: Mapper, tmp_path: Path
+) -> None:
+    context = Context(copy_of(mapped, tmp_path / "out"))
+    assert is_to_be_looked_at(context)
+    look_at_learned(escalation_of(context), mapper)
+    looked_at = LookedAt.of(context)
+    assert looked_at
+    forget_others(context)
+    assert is_to_be_looked_at(context) == (looked_at.score > present_score(context))
+    shutil.rmtree(context.workspace.sparse)
+    assert not choose_learned(escalation_of(context), at_once=False)
+    assert is_to_be_looked_at(context)
 
 
 def interrupted_at_third_call() -> Callable[[Escalation], None]:
