@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.two_views import CALIBRATED, pair_model
-from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
+from colmap_affrect.colmap.verification import PairVerifier, weakly_connected_images
 from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
 from colmap_affrect.geometry.tilts import vary_singly
@@ -26,13 +26,12 @@ from colmap_affrect.pairs.lists import Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore, GuidedPair
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.expected_gain import weakly_connected_images
-from colmap_affrect.stages.match import IMAGES_IN_MEMORY, PAIRS_PER_WRITE
-from colmap_affrect.stages.pairs import listed_pairs
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.stationary import StationaryFilter
-from colmap_affrect.stages.verify import extracted_px, verified_inliers
+from colmap_affrect.stages.verify import extracted_px
 
+IMAGES_IN_MEMORY = 40  # of 13,000 features
+PAIRS_PER_WRITE = 64
 MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
 NOTHING: Indices = np.zeros((0, 2), np.int64)
 
@@ -59,7 +58,7 @@ def guide(context: Context, options: GuidedOptions | None = None) -> StageReport
 def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, Indices]:
     """Return the inliers of each verified pair without the matches of :func:`current` ones."""
     exact = {pair.names: pair.exact for pair in guided if pair.num_inliers}
-    return {**verified_inliers(context), **exact}
+    return {**context.verified_inliers(), **exact}
 
 
 def current(context: Context) -> list[GuidedPair]:
@@ -70,12 +69,9 @@ def current(context: Context) -> list[GuidedPair]:
     path = context.workspace.database
     if not (context.workspace.guided.exists() and path.exists()):
         return []
-    ids = colmap_database.image_ids(path)
-    counts = verified_pairs(path, 0)
+    counts = context.graph.num_inliers(0)
     return [
-        pair
-        for pair in context.guided.read()
-        if pair.num_inliers in (0, counts.get((ids[pair.names[0]], ids[pair.names[1]])))
+        pair for pair in context.guided.read() if pair.num_inliers in (0, counts.get(pair.names))
     ]
 
 
@@ -133,12 +129,14 @@ class Guiding:
     def __init__(self, context: Context, options: GuidedOptions) -> None:
         self.context, self.options = context, options
         self.path = context.workspace.database
-        self.ids = colmap_database.image_ids(self.path)
+        self.ids = context.graph.ids
         max_size_px = context.extraction.max_image_size_px
         sizes = context.features.image_sizes()
         # Bands are as wide as features are exact: in pixels of the images as they were extracted.
         self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
-        self.verifier = PairVerifier(self.path, context.verification, extracted_px(context))
+        self.verifier = PairVerifier(
+            context.graph.ids, context.graph.cameras, context.verification, extracted_px(context)
+        )
 
     def todo(self) -> tuple[list[Pair], int]:
         """Return the pairs to guide, and how many are done."""
@@ -149,7 +147,7 @@ class Guiding:
             has_three = len({name for pair in exact for name in pair}) > 2
             limit = self.options.min_num_tracks if has_three else 0
             images = weakly_connected_images(exact, limit)
-        levels = self.context.matches.levels(listed_pairs(self.context))
+        levels = self.context.matches.levels(self.context.listed_pairs())
         escalated = {frozenset(pair) for pair, level in levels.items() if level}  # have enough
         chosen = [p for p in exact if not {*p}.isdisjoint(images) and {*p} not in escalated]
         done = {pair.names for pair in known}
@@ -179,8 +177,8 @@ class Guiding:
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
         """Return what is to be done for the pairs whose geometry says where matches may be."""
         tasks = []
-        with colmap_database.open_database(self.path) as database:
-            cameras = colmap_database.cameras_of_images(database)
+        with open_database(self.path) as database:
+            cameras = cameras_of_images(database)
             for names in pairs:
                 first, second = (self.ids[name] for name in names)
                 keypoints = database.read_keypoints(first), database.read_keypoints(second)
@@ -208,7 +206,9 @@ class Guiding:
         self._write(geometries)
 
     def _write(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
-        with colmap_database.open_database(self.path) as database:
+        if not geometries:
+            return
+        with self.context.graph.opened(for_pairs=True) as database:
             for names, geometry in geometries.items():
                 first, second = (self.ids[name] for name in names)
                 database.update_two_view_geometry(first, second, geometry)

@@ -5,7 +5,6 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
@@ -17,8 +16,7 @@ from colmap_affrect.mappers.mapping import map_database, model_folders, read_sum
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import unmeasured_pairs
+from colmap_affrect.session.context import Context
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
@@ -61,7 +59,7 @@ def map_images(
             before.append(MappedModel(model, known_model.bridges, known_model.moves))
     task = _task(context, extend, before)
     workspace.record_made_from(map="")  # a run that is killed begins anew
-    num_images = len(colmap_database.image_ids(workspace.database))
+    num_images = len(context.graph.ids)
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
     workspace.record_made_from(map=inputs)
@@ -88,6 +86,29 @@ def _task(context: Context, extend: Extension | None, before: Sequence[MappedMod
         may_share=not copied and context.inputs.may_share,
         tie_points=tie_points,
     )
+
+
+def unmeasured_pairs(context: Context) -> list[Pair]:
+    """Return the pairs whose matches are of local affine frames that were not measured.
+
+    None where no level of the recipe measures frames.
+    """
+    is_measured = [level.features.has_shapes for level in context.extraction.levels]
+    if not any(is_measured):
+        return []
+    pairs = usable_pairs(context)
+    levels = context.matches.levels(pairs)
+    return [pair for pair, level in levels.items() if not is_measured[level]]
+
+
+def usable_pairs(context: Context) -> list[Pair]:
+    """Return the listed pairs whose images the database has, but those rejected by hand."""
+    ids = context.graph.ids
+    return [
+        (first, second)
+        for first, second in context.listed_pairs()
+        if first in ids and second in ids and context.by_hand.allows(first, second)
+    ]
 
 
 def _inputs(context: Context, extend: Extension | None) -> str:
@@ -119,7 +140,7 @@ def image_names(context: Context) -> list[str]:
     """Return the names of the images of a run, or of the database that was copied."""
     if context.workspace.is_foreign:
         context.workspace.require("verify")
-        return sorted(colmap_database.image_ids(context.workspace.database))
+        return sorted(context.graph.ids)
     return context.inputs.names()
 
 
@@ -133,7 +154,7 @@ def unregistered(
 
     ``pair_inliers`` are the numbers of inliers of the verified pairs.
     """
-    num_keypoints = colmap_database.keypoint_counts(context.workspace.database)
+    num_keypoints = context.graph.num_keypoints
     partners: defaultdict[str, dict[str, int]] = defaultdict(dict)
     for (first, second), count in pair_inliers.items():
         partners[first][second] = partners[second][first] = count

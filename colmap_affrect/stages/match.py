@@ -13,21 +13,19 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.matchers.base import MATCHERS, ImageFeatures, MatcherContext, MatcherOptions
-from colmap_affrect.pairs.lists import Pair, PairList, ordered_for_reuse
+from colmap_affrect.pairs.lists import Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FINISHED, IN_VAIN, FeatureStore, MatchStore, PairMatches
 from colmap_affrect.recipes import ExtractionOptions
-from colmap_affrect.stages.context import Context, Resources, require_same_files
-from colmap_affrect.stages.extract import write_images_and_keypoints
-from colmap_affrect.stages.pairs import listed_pairs
+from colmap_affrect.session.context import Context, Resources, require_same_files
+from colmap_affrect.session.database_export import write_images_and_keypoints, write_matches
 from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
@@ -52,7 +50,7 @@ def match(
     """Match the listed pairs and put the raw matches into the database."""
     start = time.perf_counter()
     context.resources.require_device()
-    pairs = listed_pairs(context)
+    pairs = context.listed_pairs()
     options = options or context.matching
     workspace, extraction = context.workspace, context.extraction
     try:
@@ -83,7 +81,9 @@ def match(
             logger.warning("matches: %s", line)
     if finished != digest:
         matches.keep_note(FINISHED, digest)
-    write_matches(context, pairs)
+    write_images_and_keypoints(context)
+    with context.graph.opened(for_pairs=True) as database:
+        write_matches(context, database, pairs)
     wall_s = time.perf_counter() - start
     return StageReport("match", wall_s, len(missing), len(pairs) - len(missing), warnings=warnings)
 
@@ -185,26 +185,6 @@ def matched_at_level(
     with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
         for found in found_pairs:
             yield stationary.filtered(found)
-
-
-def write_matches(context: Context, pairs: Sequence[Pair], *, replaces: bool = False) -> None:
-    """Put the raw matches that the database lacks into it, after images and keypoints.
-
-    ``replaces``: also those that are others there, whose two-view geometry goes.
-    """
-    write_images_and_keypoints(context)
-    path, listed = context.workspace.database, PairList.of(pairs)
-    ids = colmap_database.image_ids(path)
-    known_ids = np.array([ids.get(name, 0) for name in listed.names], np.int64)
-    ids_of_pairs = known_ids[listed.numbers]
-    with colmap_database.open_database(path) as database:
-        wanted = np.min(ids_of_pairs, axis=1, initial=1) > 0  # both images are there
-        if not replaces:
-            wanted = colmap_database.lack_matches(database, ids_of_pairs)
-        todo = listed.at(wanted)
-        for found in context.matches.read(todo) if todo else ():
-            first, second = (ids[name] for name in found.names)
-            colmap_database.write_matches(database, first, second, found.indices)
 
 
 # What is done for one pair, in a thread of this process or on a worker of a cluster.

@@ -26,6 +26,9 @@ from registration import SUBSETS, Subset
 
 from colmap_affrect.colmap.model_files import read_poses
 from colmap_affrect.comparison.results import pose_scores
+from colmap_affrect.escalation import climb as climbing
+from colmap_affrect.escalation.escalate import Escalation
+from colmap_affrect.escalation.policy import EFFORTS
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import read_summaries
@@ -34,10 +37,7 @@ from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import LOOKED_AT
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages import climb as climbing
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation
-from colmap_affrect.stages.escalation_policy import EFFORTS
+from colmap_affrect.session.context import Context
 
 Row = dict[str, Any]
 

@@ -7,7 +7,7 @@ truth it needs 50 inliers. From each pair come six rows, which differ in the lev
 in vain before and in the other pairs of which the outcome is known. Usage:
 
     python tests/benchmarks/fit_expected_gain.py --scenes-path ../shared/scenes \
-        --work-path out/gain --output-path colmap_affrect/stages/expected_gain.json
+        --work-path out/gain --output-path colmap_affrect/escalation/expected_gain.json
 
 A subset whose name begins with "aged" is looked for below --aged-path, a folder like --scenes-path
 of the same photographs made to look old. What is found in --work-path is used again.
@@ -32,11 +32,11 @@ from registration import SUBSETS
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import PairVerifier
+from colmap_affrect.escalation.escalate import Escalation
+from colmap_affrect.escalation.expected_gain import PairState, kind_of, terms
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
-from colmap_affrect.stages.context import Context, Inputs
-from colmap_affrect.stages.escalate import Escalation
-from colmap_affrect.stages.expected_gain import PairState, kind_of, terms
+from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import match, matched_at_level
 from colmap_affrect.stages.pairs import choose_pairs
@@ -130,7 +130,10 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
             ]
             escalation._extend(missing, lambda _: None)
             verifier = PairVerifier(
-                context.workspace.database, context.verification, level.max_image_size_px
+                context.graph.ids,
+                context.graph.cameras,
+                context.verification,
+                level.max_image_size_px,
             )
             with closing(
                 matched_at_level(context, pairs, escalation.matching, number)

@@ -32,7 +32,7 @@ from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.context import Context, Inputs, Resources
+from colmap_affrect.session.context import Context, Inputs, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import Matching, iterate_matches, match
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs

@@ -11,16 +11,17 @@ from small_scene import NAMES
 from verified import copy_of, verified
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.escalation.escalate import Escalation
+from colmap_affrect.escalation.expected_gain import Step
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import PairMatches, Worth
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages import map as stage
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, unmeasured_pairs
-from colmap_affrect.stages.expected_gain import Step
+from colmap_affrect.stages.map import unmeasured_pairs
 
 RECIPE = """
 [rectifier]

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 
-from colmap_affrect.colmap.verification import connected_parts, num_in_tracks
-from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.stores import Worth
 from colmap_affrect.recipes import Level
@@ -298,11 +297,3 @@ def insecure_images(
     strong = (pair for pair, count in num_inliers.items() if count >= max(1, strong_num_inliers))
     names = {name for pair in num_inliers for name in pair}
     return names.difference(*strong).union(weakly_connected)
-
-
-def weakly_connected_images(matches: Mapping[Pair, Indices], min_num_features: int) -> set[str]:
-    """Return the images with fewer features than that in tracks through three images or more.
-
-    Mappers register images by features that two others have triangulated already.
-    """
-    return {name for name, count in num_in_tracks(matches).items() if count < min_num_features}

@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from colmap_affrect.escalation.escalate import Escalation
+from colmap_affrect.escalation.policy import SMALL
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import copy_with_keypoints, model_folders, read_summaries
 from colmap_affrect.pairs.lists import Pair
@@ -31,9 +33,7 @@ from colmap_affrect.project.stores import (
     PairMatches,
     Worth,
 )
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation
-from colmap_affrect.stages.escalation_policy import SMALL
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.verify import verify_matches

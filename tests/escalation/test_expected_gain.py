@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from colmap_affrect.colmap.verification import connected_parts
-from colmap_affrect.recipes import Level, load_recipe, recipe_names
-from colmap_affrect.stages import expected_gain
-from colmap_affrect.stages.expected_gain import (
+from colmap_affrect.escalation import expected_gain
+from colmap_affrect.escalation.expected_gain import (
     ExpectedGain,
     PairState,
     Step,
@@ -18,6 +17,7 @@ from colmap_affrect.stages.expected_gain import (
     insecure_images,
     terms,
 )
+from colmap_affrect.recipes import Level, load_recipe, recipe_names
 
 LEVELS = load_recipe("default").levels
 COVERS, LEARNED = LEVELS[1], LEVELS[2]

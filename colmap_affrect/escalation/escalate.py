@@ -4,7 +4,7 @@ Images get the features that a level of the recipe adds, and pairs are matched a
 (Mishkin, Matas, Perdoch, MODS, 2015). New matches take the place of the old ones only when their
 two-view geometry has more inliers, or, where neither is verified, when more of them confirm each
 other. Which pairs are matched again, and at which level, is decided anew after every step
-(:mod:`colmap_affrect.stages.escalation_policy`), by what the database holds then; the step that has
+(:mod:`colmap_affrect.escalation.policy`), by what the database holds then; the step that has
 begun is on record, so that a killed run goes on in the same way.
 
 Images are in need that the model before has not, or is not sure of. While there is none, those that
@@ -19,9 +19,19 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 
-from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import PairVerifier
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.verification import PairVerifier, weakly_connected_images
 from colmap_affrect.errors import ImageError, such_as
+from colmap_affrect.escalation import expected_gain
+from colmap_affrect.escalation.expected_gain import PairState, Step
+from colmap_affrect.escalation.policy import (
+    Plan,
+    Situation,
+    learned_step,
+    next_step,
+    tried,
+    untried,
+)
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.options import EffortName
@@ -30,27 +40,15 @@ from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain, ModelSummary, StageReport
 from colmap_affrect.project.stores import EFFORT, LEARNING, STEP, Learned, PairMatches, Worth
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages import expected_gain
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalation_policy import (
-    Plan,
-    Situation,
-    learned_step,
-    next_step,
-    tried,
-    untried,
-)
-from colmap_affrect.stages.expected_gain import PairState, Step
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.extract import extract_images
 from colmap_affrect.stages.match import (
     matched_at_level,
     num_confirming,
     write_batches,
-    write_matches,
 )
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
-from colmap_affrect.stages.pairs import listed_pairs
-from colmap_affrect.stages.verify import num_verified_inliers, verified_inliers, verify_new
+from colmap_affrect.stages.verify import update_verified
 
 logger = logging.getLogger(__name__)
 
@@ -86,16 +84,9 @@ def begin(
     if context.matches.note(EFFORT) != context.effort:
         context.matches.keep_note(EFFORT, context.effort)
     escalation = Escalation(context, options)
-    escalation.write()  # it may have been killed before
+    if escalation.has_stepped or escalation.matches.note(LEARNING):
+        escalation.write()  # a run was killed before
     return escalation, StageReport("escalate", time.perf_counter() - start, 0)
-
-
-def unmeasured_pairs(context: Context) -> list[Pair]:
-    """Return the pairs whose matches are of frames that were not measured, if others are not."""
-    escalation = Escalation(context, EscalateOptions())
-    pairs = escalation.num_inliers() if any(escalation.is_measured) else ()
-    levels = escalation.matches.levels(pairs)
-    return [pair for pair, level in levels.items() if not escalation.is_measured[level]]
 
 
 @dataclass(frozen=True)
@@ -144,7 +135,7 @@ class Escalation:
         self.context, self.options = context, options
         self.extraction, self.matching = context.extraction, context.matching
         self.verification = context.verification
-        self.pairs = listed_pairs(context)
+        self.pairs = context.listed_pairs()
         self.features, self.matches = context.features, context.matches
         self.path = context.workspace.database
         self.is_measured = [level.features.has_shapes for level in self.extraction.levels]
@@ -169,8 +160,8 @@ class Escalation:
 
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of pairs in the database that may be used, 0 of unverified ones."""
-        ids = colmap_database.image_ids(self.path)
-        verified = num_verified_inliers(self.context)
+        ids = self.context.graph.ids
+        verified = self.context.num_verified_inliers()
         return {
             (first, second): verified.get((first, second)) or verified.get((second, first), 0)
             for first, second in self.pairs
@@ -214,7 +205,7 @@ class Escalation:
         if len(self.features.names()) < 3:
             return set()
         limit = self.context.guiding.min_num_tracks
-        return expected_gain.weakly_connected_images(verified_inliers(self.context), limit)
+        return weakly_connected_images(self.context.verified_inliers(), limit)
 
     def states(self) -> dict[Pair, PairState]:
         """Return what is known of the pairs that are in the database."""
@@ -238,8 +229,10 @@ class Escalation:
 
     def _num_consistent(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
         """Return how many raw matches of pairs confirm each other."""
-        ids = colmap_database.image_ids(self.path)
-        with colmap_database.open_database(self.path) as database:
+        if not pairs:
+            return {}
+        ids = self.context.graph.ids
+        with open_database(self.path) as database:
             matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
         known = self._consistent
         for pair, indices in matches.items():
@@ -418,8 +411,7 @@ class Escalation:
 
     def write(self) -> None:
         """Bring the database up to what is stored."""
-        write_matches(self.context, self.pairs, replaces=True)
-        verify_new(self.context)
+        update_verified(self.context, self.pairs, replaces=True)
 
     def _extend(self, missing: Sequence[tuple[str, int]], advance: Callable[[int], None]) -> None:
         """Add to images the features of levels that they lack."""
@@ -441,7 +433,9 @@ class Escalation:
         advance: Callable[[int], None],
     ) -> None:
         size_px = self.extraction.levels[level].max_image_size_px
-        verifier, states = PairVerifier(self.path, self.verification, size_px), self.states()
+        graph = self.context.graph
+        verifier = PairVerifier(graph.ids, graph.cameras, self.verification, size_px)
+        states = self.states()
 
         def judged(found: PairMatches) -> Trial:
             names = found.names

@@ -2,10 +2,10 @@
 
 1. Learned matching of whole photographs comes first, where its weights are there: it costs little
    and helps where light, age or season differ. On small sets all pairs of images in need are
-   matched by it, beside what is there (:mod:`colmap_affrect.stages.alternatives`); on others as
+   matched by it, beside what is there (:mod:`colmap_affrect.escalation.alternatives`); on others as
    many as take what the first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
-   (:mod:`colmap_affrect.stages.expected_gain`), until the budget of the effort is spent, or
+   (:mod:`colmap_affrect.escalation.expected_gain`), until the budget of the effort is spent, or
    nothing is likely to help.
 
 All seconds are nominal, of one core: a run that is killed and goes on, or a busy machine, decides
@@ -16,11 +16,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from colmap_affrect.options import EffortName
-from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.report import MatchedAgain
-from colmap_affrect.recipes import Level
-from colmap_affrect.stages.expected_gain import (
+from colmap_affrect.escalation.expected_gain import (
     LEARNED,
     MAPPING_S,
     ExpectedGain,
@@ -29,6 +25,10 @@ from colmap_affrect.stages.expected_gain import (
     gain_of,
     kind_of,
 )
+from colmap_affrect.options import EffortName
+from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.report import MatchedAgain
+from colmap_affrect.recipes import Level
 
 SMALL = 30  # images up to which learned matching takes all pairs of images in need
 MIN_PHOTOGRAPHS = 0.2  # expected of all that the budget allows, below which nothing is tried

@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 
-from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages import escalation_policy as policy
-from colmap_affrect.stages.escalation_policy import (
+from colmap_affrect.escalation import policy
+from colmap_affrect.escalation.expected_gain import PairState, gain_of, kind_of
+from colmap_affrect.escalation.policy import (
     EFFORTS,
     SMALL,
     Situation,
@@ -20,7 +19,8 @@ from colmap_affrect.stages.escalation_policy import (
     tried,
     untried,
 )
-from colmap_affrect.stages.expected_gain import PairState, gain_of, kind_of
+from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.recipes import load_recipe
 
 LEVELS = load_recipe("default").levels
 KINDS = [kind_of(level) for level in LEVELS]

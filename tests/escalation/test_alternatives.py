@@ -17,15 +17,8 @@ from verified import copy_of, verified
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.features.base import EXTRACTORS
-from colmap_affrect.mappers.base import MAPPERS, Mapper
-from colmap_affrect.mappers.mapping import read_summaries
-from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING, LOOKED_AT, RESTORING
-from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import Recipe, load_recipe
-from colmap_affrect.stages import alternatives, climb
-from colmap_affrect.stages.alternatives import (
+from colmap_affrect.escalation import alternatives, climb
+from colmap_affrect.escalation.alternatives import (
     Choice,
     LookedAt,
     best_score,
@@ -39,8 +32,15 @@ from colmap_affrect.stages.alternatives import (
     score,
     take_over_chosen,
 )
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, begin, matched_again
+from colmap_affrect.escalation.escalate import Escalation, begin, matched_again
+from colmap_affrect.features.base import EXTRACTORS
+from colmap_affrect.mappers.base import MAPPERS, Mapper
+from colmap_affrect.mappers.mapping import read_summaries
+from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING, LOOKED_AT, RESTORING
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
 
@@ -140,7 +140,7 @@ def test_step_takes_matches_that_are_kept_and_matches_nothing_anew(
     (pair, *_) = escalation.pairs
     without_matches(escalation, pair)
     (kept,) = context.matches.learned([pair]).values()
-    monkeypatch.setattr("colmap_affrect.stages.escalate.matched_at_level", None)
+    monkeypatch.setattr("colmap_affrect.escalation.escalate.matched_at_level", None)
     escalation.match_at([pair], 1)
     state = escalation.states()[pair]
     assert (state.level, state.num_inliers, state.tried) == (1, kept.worth[0], 0b11)
