@@ -155,11 +155,11 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
 
 
 def _learned_choice(escalation: Escalation) -> Choice:
-    states = escalation.states()
+    states = escalation.state.states()
     learned = escalation.matches.learned(list(states))
     levels = {pair: found.matches.level for pair, found in learned.items()}
     changed = [pair for pair, level in levels.items() if states[pair].level != level]
-    measured = [pair for pair in changed if escalation.is_measured[states[pair].level]]
+    measured = [pair for pair in changed if escalation.state.is_measured[states[pair].level]]
     worths = {pair: states[pair].worth for pair in measured}
     return Choice([learned[pair].matches for pair in changed], worths)
 
@@ -273,7 +273,7 @@ def restore_best(escalation: Escalation) -> bool:
     if best_score(context) <= present_score(context):
         return False
     before = MatchStore(best / context.workspace.matches.name)
-    pairs = list(escalation.num_inliers())
+    pairs = list(escalation.state.num_inliers())
     levels = context.matches.levels(pairs)
     changed = [p for p, level in before.levels(pairs).items() if level != levels[p]]
     choice = Choice(list(before.read(changed)), before.measured_worths(changed))

@@ -123,8 +123,8 @@ def curve(
 def spent(context: Context) -> Row:
     """Return what escalation has taken so far, in nominal seconds, and what it was."""
     escalation = Escalation(context, Recipe().escalate)
-    models = escalation.models()
-    situation = escalation.situation(escalation.needs(models), models)
+    models = escalation.state.models()
+    situation = escalation.state.situation(escalation.state.weights(models), models)
     names = [level.name for level in situation.levels]
     return {
         "first_model_s": round(situation.first_model_s, 1),

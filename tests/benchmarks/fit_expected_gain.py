@@ -44,8 +44,8 @@ from colmap_affrect.stages.verify import verify_matches
 
 NUM_PAIRS, NUM_SLOW_PAIRS, NUM_ROWS = 21, 8, 6
 STRONG, ENOUGH, MAX_ERROR_DEG = 100, 50, 10.0
-PRIOR = {"constant": -1.5, "consistent": 0.5, "inliers": 0.3, "tried": -0.5, "luck": 0.3}
-RIDGE = {"constant": 0.9, "consistent": 6.0, "inliers": 6.0, "tried": 6.0, "luck": 6.0}
+PRIOR = {"constant": -1.5, "consistent": 0.5, "inliers": 0.3, "tried": -0.5, "success_ratio": 0.3}
+RIDGE = {"constant": 0.9, "consistent": 6.0, "inliers": 6.0, "tried": 6.0, "success_ratio": 6.0}
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -107,7 +107,7 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
         verify_matches(context)
         context.workspace.record_options("escalate", EscalateOptions().to_mapping())
         escalation = Escalation(context, EscalateOptions())
-        states, features = escalation.states(), context.features
+        states, features = escalation.state.states(), context.features
         weak = [pair for pair, state in states.items() if state.num_inliers < STRONG]
         chosen = sorted(random.Random(0).sample(weak, min(NUM_PAIRS, len(weak))))
         rows: dict[tuple[str, str], Row] = {
@@ -135,9 +135,7 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
                 context.verification,
                 level.max_image_size_px,
             )
-            with closing(
-                matched_at_level(context, pairs, escalation.matching, number)
-            ) as found_pairs:
+            with closing(matched_at_level(context, pairs, context.matching, number)) as found_pairs:
                 for found in found_pairs:
                     frames = [features.read_frames(name) for name in found.names]
                     inliers = verifier.inliers(found.names, (frames[0], frames[1]), found.indices)
@@ -231,7 +229,7 @@ def main() -> None:
             chance[out] = 1 / (1 + np.exp(-odds))
         kind = kind_of(levels[number])
         weights = np.round(fitted(values, outcome), 2).tolist()
-        content[kind]["weights"] = dict(zip(PRIOR, weights, strict=True))
+        content[kind]["coefficients"] = dict(zip(PRIOR, weights, strict=True))
         brier, mean = np.mean((chance - outcome) ** 2), np.var(outcome)
         print(f"{kind}: {len(found) // NUM_ROWS} pairs, Brier {brier:.3f} (mean alone {mean:.3f})")
     arguments.output_path.write_text(json.dumps(content, indent=1) + "\n")
