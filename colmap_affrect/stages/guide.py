@@ -40,8 +40,14 @@ def guide(context: Context, options: GuidedOptions | None = None) -> StageReport
     """Match the verified pairs of some images again, guided by their geometry.
 
     A pair gets the geometry of its inliers and guided matches when that has more inliers than the
-    one before. Pairs that were guided are not guided again. ``options`` are by default those on
-    record. ``num_done`` counts the pairs that were matched again now.
+    one before. Pairs that were guided are not guided again.
+
+    Args:
+        context: of the workspace, whose pairs are verified.
+        options: by default those on record.
+
+    Returns:
+        How many pairs were matched again now, and how many before.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -104,7 +110,9 @@ class GuidedMatcher:
     """Matches pairs again, with the features that it keeps of some images."""
 
     def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
-        self._store, self._options = store, options
+        """Name the features; they are read when an image comes first."""
+        self._store = store
+        self._options = options
         self._images = lru_cache(IMAGES_IN_MEMORY)(self._read)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -112,22 +120,33 @@ class GuidedMatcher:
 
     def __call__(self, task: GuidedTask) -> Indices:
         """Return the (K, 2) inliers of a pair and its guided matches."""
-        (first, shapes1), (second, shapes2) = map(self._images, task.names)
+        descriptors1, shapes1 = self._images(task.names[0])
+        descriptors2, shapes2 = self._images(task.names[1])
+        descriptors = (descriptors1, descriptors2)
         shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
-        return guided_matches((first, second), shapes, task.model, task.inliers, self._options)
+        return guided_matches(descriptors, shapes, task.model, task.inliers, self._options)
 
     def _read(self, name: str) -> tuple[Singles, Array]:
         """Return descriptors and, where frames were measured one by one, their linear parts."""
         features = self._store.read(name)
         shapes = features.lafs[:, :, :2]
-        return features.descriptors, shapes if len(shapes) and vary_singly(shapes) else shapes[:0]
+        if not (len(shapes) and vary_singly(shapes)):
+            shapes = shapes[:0]
+        return features.descriptors, shapes
 
 
 class Guiding:
     """Guides the pairs of a workspace, with the options on record."""
 
     def __init__(self, context: Context, options: GuidedOptions) -> None:
-        self.context, self.options = context, options
+        """Name the workspace.
+
+        Args:
+            context: of the workspace, whose pairs are verified.
+            options: of guided matching.
+        """
+        self.context = context
+        self.options = options
         self.path = context.workspace.database
         self.ids = context.graph.ids
         max_size_px = context.extraction.max_image_size_px
@@ -142,19 +161,39 @@ class Guiding:
         """Return the pairs to guide, and how many are done."""
         known = current(self.context)
         exact = exact_inliers(self.context, known)
-        images = set(self.ids) if self.options.enabled == "always" else set[str]()
-        if self.options.enabled == "auto":  # of two images alone there are no longer tracks
-            has_three = len({name for pair in exact for name in pair}) > 2
-            limit = self.options.min_num_tracks if has_three else 0
-            images = weakly_connected_images(exact, limit)
+        images = self._images_to_guide(exact)
         levels = self.context.matches.levels(self.context.listed_pairs())
         escalated = {frozenset(pair) for pair, level in levels.items() if level}  # have enough
-        chosen = [p for p in exact if not {*p}.isdisjoint(images) and {*p} not in escalated]
         done = {pair.names for pair in known}
-        return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
+        todo = list[Pair]()
+        num_done = 0
+        for pair in exact:
+            if images.isdisjoint(pair) or frozenset(pair) in escalated:
+                continue
+            if pair in done:
+                num_done += 1
+            else:
+                todo.append(pair)
+        return todo, num_done
+
+    def _images_to_guide(self, exact: Mapping[Pair, Indices]) -> set[str]:
+        """Return the images whose verified pairs are guided, by their exact inliers."""
+        if self.options.enabled == "always":
+            return set(self.ids)
+        if self.options.enabled != "auto":
+            return set()
+        names = {name for pair in exact for name in pair}
+        # Of two images alone there are no longer tracks.
+        limit = self.options.min_num_tracks if len(names) > 2 else 0
+        return weakly_connected_images(exact, limit)
 
     def guide(self, pairs: Sequence[Pair], advance: Callable[[int], None]) -> None:
-        """Match verified pairs again, batch by batch, and keep what has more inliers."""
+        """Match verified pairs again, batch by batch, and keep what has more inliers.
+
+        Args:
+            pairs: of image names.
+            advance: is called with the number of pairs that are done.
+        """
         if not pairs:
             return
         features = self.context.features
@@ -163,15 +202,19 @@ class Guiding:
         stationary = StationaryFilter(features, self.context.matches)
         ordered = ordered_for_reuse(pairs, IMAGES_IN_MEMORY)
         for begin in range(0, len(ordered), PAIRS_PER_WRITE):
-            batch, found = ordered[begin : begin + PAIRS_PER_WRITE], []
+            batch = ordered[begin : begin + PAIRS_PER_WRITE]
             tasks = self._tasks(batch)
+            found = list[tuple[GuidedTask, Indices]]()
             matched = executor.map(matcher, tasks, [features.path])
-            for task, both in zip(tasks, matched, strict=True):
-                found.append((task, both[stationary.left(task.names, both)]))
+            for task, matches in zip(tasks, matched, strict=True):
+                moving = stationary.left(task.names, matches)
+                found.append((task, matches[moving]))
                 advance(1)
-            untold = set(batch) - {task.names for task in tasks}
-            self.context.guided.write(GuidedPair(names, NOTHING, 0) for names in sorted(untold))
-            advance(len(untold))
+            without_model = set(batch).difference(task.names for task in tasks)
+            self.context.guided.write(
+                GuidedPair(names, NOTHING, 0) for names in sorted(without_model)
+            )
+            advance(len(without_model))
             self._keep(found)
 
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
@@ -180,25 +223,31 @@ class Guiding:
         with open_database(self.path) as database:
             cameras = cameras_of_images(database)
             for names in pairs:
-                first, second = (self.ids[name] for name in names)
-                keypoints = database.read_keypoints(first), database.read_keypoints(second)
+                first = self.ids[names[0]]
+                second = self.ids[names[1]]
+                keypoints = (database.read_keypoints(first), database.read_keypoints(second))
                 geometry = database.read_two_view_geometry(first, second)
                 model = pair_model(geometry, (cameras[first], cameras[second]), keypoints)
-                if model:
-                    inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-                    scaled = model.scaled(self.scales[names[0]], self.scales[names[1]])
-                    tasks.append(GuidedTask(names, scaled, inliers, geometry.config == CALIBRATED))
+                if not model:
+                    continue
+                inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+                scaled = model.scaled(self.scales[names[0]], self.scales[names[1]])
+                is_calibrated = geometry.config == CALIBRATED
+                tasks.append(GuidedTask(names, scaled, inliers, is_calibrated))
         return tasks
 
     def _keep(self, found: Sequence[tuple[GuidedTask, Indices]]) -> None:
         """Put better geometries into the database, and all pairs on record before that."""
-        geometries = {}
+        features = self.context.features
+        geometries = dict[Pair, pycolmap.TwoViewGeometry]()
         for task, matches in found:
-            if len(matches) > len(task.inliers):
-                frames1, frames2 = map(self.context.features.read_frames, task.names)
-                geometry = self.verifier.geometry(task.names, (frames1, frames2), matches)
-                if _is_better(geometry, task):
-                    geometries[task.names] = geometry
+            if len(matches) <= len(task.inliers):
+                continue
+            first, second = task.names
+            frames = (features.read_frames(first), features.read_frames(second))
+            geometry = self.verifier.geometry(task.names, frames, matches)
+            if _is_better(geometry, task):
+                geometries[task.names] = geometry
         counts = {names: len(geometry.inlier_matches) for names, geometry in geometries.items()}
         self.context.guided.write(
             GuidedPair(task.names, task.inliers, counts.get(task.names, 0)) for task, _ in found
@@ -210,8 +259,8 @@ class Guiding:
             return
         with self.context.graph.opened(for_pairs=True) as database:
             for names, geometry in geometries.items():
-                first, second = (self.ids[name] for name in names)
-                database.update_two_view_geometry(first, second, geometry)
+                first, second = names
+                database.update_two_view_geometry(self.ids[first], self.ids[second], geometry)
 
 
 def _is_better(geometry: pycolmap.TwoViewGeometry, task: GuidedTask) -> bool:
