@@ -2,6 +2,7 @@
 
 import codecs
 import io
+import logging
 import re
 import shlex
 import sys
@@ -15,6 +16,9 @@ DAMAGE = (
     OverflowError, EOFError,
 )  # fmt: skip
 """What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or not ours."""
+# What is logged is shown by the command line, or as the program says that uses the package.
+logging.getLogger("colmap_affrect").addHandler(logging.NullHandler())
+
 MAX_REASON = 200  # characters of what a reader says
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
@@ -166,7 +170,7 @@ codecs.register_error(ESCAPED, _escape_lacking)
 
 def say(line: str) -> None:
     """Print a line on stderr, which nobody may read any more."""
-    with suppress(OSError):
+    with suppress(OSError, RuntimeError):  # the latter of a handler that a signal calls meanwhile
         if sys.stderr:  # it may have been closed
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()

@@ -4,6 +4,7 @@ What is known of finished models is kept beside them: COLMAP's files cannot hold
 """
 
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,6 +88,7 @@ def model_folders(sparse_path: Path) -> list[Path]:
 
 Judgements = Mapping[str, Judgement]  # by the names of the images
 WRONG = 0.05  # probability below which an image leaves its model: nineteen of twenty are wrong
+NUM_REMOVALS, BETWEEN_REMOVALS_S = 5, 0.05  # of what was begun, while a call still writes there
 
 
 def map_database(
@@ -137,8 +139,21 @@ def map_database(
         remove_own([sparse_path])
         partial.rename(sparse_path)
     finally:
-        remove_own([partial])
+        _remove_unfinished(partial)
     return summaries
+
+
+def _remove_unfinished(partial: Path) -> None:
+    """Remove what mapping has not finished; a call of COLMAP that was left may still write there.
+
+    What stays nevertheless, the next mapping removes.
+    """
+    for _ in range(NUM_REMOVALS):
+        try:
+            remove_own([partial])
+            return
+        except OSError:
+            time.sleep(BETWEEN_REMOVALS_S)
 
 
 def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgements]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -153,6 +155,27 @@ def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
     (model,), _ = reconstruct(path, mapper_of("incremental"))
     assert len(model.registered_names) == 3
+
+
+def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A call that does not look whether it is cancelled is left, and goes on for a moment."""
+    path, removed = tmp_path / "database.db", shutil.rmtree
+    synthesize(path, num_rigs=2, num_points3D=50)
+
+    def remove_while_a_file_is_made(folder: Path) -> None:
+        monkeypatch.setattr(shutil, "rmtree", removed)
+        raise OSError(errno.ENOTEMPTY, "Directory not empty", folder)
+
+    def stop(*_: object, **__: object) -> None:
+        monkeypatch.setattr(shutil, "rmtree", remove_while_a_file_is_made)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", stop)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(path, mapper_of("incremental"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
 
 
 @pytest.fixture(scope="module")
