@@ -55,7 +55,11 @@ def _argument(flag: re.Match[str]) -> str:
 
 
 class OptionError(AffrectError, ValueError):
-    """An option is unknown, out of range, contradicts another one, or names what is not there."""
+    """The command cannot be carried out as it is given, and nothing is computed.
+
+    An option is unknown, out of range, contradicts another one, or names what is not there or does
+    not hold what it should: a folder, a list or a table.
+    """
 
     exit_code = 2
 
@@ -72,6 +76,10 @@ class ImageError(AffrectError):
 
 class StoreError(AffrectError):
     """A file of features or matches is foreign, incomplete, or of another format version."""
+
+
+class ConflictError(StoreError, OptionError):
+    """Results are there that the command would replace, or that it cannot go on from."""
 
 
 class DatabaseError(AffrectError):

@@ -25,7 +25,7 @@ from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.regular_files import read_regular
-from colmap_affrect.project.report import DOUBTFUL, ModelSummary
+from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_probability
 
 
 @dataclass(frozen=True)
@@ -204,15 +204,17 @@ def _summary(
     inside, graph = set(model.reg_image_ids()), graph_of(task, MIN_NUM_MATCHES)
     images = [model.images[image_id] for image_id in sorted(inside)]
     alike = sorted(one_views(graph, task.image_path))
+    sure_of = {name: kept_probability(one.probability) for name, one in found.items()}
     focals = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
     return ModelSummary(
         registered_names=tuple(sorted(focals)),
         num_points3D=model.num_points3D(),
         mean_track_length=float(model.compute_mean_track_length()),
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
-        probabilities={name: round(one.probability, 3) for name, one in found.items()},
+        probabilities=sure_of,
         gains={name: round(one.gain, 3) for name, one in {**taken, **found}.items()},
-        doubtful={name: one.reason for name, one in found.items() if one.probability < DOUBTFUL},
+        doubtful={name: found[name].reason for name, p in sure_of.items() if p < DOUBTFUL},
+        unsure={name: found[name].reason for name, p in sure_of.items() if DOUBTFUL <= p < SURE},
         bridges={name: one for name, one in mapped.bridges.items() if name in focals},
         taken_out={name: one.reason for name, one in taken.items()},
         focals_px=focals,
