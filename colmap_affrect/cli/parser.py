@@ -233,7 +233,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "panoramas of 360 x 180 degrees, by views of them, into COLMAP models",
         "--image-path! --output-path@new! --order --random-seed"),
     "inspect": (
-        "draw what a recipe does to one image: regions, warps, features",
+        "draw what a recipe does to one image, a sheet for each level: regions, warps, features",
         f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),
     "show-pair": (
         "draw two photographs side by side, with lines between what was matched",
