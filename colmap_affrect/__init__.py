@@ -2,16 +2,11 @@
 
 Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)``. The public names
 are those of ``__init__.pyi``; they are loaded when first used, so that importing the package stays
-light.
+light: these are the first lines of a command, too, which Ctrl-C may already meet.
 """
 
-import importlib
-import logging
-import re
 import sys
 import zlib
-from pathlib import Path
-from typing import Any
 
 __version__ = "0.1.0"
 
@@ -23,10 +18,19 @@ PYCOLMAP_CAME_FIRST = _first.startswith("pycolmap")
 if not PYCOLMAP_CAME_FIRST:
     zlib.decompress(zlib.compress(b"warm"))
 
-logging.getLogger(__name__).addHandler(logging.NullHandler())
 
-_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-_PUBLIC = {n: module for module, n in re.findall(r"^from (\S+) import (\w+)", _STUB, re.MULTILINE)}
+def _public_names() -> dict[str, str]:
+    """Return the module of each public name, by the stub."""
+    found = {}
+    with open(f"{__file__}i", encoding="utf-8") as stub:  # noqa: PTH123 (pathlib takes time)
+        for line in stub:
+            if line.startswith("from "):
+                _, module, _, name, *_ = line.split()
+                found[name] = module
+    return found
+
+
+_PUBLIC = _public_names()
 
 __all__ = ["__version__"]
 __all__ += list(_PUBLIC)
@@ -36,7 +40,9 @@ def __dir__() -> list[str]:
     return [*globals(), *_PUBLIC]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
     return getattr(importlib.import_module(_PUBLIC[name]), name)

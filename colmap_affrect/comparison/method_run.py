@@ -27,7 +27,7 @@ from colmap_affrect.colmap.verification import VerificationOptions, verified_pai
 from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
-from colmap_affrect.errors import AffrectError, StoreError
+from colmap_affrect.errors import AffrectError, ConflictError
 from colmap_affrect.escalation.climb import climb
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
@@ -182,7 +182,7 @@ class MethodRun:
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
         known = json.loads(read_regular(record)) if record.exists() else {}
         if folder.exists() and (difference := first_difference(known, asked)):
-            raise StoreError(
+            raise ConflictError(
                 f"{folder}: {self.method.label} was run there with {difference}; use "
                 "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
                 "or another --output-path"

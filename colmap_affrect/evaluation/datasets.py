@@ -87,7 +87,7 @@ def load_evd(folder: Path) -> Pairs:
             found.append(entry(f"{name} {one}-{two}", f"{name}_{one}", f"{name}_{two}", file.name))
     if not found:
         layouts = "1/NAME.png, 2/NAME.png, h/NAME.txt nor NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
-        raise AffrectError(f"{folder}: holds neither {layouts}")
+        raise OptionError(f"{folder}: holds neither {layouts}")
     return _loaded(found, folder, 0.0)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
@@ -31,7 +31,7 @@ OF_TRAINING = "SIFT."  # begins what the file of HardTFeat has beside it
 def resolve_device(name: str) -> torch.device:
     """Return the device of ``auto`` (CUDA if there is any), ``cpu``, ``cuda:1``, ``mps``.
 
-    OptionError for another name, AffrectError when the device is not there.
+    OptionError for another name, or when the device is not there.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -41,7 +41,7 @@ def resolve_device(name: str) -> torch.device:
         torch.empty(0, device=name)
     except (AssertionError, RuntimeError) as error:
         why = str(error).splitlines()[0]
-        raise AffrectError(f"--device {name}: {why}; use --device cpu or auto") from error
+        raise OptionError(f"--device {name}: {why}; use --device cpu or auto") from error
     return torch.device(name)
 
 

@@ -114,11 +114,16 @@ TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
         lambda m: CONTRADICTIONS[0] if m.evidence < 0.0 else "few matches speak for its place",
     ),
     "agreement": Term(
-        lambda m: m.agreement, lambda m: f"only {m.agreement:.0%} {CONTRADICTIONS[1]}"
+        lambda m: m.agreement,
+        lambda m: f"only {math.floor(100.0 * m.agreement)}% {CONTRADICTIONS[1]}",
     ),
     "points of three": Term(
         lambda m: math.log1p(min(m.num_three, 300)),
-        lambda m: f"only {m.num_three} of its points are seen by two other photographs",
+        lambda m: (
+            f"only {m.num_three} of its points are seen by two other photographs"
+            if m.num_three
+            else "none of its points is seen by two other photographs"
+        ),
     ),
     "focal length": Term(
         lambda m: math.log(min(max(m.focal_growth, MIN_GROWTH), MAX_GROWTH)),

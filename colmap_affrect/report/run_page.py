@@ -18,8 +18,10 @@ from colmap_affrect.project.report import (
     SOURCES,
     ModelSummary,
     ReconstructionReport,
+    as_mapped,
     by_story,
     camera_notes,
+    probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.page import TEMPLATES, write_page
@@ -107,7 +109,10 @@ def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
         kind, text = "existing", KINDS["existing"]
     groups = ["all", kind, *(["added"] if name in report.added else [])]
     if name in model.probabilities:
-        text += f", right with a probability of {model.probabilities[name]:.0%}"
+        text += f", right with a probability of {probability_text(model.probabilities[name])}"
+    if name in model.unsure:
+        why, reasons = model.unsure[name], list(model.unsure.values())
+        text += "; not sure" + f": {why}" * (reasons.count(why) == 1)
     if name in model.doubtful:
         why, reasons = model.doubtful[name], list(model.doubtful.values())
         kind, text = "doubtful", f"{text}; doubtful" + f": {why}" * (reasons.count(why) == 1)
@@ -118,7 +123,8 @@ def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
 def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     """Return what cannot be trusted, or why there is no model and what became of photographs."""
     if report.models:
-        return by_story(model.doubtful)
+        unsure = [f"not sure: {line}" for line in by_story(model.unsure)]
+        return by_story(model.doubtful) + unsure
     why = report.why_no_model
     fates = {name: fate.partition(";")[0] for name, fate in report.unregistered.items()}
     return [f"{why[0].upper()}{why[1:]}.", *by_story(fates)]
@@ -129,7 +135,7 @@ def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, An
     numbered = {name: f"{number} {name}" for number, name in enumerate(names, 1)}
     cameras = [
         (camera, such_as(numbered[name] for name in camera["names"] if name in numbered))
-        for camera in report.cameras[:MAX_NUM_CAMERAS]
+        for camera in as_mapped(report.cameras)[:MAX_NUM_CAMERAS]
     ]
     counts = Counter(camera["source"] for camera in report.cameras).most_common()
     notes = camera_notes(report.cameras)

@@ -18,6 +18,7 @@ from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import judge
 from colmap_affrect.mappers.tie_points import NONE, TiePoints
+from colmap_affrect.project.report import kept_probability
 
 NOISE_PX = 0.5
 
@@ -153,7 +154,9 @@ def test_models_are_judged_before_their_last_points(tmp_path: Path) -> None:
 
     (summary,) = map_database(Kept(), task, tmp_path / "sparse", lambda _: None)
     expected = judge(unfinished[0], task)
-    assert summary.probabilities == {k: round(v.probability, 3) for k, v in expected.items()}
+    assert summary.probabilities == {
+        k: kept_probability(v.probability) for k, v in expected.items()
+    }
     written = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert bits(written) == bits(unfinished[0].reconstruction)
     assert written.num_points3D() == summary.num_points3D >= 118
