@@ -33,13 +33,20 @@ def triangulated_depths(rotation: Array, translation: Array, rays1: Array, rays2
     square1, square2 = (towards1**2).sum(axis=1), (towards2**2).sum(axis=1)
     product = (towards1 * towards2).sum(axis=1)
     along1, along2 = towards1 @ translation, towards2 @ translation
-    sines = np.linalg.norm(np.cross(towards1, towards2), axis=1)
+    sines = np.linalg.norm(_cross(towards1, towards2), axis=1)
     determinants = np.maximum(sines**2, np.finfo(float).tiny)
     return Depths(
         (product * along2 - square2 * along1) / determinants,
         (square1 * along2 - product * along1) / determinants,
         np.degrees(np.arctan2(sines, product)),
     )
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """Return the cross products of (N, 3) vectors: ``np.cross`` takes twice as long for few."""
+    x1, y1, z1 = first.T
+    x2, y2, z2 = second.T
+    return np.stack([y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2], axis=1)
 
 
 def homogeneous(points: Floats) -> Array:

@@ -214,7 +214,9 @@ def measure(
     for first, second in sorted(one_view):
         same_view[second] = same_view.get(first, first)
     three, long = evidence.three_view_ratios(model), num_long_tracks(model, same_view)
-    turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
+    pairs_of_frames = _pairs_of_frames(model, pairs_of)
+    turned = _rotation_shares(graph, pairs_of_frames)
+    originals = _originals(graph, pairs, agreements)
     growths = focal_growths(model, task) if growths is None else growths
     cuts = _cuts({pair.ids: pair for pair in pairs if agreements[pair.ids] >= MIN_SHARE})
     fitting_px = _fitting_focals(model, task, priors)
@@ -225,7 +227,8 @@ def measure(
         shares, weights = [agreements[p.ids] for p in own], [len(p.matches) for p in own]
         cells_of = {p.ids: evidence.num_cells(p) for p in own if p.ids not in one_view}
         nats = sum(pair_evidence(agreements[ids] * n, n) for ids, n in cells_of.items())
-        rotations = [turned[p.ids] for p in own if p.ids in turned] or list(turned.values())
+        with_frame = pairs_of_frames[model.images[image_id].frame_id]
+        rotations = [turned[p.ids] for p in with_frame if p.ids in turned] or list(turned.values())
         name, camera = graph.names[image_id], cameras[image_id]
         focal_px = float(camera.mean_focal_length())
         found[name] = Measures(
@@ -256,10 +259,24 @@ def _cuts(agreeing: Mapping[Ids, VerifiedPair]) -> dict[int, VerifiedPair]:
     return found
 
 
+def _pairs_of_frames(
+    model: pycolmap.Reconstruction, pairs_of: Mapping[int, Sequence[VerifiedPair]]
+) -> dict[int, list[VerifiedPair]]:
+    """Return the pairs of each frame with others: what a rig took at once stands right together."""
+    frames = {image_id: model.images[image_id].frame_id for image_id in pairs_of}
+    found: dict[int, list[VerifiedPair]] = {frame_id: [] for frame_id in frames.values()}
+    for image_id, pairs in pairs_of.items():
+        for pair in pairs:
+            first, second = pair.ids
+            if frames[first] != frames[second]:
+                found[frames[image_id]].append(pair)
+    return found
+
+
 def _rotation_shares(
     graph: PairGraph, pairs_of: Mapping[int, Sequence[VerifiedPair]]
 ) -> dict[Ids, float]:
-    """Return, of the strongest pairs of images, how much a camera that turns explains."""
+    """Return, of the strongest pairs of frames, how much a camera that turns explains."""
     strongest = {
         pair.ids: pair
         for pairs in pairs_of.values()

@@ -54,6 +54,23 @@ def test_all_tracks_become_points_and_poses_stay_to_the_bit(tmp_path: Path) -> N
     assert model.compute_mean_reprojection_error() < 1.05 * NOISE_PX * np.sqrt(np.pi / 2 * 0.7)
 
 
+def test_no_fewer_points_than_by_colmap_and_no_larger_errors(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path, noise_px=2.0, num_rigs=2, num_points3D=400)
+    native = pycolmap.IncrementalPipelineOptions(random_seed=SEED, num_threads=1)
+    native.triangulation.ignore_two_view_tracks = False
+    theirs = pycolmap.triangulate_points(
+        copy.deepcopy(truth), path, tmp_path, tmp_path, clear_points=True, options=native
+    )
+    model = copy.deepcopy(truth)
+    for key in list(model.point3D_ids()):
+        model.delete_point3D(key)
+    complete(model, path)
+    theirs.update_point_3d_errors()
+    assert model.num_points3D() >= theirs.num_points3D() > 200
+    assert model.compute_mean_reprojection_error() <= theirs.compute_mean_reprojection_error()
+
+
 def test_points_that_stood_badly_are_moved(tmp_path: Path) -> None:
     model = placed(tmp_path / "database.db")
     complete(model, tmp_path / "database.db")
