@@ -13,7 +13,8 @@ from synthetic import texture, write_image
 from colmap_affrect.data import Photograph, Rectification, RectificationPlan
 from colmap_affrect.errors import ImageError
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.report.inspection import PALETTE, WIDTH_PX, inspect_image, inspect_level, tinted
+from colmap_affrect.report.inspection import inspect_image, inspect_level, tinted
+from colmap_affrect.report.sheets import PALETTE, WIDTH_PX, rgb
 from colmap_affrect.stages import context
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
@@ -52,8 +53,8 @@ def test_level_has_the_plan_and_the_features_of_extraction(
     assert len(level.plan.items) == len(plan.items) > 0
     assert_array_equal(level.features.lafs, features.lafs)
     kept = np.bincount(level.features.rectification_ids, minlength=len(plan.items) + 1)
-    assert set(level.seen) == set(range(len(plan.items) + 1))
-    assert all(kept[number] <= len(found) for number, (_, found) in level.seen.items())
+    assert set(level.detected) == set(range(len(plan.items) + 1))
+    assert all(kept[number] <= len(found) for number, (_, found) in level.detected.items())
     said = inspect(extractor, photo, tmp_path / "new" / "out")
     assert f"{len(plan.items)} warp" in said
     assert f"{len(features)} features" in said
@@ -107,7 +108,7 @@ def test_region_is_tinted_where_it_lies() -> None:
     item = Rectification(np.eye(3), SIZE, region, 2.0, 0.3, region_origin=(150, 20))
     photograph = Photograph(np.full(SIZE[::-1], 100, np.uint8), "photo.png", None, np.eye(3))
     image = tinted(photograph, RectificationPlan(SIZE, (item,)))
-    color = np.array([int(PALETTE[0][k : k + 2], 16) for k in (1, 3, 5)])
+    color = np.array(rgb(PALETTE[0]))
     is_tinted = np.zeros(SIZE[::-1], bool)
     is_tinted[20:70, 150:270] = True
     assert_allclose(image[is_tinted], np.tile(0.55 * 100 + 0.45 * color, (6000, 1)), atol=1)

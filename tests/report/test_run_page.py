@@ -16,7 +16,7 @@ from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.report.run_page import RunContent, write_run_page
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
         "cameras": (),
     }
     nothing = type(report)(**{**vars(report), **values})
-    path = write_run_page(Workspace(tmp_path), nothing, NAMES, {}, None)
+    path = write_run_page(Workspace(tmp_path), nothing, RunContent(NAMES, {}))
     html = path.read_text(encoding="utf-8")
     for text in (
         "Why there is no model",

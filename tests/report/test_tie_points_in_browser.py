@@ -20,7 +20,7 @@ from small_scene import NAMES as SCENE_NAMES
 
 from colmap_affrect.project.report import ModelSummary, Residual
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.report.run_page import RunContent, write_run_page
 
 pytestmark = [needs_chromium, pytest.mark.long]
 
@@ -98,8 +98,8 @@ def page(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     model = ModelSummary(tuple(names[:4]), 90, 3.5, 0.25, tie_points=residuals)
     report = small_report(tmp_path)
     values = {**vars(report), "models": (model,), "unregistered": dict.fromkeys(names[4:], "lost")}
-    changed, photographs = type(report)(**values), tmp_path / "photographs"
-    return write_run_page(workspace, changed, names, {}, photographs, marks=marks)
+    content = RunContent(names, {}, tmp_path / "photographs", marks)
+    return write_run_page(workspace, type(report)(**values), content)
 
 
 def until(true: Callable[[], object]) -> None:
