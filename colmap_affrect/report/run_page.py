@@ -108,10 +108,7 @@ def write_run_page(
             "num_pairs": len(num_inliers),
             "pairs_to_check": content.pairs_to_check,
             "line_colors": LEGEND,
-            "cameras": _camera_rows(report, names),
-            "source_counts": Counter(one["source"] for one in report.cameras).most_common(),
-            "source_texts": SOURCES,
-            "camera_notes": camera_notes(report.cameras),
+            **_cameras(report, names),
             "wants_marks": bool(marks) or len(model.registered_names) < len(names),
             "residuals": [
                 f"{one.point} in {one.image}: {one.error_px:.1f} px" for one in model.tie_points
@@ -175,17 +172,20 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     return [f"{why[0].upper()}{why[1:]}.", *by_story(fates)]
 
 
-def _camera_rows(
-    report: ReconstructionReport, names: Sequence[str]
-) -> list[tuple[dict[str, Any], str]]:
-    """Return the first cameras, each with its photographs."""
+def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, Any]:
+    """Return the first cameras, each with its photographs, and the sources of all focal lengths."""
     numbers = {name: number for number, name in enumerate(names, 1)}
     rows = []
     for camera in report.cameras[:MAX_NUM_CAMERAS]:
         known = [name for name in camera["names"] if name in numbers]
         photographs = such_as(f"{numbers[name]} {name}" for name in known)
         rows.append((camera, photographs))
-    return rows
+    return {
+        "cameras": rows,
+        "source_counts": Counter(one["source"] for one in report.cameras).most_common(),
+        "source_texts": SOURCES,
+        "camera_notes": camera_notes(report.cameras),
+    }
 
 
 def _tie_points(

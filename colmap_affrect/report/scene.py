@@ -13,7 +13,7 @@ from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.report.pictures import base64_text
 
-# The view was fitted by eye to the models of BENCHMARKS.
+# What is in the view, and how it is drawn, was chosen by eye.
 MAX_NUM_POINTS = 20_000  # that are drawn of a model; a page stays below some MB
 POINT_PERCENTILE = 90.0  # share of the points, by distance from their median, that is in the view
 RADIUS_MARGIN = 1.15  # radius of the view per distance of the farthest camera or point from it
