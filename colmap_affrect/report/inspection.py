@@ -17,7 +17,6 @@ from colmap_affrect.data import (
     LocalFeatures,
     Mask,
     Photograph,
-    Rectification,
     RectificationPlan,
     View,
 )
@@ -163,16 +162,13 @@ def warp_colors(plan: RectificationPlan) -> list[Color]:
 
     Warps of one segment have the same colour, and so have those of the whole image with one tilt.
     """
-    groups = [_color_group(item) for item in plan.items]
-    distinct = list(dict.fromkeys(groups))
-    numbers = [distinct.index(group) for group in groups]
-    return [rgb(PALETTE[number % len(PALETTE)]) for number in numbers]
-
-
-def _color_group(item: Rectification) -> tuple[float, float] | int:
-    if item.region is None:
-        return (item.tilt, item.tilt_angle_rad)
-    return item.segment_id
+    numbers: dict[tuple[float, float] | int, int] = {}  # of colours, by tilt or segment
+    colors = []
+    for item in plan.items:
+        key = (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
+        number = numbers.setdefault(key, len(numbers))
+        colors.append(rgb(PALETTE[number % len(PALETTE)]))
+    return colors
 
 
 def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:

@@ -73,7 +73,7 @@ def pairs_to_check(
         _of_pairs(disagreeing, Reason.DISAGREES),
         _of_pairs(lone_ties(agreeing), Reason.BRIDGE_EDGE),
         _of_pairs(rejected, Reason.REJECTED),
-        (Candidate((name, one.by), Reason.BRIDGED, name) for name, one in model.bridges.items()),
+        _bridged(model),
         _of_pairs(model.one_view, Reason.ONE_VIEW),
         _of_images(model.doubtful, strongest, Reason.DOUBTFUL),
         _of_images(report.unregistered, strongest, Reason.MISSING),
@@ -110,6 +110,12 @@ def _strongest_pairs(
 def _of_pairs(pairs: Iterable[Pair], reason: Reason) -> Iterator[Candidate]:
     for pair in pairs:
         yield Candidate(pair, reason)
+
+
+def _bridged(model: ModelSummary) -> Iterator[Candidate]:
+    """Yield the pairs by which single images were registered."""
+    for name, bridge in model.bridges.items():
+        yield Candidate((name, bridge.by), Reason.BRIDGED, name)
 
 
 def _of_images(

@@ -123,14 +123,18 @@ class PairReader:
 
         The model has them as keypoints behind those of the database (``colmap/by_hand``).
         """
-        marks: list[dict[int, Array]] = []  # by the id of their 3D point
-        for name, known in zip(names, keypoints, strict=True):
+        marks: list[dict[int, Array]] = [{}, {}]  # by the id of their 3D point
+        for side, name in enumerate(names):
             image = self.model.find_image_with_name(name)
-            behind = image.points2D[len(known) :] if image else ()
-            marks.append({point.point3D_id: point.xy for point in behind if point.has_point3D()})
-        common = [point_id for point_id in marks[0] if point_id in marks[1]]
-        rows = np.array([(marks[0][point_id], marks[1][point_id]) for point_id in common])
-        return list(rows.reshape(-1, 2, 2).swapaxes(0, 1))
+            for point in image.points2D[len(keypoints[side]) :] if image else ():
+                if point.has_point3D():
+                    marks[side][point.point3D_id] = point.xy
+        points: list[list[Array]] = [[], []]
+        for point_id in marks[0]:
+            if point_id in marks[1]:
+                points[0].append(marks[0][point_id])
+                points[1].append(marks[1][point_id])
+        return [np.array(points[0]).reshape(-1, 2), np.array(points[1]).reshape(-1, 2)]
 
     def _text(self, names: Pair, num_raw: int, num_inliers: int) -> str:
         """Return how many matches a pair has, of which level, and what the model says."""

@@ -65,6 +65,11 @@ def test_half_of_the_others_decides(truth: Poses) -> None:
     assert num_correct(estimated, truth) == 0
 
 
+@pytest.mark.parametrize(("degrees", "expected"), [(4.9, 5), (5.1, 4)])
+def test_poses_are_correct_within_5_degrees(truth: Poses, degrees: float, expected: int) -> None:
+    assert num_correct(turned(truth, "4.jpg", degrees), truth) == expected
+
+
 @pytest.mark.parametrize("num_images", [0, 1])
 def test_no_pairs(truth: Poses, num_images: int) -> None:
     estimated = dict(list(truth.items())[:num_images])

@@ -10,11 +10,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import texture, write_image
 
-from colmap_affrect.data import Photograph, Rectification, RectificationPlan
+from colmap_affrect.data import LocalFeatures, Photograph, Rectification, RectificationPlan
 from colmap_affrect.errors import ImageError
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.report.inspection import inspect_image, inspect_level, tinted
-from colmap_affrect.report.sheets import PALETTE, WIDTH_PX, rgb
+from colmap_affrect.report.sheets import PALETTE, WIDTH_PX, Panel, rgb
 from colmap_affrect.stages import context
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
@@ -101,6 +101,18 @@ def test_names_of_every_kind_are_written_and_drawn(
 ) -> None:
     inspect(extractor, photo.rename(tmp_path / "a $x^{$ ü 漢字.png"), tmp_path / "Ausgabe ä")
     assert (tmp_path / "Ausgabe ä" / "a $x^{$ ü 漢字-inspection.png").exists()
+
+
+def test_features_are_ellipses_of_two_sigmas() -> None:
+    """The LAF of a feature is that of six sigmas."""
+    lafs = np.array([[[30.0, 0.0, 49.5], [0.0, 15.0, 49.5]]])
+    features = LocalFeatures(lafs, np.ones(1, np.float32), np.zeros((1, 0), np.float32))
+    panel = Panel.fit(np.zeros((100, 100), np.uint8), 2)
+    scale = len(panel.image) / 100
+    panel.draw_features(features, [(255, 0, 0)], 1)
+    rows, columns = np.nonzero(panel.image[:, :, 0])
+    assert np.ptp(columns) == pytest.approx(2 * 10 * scale, abs=3)
+    assert np.ptp(rows) == pytest.approx(2 * 5 * scale, abs=3)
 
 
 def test_region_is_tinted_where_it_lies() -> None:

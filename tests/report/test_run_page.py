@@ -16,7 +16,8 @@ from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.run_page import RunContent, write_run_page
+from colmap_affrect.report import pictures
+from colmap_affrect.report.run_page import RunContent, inlier_matrix, write_run_page
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +92,32 @@ def test_cameras_are_where_the_model_has_them_seen_from_the_front(html: str, fol
 
     ratios = lengths(shown) / lengths(true)
     np.testing.assert_allclose(ratios, ratios[0], rtol=2e-3)
+
+
+def test_matrix_of_inliers_is_symmetric_and_not_there_for_many_photographs() -> None:
+    names = [f"{number}.png" for number in range(1000)]
+    data = base64.b64decode(inlier_matrix(names, {("0.png", "2.png"): 70_000}))
+    counts = np.frombuffer(data, "<u2").reshape(1000, 1000)
+    assert counts[0, 2] == counts[2, 0] == 65_535
+    assert np.count_nonzero(counts) == 2
+    assert inlier_matrix([*names, "one more.png"], {}) == ""
+
+
+@pytest.mark.parametrize(("num_photographs", "side_px"), [(1, 640), (39, 640), (1000, 126)])
+def test_thumbnails_are_smaller_the_more_photographs_a_page_has(
+    num_photographs: int, side_px: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All together have at most 12 megapixels, if they are as long as 4 to 3."""
+    asked = []
+
+    def read(_: Path, size_px: int) -> np.ndarray:
+        asked.append(size_px)
+        return np.zeros((2, 2, 3), np.uint8)
+
+    monkeypatch.setattr(pictures, "read_color", read)
+    names = [f"{number}.png" for number in range(num_photographs)]
+    assert list(pictures.thumbnails(tmp_path, names)) == names
+    assert set(asked) == {side_px}
 
 
 def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
