@@ -39,11 +39,11 @@ def num_correct(estimated: Poses, truth: Poses) -> int:
 
 
 def test_similarity_of_the_world_changes_nothing(truth: Poses) -> None:
-    world, shift, scale = rotation((3, 1, 2), 50), np.array([7.0, -8, 9]), 0.2
-    estimated = {
-        name: (matrix @ world, matrix @ shift + scale * translation)
-        for name, (matrix, translation) in truth.items()
-    }
+    world = rotation((3, 1, 2), 50)
+    shift = np.array([7.0, -8, 9])
+    estimated = {}
+    for name, (matrix, translation) in truth.items():
+        estimated[name] = (matrix @ world, matrix @ shift + 0.2 * translation)
     scores = pose_scores(estimated, truth, list(truth))
     assert scores.correct_names == tuple(truth)
     assert scores.median_rotation_error_deg == pytest.approx(0, abs=1e-6)

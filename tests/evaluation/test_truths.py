@@ -28,7 +28,8 @@ from colmap_affrect.evaluation.truths import (
 from colmap_affrect.geometry.conventions import pixel_from_colmap
 
 TRUTH = np.array([[0.9, 0.2, 30.0], [-0.1, 1.1, -20.0], [3e-4, -1e-4, 1.0]])
-SIZE1, SIZE2 = (320, 200), (240, 260)
+SIZE1 = (320, 200)
+SIZE2 = (240, 260)
 ROUNDING_PX = 1e-9  # double precision on coordinates of some hundred px
 OPTIONS = ScoreOptions(max_num_iterations=10_000)
 
@@ -80,6 +81,8 @@ def test_matches_of_which_half_are_wrong_give_the_homography() -> None:
     assert (found.num_inliers, found.num_correct, found.solved) == (30, 30, 1.0)
     turned = homography_score(points2, points1)
     assert (turned.error > 10.0, turned.solved) == (True, 0.0)
+    four = homography_score(points1[1:8:2], points2[1:8:2])
+    assert (four.num_inliers, four.solved) == (4, 1.0)
     none = homography_score(points1[:3], points1[:3])
     assert none == PairScore(math.inf, 0, 0, kind="homographies")
 
@@ -194,7 +197,8 @@ SHIFT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def test_epipolar_distances_by_hand() -> None:
-    points1, points2 = np.array([[5.0, 7.0]] * 2), np.array([[90.0, 7.0], [90.0, 10.0]])
+    points1 = np.array([[5.0, 7.0], [5.0, 7.0]])
+    points2 = np.array([[90.0, 7.0], [90.0, 10.0]])
     distances = symmetric_epipolar_distances(SHIFT_X, points1, points2)
     np.testing.assert_allclose(distances, [0.0, 3.0 * np.sqrt(2.0)])
     assert np.isinf(symmetric_epipolar_distances(None, points1, points2)).all()
@@ -215,6 +219,7 @@ def test_matches_of_another_geometry_score_worse() -> None:
     right = truth.score(points1[30:], points2[30:], OPTIONS)
     assert right.error < truth.score(points2[30:], points1[30:], OPTIONS).error
     assert right.solved > 0.5  # the lens of image 1 distorts
+    assert math.isfinite(truth.score(points1[30:38], points2[30:38], OPTIONS).error)
     none = truth.score(points1[:7], points2[:7], OPTIONS)
     assert (none.error, none.solved) == (math.inf, 0.0)
 

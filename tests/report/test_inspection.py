@@ -48,7 +48,8 @@ def test_level_has_the_plan_and_the_features_of_extraction(
     extractor: ImageExtractor, photo: Path, tmp_path: Path
 ) -> None:
     photograph, _ = extractor.photograph(photo)
-    level, plan = inspect_level(extractor, photograph, 0), extractor.plan(photograph)[0]
+    level = inspect_level(extractor, photograph, 0)
+    plan, _ = extractor.plan(photograph)
     features = extractor.extract_file(photo).features
     assert len(level.plan.items) == len(plan.items) > 0
     assert_array_equal(level.features.lafs, features.lafs)

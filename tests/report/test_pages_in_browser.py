@@ -152,7 +152,8 @@ def test_models_are_chosen_from_a_list_and_seen_beside_each_other(
     running: Browser, tmp_path: Path
 ) -> None:
     make_run_page(tmp_path)
-    workspace, report = Workspace(tmp_path / "out"), small_report(tmp_path)
+    workspace = Workspace(tmp_path / "out")
+    report = small_report(tmp_path)
     (first,) = report.models
     shutil.copytree(workspace.sparse / "0", workspace.sparse / "1")
     both = replace(report, models=(first, replace(first, doubtful={})))

@@ -53,8 +53,9 @@ def test_lines_join_the_matches_in_the_colours_of_their_kinds() -> None:
     )
     drawn = draw_matches(pair, PHOTOGRAPHS)
     assert drawn.shape == (SIDE, WIDTH_PX, 3)
-    scales, far = (SIDE / 400, SIDE / 300), np.full(drawn.shape[:2], np.inf)
-    rows, columns = np.indices(far.shape)
+    scales = (SIDE / 400, SIDE / 300)
+    distances = np.full(drawn.shape[:2], np.inf)  # of pixels from the nearest line
+    rows, columns = np.indices(distances.shape)
     for index, kind in enumerate((MatchKind.OWN, MatchKind.GUIDED)):
         first, second = (pair.points[side][index] * scales[side] - 0.5 for side in (0, 1))
         second[0] += WIDTH_PX // 2
@@ -65,10 +66,10 @@ def test_lines_join_the_matches_in_the_colours_of_their_kinds() -> None:
         normal = np.array([first[1] - second[1], second[0] - first[0]])
         normal /= np.linalg.norm(normal)
         offsets = (columns - first[0]) * normal[0] + (rows - first[1]) * normal[1]
-        far = np.minimum(far, np.abs(offsets))
+        distances = np.minimum(distances, np.abs(offsets))
     drawn[int(scales[0] * 300) :, : WIDTH_PX // 2] = 0  # white below the wide photograph
     drawn[:, SIDE : WIDTH_PX // 2] = drawn[:, WIDTH_PX // 2 + int(scales[1] * 150) :] = 0
-    assert far[drawn.any(axis=2)].max() < 6
+    assert distances[drawn.any(axis=2)].max() < 6
 
 
 def test_photographs_that_were_shrunk_get_the_same_lines() -> None:
