@@ -42,7 +42,7 @@ def test_everything_of_the_report_is_told(html: str) -> None:
         "colmap-affrect show-pair OUT", "model: an &lt;old&gt; one",
     ):  # fmt: skip
         assert text in html
-    assert html.index("What to doubt") < html.index("What to try next") < html.index("<main>")
+    assert html.index("Low-confidence images") < html.index("What to try next") < html.index("<main>")
 
 
 def test_page_loads_nothing_and_names_are_never_markup(html: str) -> None:
