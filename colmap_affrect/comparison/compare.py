@@ -72,16 +72,14 @@ def compare(
     truth = _ground_truth(options.ground_truth_path, names)
     options = replace(options, mapping=MAPPERS.make(options.mapping).options)
     common = _common_record(inputs, names, pairs, options)
-    runs = []
-    for method in methods:
-        run = MethodRun(method, output_path.resolve(), image_path.resolve(), options, common)
-        runs.append(run)
-    _resolve_weights([run for run in runs if overwrite or not run.finished()], options, progress)
+    folders = (output_path.resolve(), image_path.resolve())
+    runs = [MethodRun(method, *folders, options, common) for method in methods]
+    _resolve_weights(runs, options, progress, overwrite=overwrite)
     with workspace.locked():
         num_images = len(names) + len(pairs) / PAIRS_PER_IMAGE
         results = _run_methods(runs, num_images, progress, overwrite=overwrite)
         if truth:
-            results = [_with_scores(result, output_path, truth, names) for result in results]
+            results = [_scored(result, output_path, truth, names) for result in results]
         comparison = Comparison(
             image_names=tuple(names),
             image_path=str(image_path.resolve()),
@@ -104,12 +102,13 @@ def _pairs(image_path: Path, names: Sequence[str], options: PairOptions) -> list
 
 
 def _resolve_weights(
-    runs: Sequence[MethodRun], options: CompareOptions, progress: Progress
+    runs: Sequence[MethodRun], options: CompareOptions, progress: Progress, *, overwrite: bool
 ) -> None:
     """Find or download the weights of all methods that are to be run."""
     keys: set[str] = set()
     for run in runs:
-        if run.method.recipe:
+        is_to_be_run = overwrite or not run.finished()
+        if is_to_be_run and run.method.recipe:
             keys.update(run.method.recipe.required_weights)
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
 
@@ -221,9 +220,7 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
     return truth
 
 
-def _with_scores(
-    result: MethodResult, folder: Path, truth: Poses, names: Sequence[str]
-) -> MethodResult:
+def _scored(result: MethodResult, folder: Path, truth: Poses, names: Sequence[str]) -> MethodResult:
     """Add the scores of the models of all seeds against ground truth."""
     seeds = []
     for seed in result.seeds:

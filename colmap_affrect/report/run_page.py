@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ class RunContent:
     names: Sequence[str]  # of all photographs
     num_inliers: Mapping[Pair, int]  # of the verified pairs
     image_path: Path | None = None  # folder of the photographs, if known
-    marks: Marks | None = None  # of the tie points by hand
+    marks: Marks = field(default_factory=dict)  # of the tie points by hand
     pairs_to_check: Sequence[PairPicture] = ()
 
 
@@ -86,13 +86,11 @@ def write_run_page(
     names = content.names
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
     views = _views(workspace, report)
-    kinds = Counter(kind for view in views for kind in view.kinds.values())
     known = set(names)
     num_inliers = {
         pair: count for pair, count in content.num_inliers.items() if known.issuperset(pair)
     }
     cameras = read_cameras(workspace.database) if workspace.database.exists() else {}
-    marks = content.marks or {}
     page = Page(
         template=TEMPLATES / "run.html",
         content={
@@ -103,13 +101,13 @@ def write_run_page(
             "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
             "max_num_lines": MAX_LINES,
             "views": views or [read_view(None, {})],
-            "kinds": {kind: f"{KINDS[kind]} ({kinds[kind]})" for kind in KINDS if kinds[kind]},
+            "kinds": _kinds_legend(views),
             "cards": [_card(name, report, model) for name in names],
             "num_pairs": len(num_inliers),
             "pairs_to_check": content.pairs_to_check,
             "line_colors": LEGEND,
             **_cameras(report, names),
-            "wants_marks": bool(marks) or len(model.registered_names) < len(names),
+            "wants_marks": bool(content.marks) or len(model.registered_names) < len(names),
             "residuals": [
                 f"{one.point} in {one.image}: {one.error_px:.1f} px" for one in model.tie_points
             ],
@@ -118,7 +116,7 @@ def write_run_page(
         image_path=content.image_path,
         views=views,
         inlier_matrix=inlier_matrix(names, num_inliers),
-        tie_points=_tie_points(model, names, marks, cameras),
+        tie_points=_tie_points(model, names, content.marks, cameras),
         can_mark=len(cameras.keys() & known) > 1,
     )
     return write_page(workspace.page, page, progress)
@@ -131,6 +129,14 @@ def _views(workspace: Workspace, report: ReconstructionReport) -> list[View3D]:
         kinds = {name: _card(name, report, model).kind for name in model.registered_names}
         views.append(read_view(workspace.sparse / str(number), kinds))
     return views
+
+
+def _kinds_legend(views: Sequence[View3D]) -> dict[str, str]:
+    """Return a text for each kind of cameras that there is."""
+    counts = Counter[str]()
+    for view in views:
+        counts.update(view.kinds.values())
+    return {kind: f"{text} ({counts[kind]})" for kind, text in KINDS.items() if counts[kind]}
 
 
 def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
