@@ -18,7 +18,7 @@ from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.arrays import Array, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.geometry.tilts import frames_from_affnet
+from colmap_affrect.geometry.tilts import shapes_from_affnet
 
 if TYPE_CHECKING:
     import torch
@@ -100,7 +100,7 @@ class AffNetHardNet:
         half_widths_px = PATCH_SIGMAS / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
         upright = sample(_frames(shapes, half_widths_px, found.keypoints))
-        shapes = frames_from_affnet(self._run(self.affnet, upright))
+        shapes = shapes_from_affnet(self._run(self.affnet, upright))
         areas = shapes[:, 0, 0] * shapes[:, 1, 1]
         shapes /= np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]
         unturned = sample(_frames(shapes, half_widths_px, found.keypoints))

@@ -171,7 +171,7 @@ class AffNet:
 
 def _frames(outputs: torch.Tensor) -> Array:
     """Return (..., 2, 2) frames L of (..., 3) outputs."""
-    return tilts.frames_from_affnet(outputs.cpu().numpy().astype(np.float64))
+    return tilts.shapes_from_affnet(outputs.cpu().numpy().astype(np.float64))
 
 
 def _mean_and_deviation(image: GrayImage) -> tuple[Array, Array]:

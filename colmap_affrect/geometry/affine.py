@@ -33,7 +33,7 @@ def project(homography: Floats, points: Floats) -> Array:
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-def transform_frames(homography: Floats, lafs: Floats) -> Array:
+def transform_lafs(homography: Floats, lafs: Floats) -> Array:
     """Carry (N, 2, 3) frames through a map: centres exactly, shapes by its Jacobian.
 
     The (3, 3) map is target_from_source, with a finite and non-zero third coordinate at every
@@ -54,7 +54,7 @@ def homography_errors(homography: Floats, points1: Floats, points2: Floats) -> A
     """
     frames = np.broadcast_to(np.eye(2, 3), (len(points1), 2, 3)).copy()
     frames[:, :, 2] = points1
-    carried = transform_frames(homography, frames)
+    carried = transform_lafs(homography, frames)
     x, y = (carried[:, :, 2] - points2).T
     jacobians = carried[:, :, :2]
     covariances = np.eye(2) + jacobians @ jacobians.transpose(0, 2, 1)

@@ -85,8 +85,8 @@ class HomographyModel:
     def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
         """Return (M,) cosines between what frames carry over and what the geometry does."""
         frames = np.concatenate([shapes[0][rows1], self.points[0][rows1, :, None]], axis=2)
-        carried = affine.transform_frames(self.matrix, frames)[:, :, :2]
-        return turn_cosines(carried, shapes[1][rows2])
+        carried = affine.transform_lafs(self.matrix, frames)[:, :, :2]
+        return rotation_cosines(carried, shapes[1][rows2])
 
     def scaled(self, first: float, second: float) -> Self:
         """Return the same in px of images that are smaller by these factors."""
@@ -98,7 +98,7 @@ class HomographyModel:
 PairModel = EpipolarModel | HomographyModel
 
 
-def turn_cosines(shapes1: Points, shapes2: Points) -> Points:
+def rotation_cosines(shapes1: Points, shapes2: Points) -> Points:
     """Return (N,) cosines of the angles by which frames are turned against others; -1 mirrored."""
     signs = np.sign(affine.determinants(shapes1))[:, None, None]
     turns = shapes2 @ affine.adjugates(shapes1) * signs

@@ -29,7 +29,9 @@ SIDE_PX, WINDOW_PX, MIN_VARIANCE = 400, 11, 60.0  # of what is compared, in gray
 MAX_NUM_SIMILARITIES = 300  # tried: enough for a set that one in eight matches is in
 
 
-def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], error: float) -> float:
+def pure_rotation_ratio(
+    points1: Array, points2: Array, sizes: tuple[Size, Size], error: float
+) -> float:
     """Return the share of matches that a turned, and zoomed, camera explains to ``error`` px."""
     points1, points2 = _some(points1), _some(points2)
     spreads = [  # which outliers do not change
@@ -98,7 +100,7 @@ def _some(points: Array) -> Array:
     return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
 
 
-def line_of_writing(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Bools:
+def text_line_matches(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Bools:
     """Return which matches are on one thin line along the sides of both images, as print is.
 
     It is the largest set that a similarity explains, and empty where that is no line. Matches of
@@ -118,7 +120,7 @@ def line_of_writing(points1: Array, points2: Array, sizes: tuple[Size, Size]) ->
     return on_line
 
 
-def one_view_homography(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Array | None:
+def same_view_homography(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Array | None:
     """Return the (3, 3) homography of px centres if a change of scale nearly explains matches."""
     error = ONE_VIEW_ERROR * max(map(max, sizes))
     _, found = cv2.estimateAffinePartial2D(points1, points2, ransacReprojThreshold=error)

@@ -17,7 +17,7 @@ MIN_AGREEING = 0.5  # right pairs have at least this share of inliers with agree
 AGREEING_SHARES = np.linspace(0.0, 1.0, 51)[:-1]  # from ``MIN_AGREEING`` (0) to all (1)
 
 
-def shuffled(num: int) -> tuple[Indices, Indices]:
+def random_matches(num: int) -> tuple[Indices, Indices]:
     """Pair matches anew: two lists of indices below ``num`` that never agree, by cyclic shifts."""
     num_shifts = min(num - 1, max(1, NUM_SHUFFLED // max(num, 1)))
     shifts = np.linspace(1, num - 1, num_shifts).astype(np.int64)

@@ -39,7 +39,7 @@ def unit_metrics(matrices: Floats) -> Array:
     return np.asarray(parts / determinant[..., None], dtype=np.float64)
 
 
-def frames_from_affnet(outputs: Floats) -> Array:
+def shapes_from_affnet(outputs: Floats) -> Array:
     """Return (..., 2, 2) frames, image from patch up to scale, of (..., 3) outputs of AffNet."""
     frames = np.zeros((*outputs.shape[:-1], 2, 2))
     frames[..., 0, 0] = 1.0 + outputs[..., 0]
@@ -54,7 +54,7 @@ def of_unit_area(shapes: Floats) -> Array:
     return np.asarray(shapes / np.sqrt(areas)[:, None, None], np.float64)
 
 
-def vary_singly(shapes: Floats) -> bool:
+def are_individual_shapes(shapes: Floats) -> bool:
     """Whether (N, 2, 2) shapes of features were measured one by one.
 
     Those without a shape are circles, which a warp turns into one ellipse for all its features.

@@ -16,7 +16,7 @@ from colmap_affrect.data import (
     union,
 )
 from colmap_affrect.features.base import FeatureExtractor
-from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
+from colmap_affrect.geometry.affine import ellipse_extents, transform_lafs
 from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.geometry.neighbors import neighbors_within
@@ -76,7 +76,7 @@ def _warped(source: Singles, rectification: Rectification, mask: Mask | None) ->
 def _carried(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:
     if rectification is None:
         return features
-    lafs = transform_frames(rectification.image_from_rectified, features.lafs)
+    lafs = transform_lafs(rectification.image_from_rectified, features.lafs)
     return replace(features, lafs=lafs)
 
 

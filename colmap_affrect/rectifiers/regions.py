@@ -6,7 +6,7 @@ from math import sqrt
 import numpy as np
 
 from colmap_affrect.data import Mask, Rectification, in_mask
-from colmap_affrect.geometry.affine import fit_canvas, project, transform_frames
+from colmap_affrect.geometry.affine import fit_canvas, project, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 
@@ -51,7 +51,7 @@ def homography_rectification(region: Region, homography: Array, segment_id: int)
     matrix = canvas_from_mapped @ homography
     middle = np.argwhere(region.mask).mean(axis=0)[::-1] + region.origin
     frame = np.concatenate([np.eye(2), middle[:, None]], axis=1)
-    jacobian = transform_frames(matrix, frame[None])[0, :, :2]
+    jacobian = transform_lafs(matrix, frame[None])[0, :, :2]
     tilt, angle_rad = tilts_from_metrics(unit_metrics(jacobian))
     tilt_class = float(tilt), float(angle_rad)
     return Rectification(matrix, canvas_size, region.mask, *tilt_class, region.origin, segment_id)

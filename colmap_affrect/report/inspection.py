@@ -15,7 +15,7 @@ import numpy as np
 
 from colmap_affrect.data import ColorImage, LocalFeatures, Mask, Photograph, RectificationPlan, View
 from colmap_affrect.features.base import FeatureExtractor
-from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.affine import project, transform_lafs
 from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.project.atomic_files import replace_bytes
@@ -107,7 +107,7 @@ def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, 
     if mask is not None:
         outside = 255 - (255 - image) // 4
         image = np.where(mask if image.ndim == 2 else mask[:, :, None], image, outside)
-    features = replace(kept, lafs=transform_frames(item.rectified_from_image, kept.lafs))
+    features = replace(kept, lafs=transform_lafs(item.rectified_from_image, kept.lafs))
     panel = panel_of(image, WARPS_PER_ROW, features, [color] * len(kept), MAX_NUM_WARP_FEATURES)
     return panel, f"{index + 1}: tilt {item.tilt:.2f}, {len(kept)} of {len(found)} features"
 
@@ -130,7 +130,7 @@ def panel_of(
     panel_from_image = resized_from_original((width, height), size)
     if features is not None:
         order = np.argsort(-features.responses, kind="stable")[:max_num]
-        lafs = transform_frames(panel_from_image, features.lafs[order])
+        lafs = transform_lafs(panel_from_image, features.lafs[order])
         outlines = lafs[:, :, :2] @ UNIT_CIRCLE * (FEATURE_SIGMAS / MEASUREMENT_SIGMAS)
         points = np.rint(np.swapaxes(outlines + lafs[:, :, 2:], 1, 2)).astype(np.int32)
         for index, outline in zip(order.tolist(), points, strict=True):

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.two_views import CALIBRATED, pair_model
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
-from colmap_affrect.geometry.tilts import vary_singly
+from colmap_affrect.geometry.tilts import are_individual_shapes
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
 from colmap_affrect.pairs.lists import Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
@@ -124,7 +124,9 @@ class GuidedMatcher:
         """Return descriptors and, where frames were measured one by one, their linear parts."""
         features = self._store.read(name)
         shapes = features.lafs[:, :, :2]
-        return features.descriptors, shapes if len(shapes) and vary_singly(shapes) else shapes[:0]
+        return features.descriptors, shapes if len(shapes) and are_individual_shapes(
+            shapes
+        ) else shapes[:0]
 
 
 class Guiding:

@@ -16,7 +16,7 @@ from colmap_affrect.geometry.affine import (
     project,
     rectifying_affine,
     rotation,
-    transform_frames,
+    transform_lafs,
 )
 from colmap_affrect.geometry.tilts import metrics_from_tilts, unit_metrics
 
@@ -53,7 +53,7 @@ def test_transform_frames_carries_warp_frame_to_image_by_inverse_on_the_left() -
     # A^-1 = [[1/2, -1/2], [0, 1]]; the other order, L A^-1, would be [[1/2, 7/2], [0, 2]].
     # Centre: y = 1 + 5 = 6, x = (7 - 3 - 6) / 2 = -1.
     expected = [[[0.5, 1.0, -1.0], [0.0, 2.0, 6.0]]]
-    actual = transform_frames(np.linalg.inv(rectified_from_image), warp_frame)
+    actual = transform_lafs(np.linalg.inv(rectified_from_image), warp_frame)
     assert_allclose(actual, expected, atol=ROUNDING)
 
 
@@ -62,7 +62,7 @@ def test_transform_frames_by_homography_has_the_jacobian_of_finite_differences(
     homography: Array, lafs: Array
 ) -> None:
     step = 1e-3
-    mapped = transform_frames(homography, lafs)
+    mapped = transform_lafs(homography, lafs)
     centers = lafs[:, :, 2]
     assert_allclose(mapped[:, :, 2], project(homography, centers), atol=ROUNDING)
     for column in range(2):

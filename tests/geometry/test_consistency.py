@@ -15,7 +15,7 @@ from colmap_affrect.geometry.significance import (
     log10_bayes_factor,
     log10_choose,
     log10_false_alarms,
-    shuffled,
+    random_matches,
 )
 
 SIZE = np.array([1200.0, 700.0])
@@ -71,7 +71,7 @@ def test_copies_of_one_place_are_no_neighbours() -> None:
 
 @pytest.mark.parametrize("num", [2, 3, 50, 9001])
 def test_matches_paired_anew_are_no_matches(num: int) -> None:
-    first, second = shuffled(num)
+    first, second = random_matches(num)
     assert len(first) == len(second) >= min(num * (num - 1), 4000 - num)
     assert (first != second).all()
     assert set(first) == set(second) == set(range(num))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.geometry.epipolar import sampson_errors
-from colmap_affrect.geometry.parallax import Size, rotation_share
+from colmap_affrect.geometry.parallax import Size, pure_rotation_ratio
 from colmap_affrect.geometry.two_views import (
     essential_matrix,
     homogeneous,
@@ -110,7 +110,7 @@ def test_turned_views_of_which_things_that_repeat_match_too(share_wrong: float) 
     num_wrong = int(share_wrong * 400)
     points1[:num_wrong] += (380.0, -25.0)
     points2[:num_wrong] = np.random.default_rng(1).uniform((40, 20), (600, 460), (num_wrong, 2))
-    share = rotation_share(points1, points2, SIZES, 2.0)
+    share = pure_rotation_ratio(points1, points2, SIZES, 2.0)
     assert share == pytest.approx(1.0 - share_wrong, abs=0.05)
 
 
@@ -121,4 +121,4 @@ def test_moved_camera_is_no_turned_one() -> None:
     for matrix, center in ((np.eye(3), (0.0, 0, 0)), (rotation(9.0, 2.0), (0.7, -0.2, 0.1))):
         seen = (scene - center) @ (MATRIX @ matrix).T
         views.append(seen[:, :2] / seen[:, 2:])
-    assert rotation_share(views[0], views[1], SIZES, 2.0) < 0.3
+    assert pure_rotation_ratio(views[0], views[1], SIZES, 2.0) < 0.3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.affine import project, transform_lafs
 from colmap_affrect.geometry.epipolar import EpipolarModel, HomographyModel, PairModel
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches, nearest_allowed
 
@@ -129,7 +129,7 @@ def test_frames_that_turn_otherwise_match_nothing() -> None:
     descriptors, model = plane()
     shapes = np.eye(2) + 0.3 * np.random.default_rng(3).normal(size=(200, 2, 2))
     frames = np.concatenate([shapes, model.points[0][:, :, None]], axis=2)
-    carried = transform_frames(HOMOGRAPHY, frames)[:, :, :2]
+    carried = transform_lafs(HOMOGRAPHY, frames)[:, :, :2]
     turn = np.array([[np.cos(0.9), -np.sin(0.9)], [np.sin(0.9), np.cos(0.9)]])
     carried[:60] = turn @ carried[:60]
     found = guided_matches(descriptors, (shapes, carried), model, NONE, OPTIONS)

@@ -17,7 +17,7 @@ from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures, union
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
+from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
 from colmap_affrect.matchers.lightglue import (
     LightGlue,
@@ -63,7 +63,7 @@ def test_circles_of_a_warp_tell_where_they_were_in_it() -> None:
     warp[:2, :2] = compose_affine(0.8, 0.3, 2.5, 1.1)
     warp[:2, 2] = (35.0, -20.0)
     found = features(50, 1)
-    carried = transform_frames(np.linalg.inv(warp), found.lafs)
+    carried = transform_lafs(np.linalg.inv(warp), found.lafs)
     points, size = points_of_view(carried)
     factor = 12.0 / np.sqrt(np.linalg.det(carried[0, :, :2]))
     low = found.keypoints.min(axis=0)

@@ -20,7 +20,9 @@ MAX_SLOPE = 0.5  # difference of the motions of two points of one thing, of thei
 NUM_FITS = 3  # of a turn to the motions that agree, each of which may make more agree
 
 
-def exactness(points: Floats, motions: Floats, tolerance_px: float, limit_px: float) -> Array:
+def stationary_log_ratios(
+    points: Floats, motions: Floats, tolerance_px: float, limit_px: float
+) -> Array:
     """Return how much more likely each small motion is if print stands still than by chance.
 
     By chance motions pass through zero along a line at least: the share of those below the

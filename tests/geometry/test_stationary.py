@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.stillness import exactness, num_moving_together
+from colmap_affrect.geometry.stationary import num_moving_together, stationary_log_ratios
 
 LIMIT_PX, TOLERANCE_PX = 5.0, 1.0
 
@@ -21,7 +21,9 @@ def noise(count: int) -> Array:
 
 def mean_ratio(places: Array, motions: Array) -> float:
     small = np.linalg.norm(motions, axis=1) <= LIMIT_PX
-    return float(exactness(places[small], motions[small], TOLERANCE_PX, LIMIT_PX).mean())
+    return float(
+        stationary_log_ratios(places[small], motions[small], TOLERANCE_PX, LIMIT_PX).mean()
+    )
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (1.5, -1.5), (-3.0, 1.0)])
@@ -52,14 +54,16 @@ def test_most_that_agree_count_and_not_the_others() -> None:
     places = points(60)
     motions = noise(60)
     motions[::5] += (3.5, 0.0)
-    ratios = exactness(places, motions, TOLERANCE_PX, LIMIT_PX)
+    ratios = stationary_log_ratios(places, motions, TOLERANCE_PX, LIMIT_PX)
     assert ratios[::5].max() < 0.0
     assert np.median(ratios) > 1.0
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_or_no_motions_are_no_error(count: int) -> None:
-    assert exactness(points(count), noise(count), TOLERANCE_PX, LIMIT_PX).shape == (count,)
+    assert stationary_log_ratios(points(count), noise(count), TOLERANCE_PX, LIMIT_PX).shape == (
+        count,
+    )
 
 
 def test_matches_of_an_object_move_together_and_wrong_ones_do_not() -> None:
