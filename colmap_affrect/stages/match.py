@@ -41,7 +41,7 @@ each other. Small scans have none."""
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
 IMAGES_IN_MEMORY = 40  # of 13,000 features
-BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
+BYTES_PER_FEATURE = 614  # of a feature ready for matching, with descriptors of 128
 
 Found = TypeVar("Found")
 
@@ -221,7 +221,6 @@ class Matching:
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     max_num_features: int = 0  # of each image, those of the largest responses; 0: all
-    num_similarities: float = 0  # about how many pairs of features there will be to compare
     num_kept: int = IMAGES_IN_MEMORY
 
 
@@ -238,10 +237,8 @@ def iterate_matches(
     counts = matching.store.num_keypoints()
     if limit := matching.max_num_features:
         counts = {name: min(count, limit) for name, count in counts.items()}
-    num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    known = replace(matching, num_similarities=num_similarities, num_kept=max(2, num_kept))
-    matcher = CachedMatcher(known)
+    matcher = CachedMatcher(replace(matching, num_kept=max(2, num_kept)))
     ordered = ordered_for_reuse(pairs, max(1, num_kept // 2))
     yield from executor.map(matcher, ordered, [matching.store.path])
 
@@ -268,7 +265,7 @@ class CachedMatcher:
         self._weights = resolve(options.weights, resources.weights_path)
         if sent is not None:
             require_same_files(self._weights, sent)
-        context = MatcherContext(self._weights, resources.device, matching.num_similarities)
+        context = MatcherContext(self._weights, resources.device)
         self.matcher = MATCHERS.make(options, context)
         self._images, self._lock = lru_cache(matching.num_kept)(self._prepare), threading.Lock()
 
