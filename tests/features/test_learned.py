@@ -14,7 +14,7 @@ from random_weights import write_random_weights
 
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.features.base import EXTRACTORS, NetworkContext
-from colmap_affrect.features.learned import RADIUS_PX, Aliked
+from colmap_affrect.features.learned import Aliked
 from colmap_affrect.features.weights import WEIGHT_FILES, find
 
 COURTYARD = Path(__file__).resolve().parents[2] / "sample_scenes" / "courtyard"
@@ -115,7 +115,7 @@ def test_mask_chooses_among_what_is_found_without_it(weights, photograph) -> Non
     assert_array_equal(few.keypoints, inside.keypoints[:30])
     assert_allclose(few.descriptors, inside.descriptors[:30], atol=1e-5)
     assert (np.diff(few.responses) <= 0).all()
-    assert_allclose(few.lafs[:, :, :2], np.tile(RADIUS_PX * np.eye(2), (30, 1, 1)), atol=1e-9)
+    assert_allclose(few.lafs[:, :, :2], np.tile(12.0 * np.eye(2), (30, 1, 1)), atol=1e-9)
 
 
 def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:
