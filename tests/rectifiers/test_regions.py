@@ -13,13 +13,10 @@ from colmap_affrect.geometry.affine import project, rectifying_affine, transform
 from colmap_affrect.geometry.planes import fronto_parallel_homography
 from colmap_affrect.geometry.tilts import metrics_from_tilts, unit_metrics
 from colmap_affrect.rectifiers.base import AffineWarpOptions
-from colmap_affrect.rectifiers.regions import (
-    CANVAS_RATIO,
-    MARGIN_PX,
-    Region,
-    homography_rectification,
-)
+from colmap_affrect.rectifiers.regions import Region, homography_rectification
 
+MARGIN_PX = 16.0  # around a region
+CANVAS_RATIO = 2.0  # area of the canvas of a homography over that of the region
 CAMERA = np.array([[300.0, 0.0, 95.0], [0.0, 320.0, 70.0], [0.0, 0.0, 1.0]])
 
 
