@@ -71,7 +71,15 @@ class Matcher(Protocol):
         """Return what :meth:`match` needs of an image, with its memory as attribute ``nbytes``."""
 
     def match(self, first: Any, second: Any) -> Matches:
-        """Match two prepared images one to one (:class:`Matches`). Either may have no features."""
+        """Match two prepared images.
+
+        Args:
+            first: prepared image 1.
+            second: prepared image 2; either may have no features.
+
+        Returns:
+            Matches, one to one.
+        """
 
 
 MATCHERS: Registry[Matcher] = Registry(

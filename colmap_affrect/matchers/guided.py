@@ -155,7 +155,13 @@ class _NearestOfFirst:
         return cls(np.full(num_features, -1), cosines)
 
     def update(self, features1: Indices, features2: Indices, cosines: Singles) -> None:
-        """Take in (R, C) cosines of (R,) features of image 1 and (C,) of image 2."""
+        """Take in the cosines of some features of both images.
+
+        Args:
+            features1: (R,) of image 1.
+            features2: (C,) of image 2.
+            cosines: (R, C) of their descriptors.
+        """
         best = cosines.argmax(axis=0)
         best_cosines = cosines[best, np.arange(len(features2))]
         known_cosines = self.cosines[features2]

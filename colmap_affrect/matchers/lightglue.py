@@ -131,7 +131,15 @@ class LightGlue:
         return PreparedImage(tuple(views), features.keypoints)
 
     def match(self, first: PreparedImage, second: PreparedImage) -> Matches:
-        """Match two images; scores are the network's."""
+        """Match two images; scores are the network's.
+
+        Args:
+            first: prepared image 1.
+            second: prepared image 2; either may have no features.
+
+        Returns:
+            Matches, one to one.
+        """
         view_pairs = list(product(first.views, second.views))
         limit = self.options.max_num_view_pairs
         if limit and len(view_pairs) > limit:

@@ -74,7 +74,15 @@ class NearestNeighbors:
         )
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
-        """Match two images; scores are 1 - the larger ratio of distances."""
+        """Match two images; scores are 1 - the larger ratio of distances.
+
+        Args:
+            first: prepared image 1.
+            second: prepared image 2; either may have no features.
+
+        Returns:
+            Matches, one to one.
+        """
         options = self.options
         if not len(first.descriptors) or not len(second.descriptors):
             return Matches.none()

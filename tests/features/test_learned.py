@@ -93,7 +93,8 @@ def test_points_are_where_they_are_in_a_shrunk_photograph(published) -> None:
         image = np.ascontiguousarray(cv2.imread(str(path))[:480, :640, ::-1])
         small = cv2.resize(image, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
         scale = np.array(small.shape[1::-1]) / image.shape[1::-1]
-        first, second = extractor.detect((image, None)), extractor.detect((small, None))
+        first = extractor.detect((image, None))
+        second = extractor.detect((small, None))
         points = (second.keypoints + 0.5) / scale - 0.5
         distances = np.linalg.norm(first.keypoints[:, None] - points[None], axis=2)
         nearest = distances.argmin(axis=1)

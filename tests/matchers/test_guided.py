@@ -85,7 +85,8 @@ def test_positions_of_a_homography_miss_nothing() -> None:
 
 def test_points_without_a_position_match_nothing() -> None:
     descriptors, (points1, points2) = random_pair(3)
-    points1[5:300], points2[7:90] = np.nan, np.nan
+    points1[5:300] = np.nan
+    points2[7:90] = np.nan
     points = points1, points2
     epipolar = EpipolarModel(fundamental((1, 0.2, 0.1)), points)
     for model in (epipolar, HomographyModel(HOMOGRAPHY, points)):
@@ -98,7 +99,8 @@ def test_points_without_a_position_match_nothing() -> None:
 def plane() -> tuple[Arrays, HomographyModel]:
     """200 features of a plane that two photographs see, with descriptors of their own."""
     rng = np.random.default_rng(8)
-    descriptors, points1 = rng.normal(size=(200, 64)), rng.uniform(0, (640, 480), (200, 2))
+    descriptors = rng.normal(size=(200, 64))
+    points1 = rng.uniform(0, (640, 480), (200, 2))
     descriptors = descriptors / np.linalg.norm(descriptors, axis=1)[:, None]
     same = descriptors.astype(np.float32)
     return (same, same), HomographyModel(HOMOGRAPHY, (points1, project(HOMOGRAPHY, points1)))
@@ -121,9 +123,19 @@ def test_inliers_stay_and_matches_are_one_to_one() -> None:
 def test_where_as_much_is_found_beside_a_geometry_nothing_is_proven(kind: type[PairModel]) -> None:
     descriptors, points = random_pair(4, (2000, 2500))
     model = kind(HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1)), points)
-    options, inliers = GuidedOptions(band_px=6.0), np.array([[3, 7], [9, 1]])
+    options = GuidedOptions(band_px=6.0)
+    inliers = np.array([[3, 7], [9, 1]])
     assert len(match_near_geometry(descriptors, model, options)) > 20
     assert_array_equal(guided_matches(descriptors, None, model, inliers, options), inliers)
+
+
+def test_accidental_matches_are_counted_near_the_geometry() -> None:
+    descriptors, (points1, points2) = random_pair(4, (2000, 2500))
+    # A surface of 120 px that repeats itself: farther away there is nothing.
+    surface = (points1 / (640.0, 480.0) * 120.0, points2 / (900.0, 350.0) * 120.0)
+    model = HomographyModel(np.eye(3), surface)
+    assert len(match_near_geometry(descriptors, model, OPTIONS)) > 20
+    assert_array_equal(guided_matches(descriptors, None, model, NONE, OPTIONS), NONE)
 
 
 def shapes_of_plane(model: HomographyModel) -> Arrays:
@@ -159,8 +171,10 @@ def test_lafs_that_map_epipolar_lines_to_others_match_nothing(sign: float) -> No
 def test_models_of_smaller_images_are_those_of_their_points(kind: type[PairModel]) -> None:
     matrix = HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1))
     _, points = random_pair(3)
-    model, rows = kind(matrix, points), np.arange(100)
+    model = kind(matrix, points)
+    rows = np.arange(100)
     smaller = model.scaled(2.0, 3.0)
     assert_array_equal(smaller.points[1], points[1] / 3.0)
-    near, small = model.errors(rows, rows), smaller.errors(rows, rows)
+    near = model.errors(rows, rows)
+    small = smaller.errors(rows, rows)
     assert np.allclose(small, near / 3.0) or np.all((small > near / 3.1) & (small < near / 1.9))

@@ -126,7 +126,8 @@ def test_of_matches_at_one_place_the_best_is_left() -> None:
 
 def test_one_place_seen_in_two_views_is_one_match(matcher: LightGlue) -> None:
     things = np.random.default_rng(0).normal(size=(40, 128))
-    image1, warp1 = features(40, 1, things=things[:40]), features(40, 1, things=things[:40])
+    image1 = features(40, 1, things=things[:40])
+    warp1 = features(40, 1, things=things[:40])
     image2 = features(80, 2, things=np.concatenate([things, things[::-1]]))
     second = replace(image2, lafs=np.concatenate([image2.lafs[:40], image2.lafs[39::-1]]))
     first = union([image1, warp1.with_rectification_id(1)])
