@@ -8,7 +8,7 @@
 4. Arrays are indexed [row, column] = [y, x]; sizes are given as (width, height).
 5. A rectifying map is A = lambda R(psi) diag(t, 1) R(phi), lambda > 0, t >= 1,
    phi in [0, pi), R(a) = [[cos a, -sin a], [sin a, cos a]] acting on (x, y), y down.
-   The tilt class (t, phi) of a frame L is that of L^-1, the map that rectifies it.
+   The tilt class (t, phi) of a LAF of shape L is that of L^-1, the map that rectifies it.
 6. A local affine frame maps the unit circle to the measurement ellipse, whose radius
    is ``MEASUREMENT_SIGMAS`` times the Gaussian scale sigma of the feature (as in kornia
    and hloc). COLMAP's affine shape maps the unit circle to one sigma.

@@ -127,7 +127,7 @@ class HomographyModel:
         return affine.homography_errors(self.matrix, self.points[0][rows1], self.points[1][rows2])
 
     def cosines(self, rows1: Integers, rows2: Integers, shapes: tuple[Array, Array]) -> Array:
-        """Return how well the LAFs of image 1, mapped by the homography, have those of image 2.
+        """Return how well LAFs of image 1, mapped by the homography, agree with those of image 2.
 
         Args:
             rows1: (M,) features of image 1.

@@ -95,7 +95,7 @@ class ScaleEstimate:
 
 
 def scale_between(
-    known: tuple[Array, Array], places: tuple[Array, Array], radius_px: float
+    known: tuple[Array, Array], observed: tuple[Array, Array], radius_px: float
 ) -> ScaleEstimate | None:
     """Estimate the scale between two sets of positive depths in one image.
 
@@ -104,14 +104,14 @@ def scale_between(
 
     Args:
         known: (K, 2) px and (K,) known depths.
-        places: (N, 2) px and (N,) depths of a pair.
+        observed: (N, 2) px and (N,) depths of a pair.
         radius_px: distance up to which depths are compared.
 
     Returns:
         The scale; None without any known depth within the radius.
     """
     known_points, known_depths = known
-    points, depths = places
+    points, depths = observed
     neighbors = _nearest_known(known_points, points, radius_px, NUM_NEIGHBORS)
     log_ratios = np.log(known_depths[neighbors.known] / depths[neighbors.rows])
     weights = np.exp(-((2 * neighbors.distances / radius_px) ** 2))
@@ -119,7 +119,7 @@ def scale_between(
 
 
 def scale_by_planes(
-    known: tuple[Array, Array], places: tuple[Array, Array], radius_px: float
+    known: tuple[Array, Array], observed: tuple[Array, Array], radius_px: float
 ) -> ScaleEstimate | None:
     """Estimate the scale as :func:`scale_between`, where no known depth lies beside a position.
 
@@ -128,14 +128,14 @@ def scale_by_planes(
 
     Args:
         known: (K, 2) px and (K,) known depths.
-        places: (N, 2) px and (N,) depths of a pair.
+        observed: (N, 2) px and (N,) depths of a pair.
         radius_px: distance up to which known depths count.
 
     Returns:
         The scale; None without any plane.
     """
     known_points, known_depths = known
-    points, depths = places
+    points, depths = observed
     neighbors = _nearest_known(known_points, points, radius_px, NUM_ON_PLANE)
     counts = np.bincount(neighbors.rows, minlength=len(points))
     rows = np.flatnonzero(counts == NUM_ON_PLANE)

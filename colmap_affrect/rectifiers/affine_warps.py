@@ -113,7 +113,7 @@ class DenseShapes(base.WithInputs):
     Options = DenseShapesOptions
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
-        """Plan one warp for each place of each region."""
+        """Plan one warp for each part of each region."""
         return plan_dense_shapes(self.shapes.grid(photograph.gray), photograph.size, self.options)
 
 
