@@ -19,7 +19,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import connected_parts, lone_ties
-from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
+from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
 from colmap_affrect.mappers.adjustment import (
     EXIF_SIGMA,
     FINAL,
@@ -286,7 +286,7 @@ def _rotation_shares(
     for pair in list(strongest.values())[:: -(-len(strongest) // MAX_PAIRS_TURNED) or 1]:
         sizes = graph.sizes(pair.ids)
         error = MAX_ERROR * max(map(max, sizes))
-        found[pair.ids] = rotation_share(*graph.points(pair), sizes, error)
+        found[pair.ids] = pure_rotation_ratio(*graph.points(pair), sizes, error)
     return found
 
 

@@ -21,7 +21,7 @@ from colmap_affrect.data import (
     View,
 )
 from colmap_affrect.features.base import FeatureExtractor
-from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.outputs import fitting_name, new_results
@@ -147,7 +147,7 @@ def _warp(level: InspectedLevel, index: int, color: Color) -> Panel:
     counts = f"{len(kept)} of {len(detected)} features"
     title = f"{rectification_id}: tilt {item.tilt:.2f}, {counts}"
     panel = Panel.fit(image, WARPS_PER_ROW, title)
-    features = replace(kept, lafs=transform_frames(item.rectified_from_image, kept.lafs))
+    features = replace(kept, lafs=transform_lafs(item.rectified_from_image, kept.lafs))
     panel.draw_features(features, [color] * len(kept), MAX_NUM_WARP_FEATURES)
     return panel
 

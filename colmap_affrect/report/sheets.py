@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from colmap_affrect.data import ColorImage, LocalFeatures
-from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.affine import project, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Bytes
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
 
@@ -71,7 +71,7 @@ class Panel:
             max_num_features: number of features that are drawn.
         """
         strongest = np.argsort(-features.responses, kind="stable")[:max_num_features]
-        lafs = transform_frames(self.panel_from_image, features.lafs[strongest])
+        lafs = transform_lafs(self.panel_from_image, features.lafs[strongest])
         angles = np.linspace(0.0, 2.0 * np.pi, NUM_OUTLINE_POINTS)
         unit_circle = np.stack([np.cos(angles), np.sin(angles)])
         offsets = lafs[:, :, :2] @ unit_circle * (FEATURE_SIGMAS / MEASUREMENT_SIGMAS)
