@@ -80,6 +80,8 @@ MATCHERS: Registry[Matcher] = Registry(
         "lightglue": "colmap_affrect.matchers.lightglue:LightGlue",
     },
     default="nearest",
+    options_base=MatcherOptions,
+    protocol=Matcher,
 )
 
 
