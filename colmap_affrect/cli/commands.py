@@ -34,7 +34,6 @@ from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import ReconstructionReport
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
@@ -72,7 +71,8 @@ def run(options: argparse.Namespace) -> None:
 
 
 def extract(options: argparse.Namespace) -> None:
-    inputs = pipeline.InputOptions(**given.inputs(options)).inputs(options.image_path)
+    known = pipeline.RunOptions(**given.inputs(options))
+    inputs = known.inputs(options.image_path)
     with given.context(options) as context:
         report = extract_features(
             context, inputs, given.recipe(options), overwrite=options.overwrite
@@ -101,7 +101,7 @@ def map(options: argparse.Namespace) -> None:
     extend = given.extension(options)
     how = {"overwrite": options.overwrite, "page": options.page}
     if options.from_database:
-        report = pipeline.map_from_database(
+        report = pipeline.map_database(
             options.from_database,
             options.output_path,
             image_path=options.image_path,
@@ -210,12 +210,9 @@ def export_h5(options: argparse.Namespace) -> None:
 
 
 def export_database(options: argparse.Namespace) -> None:
-    workspace = Workspace(options.path)
-    if options.descriptors and not workspace.features.exists():
-        raise OptionError(f"--descriptors: {options.path} is no output folder with features.h5")
-    features = FeatureStore(workspace.features) if options.descriptors else None
-    path = workspace.database if options.path.is_dir() else options.path
-    number = old_databases.export_database(path, options.database_path, features)
+    number = old_databases.export_database(
+        options.path, options.database_path, descriptors=bool(options.descriptors)
+    )
     show(
         f"{options.database_path}: for COLMAP {options.colmap} to 3.13; {number or 'no'} images "
         "have descriptors, which COLMAP's own matchers need (--descriptors)\n"

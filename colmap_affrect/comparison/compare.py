@@ -8,10 +8,10 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
-from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
+from colmap_affrect.comparison.method_run import CompareKeywords, CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, pose_scores
@@ -20,9 +20,9 @@ from colmap_affrect.comparison.worker import run_alone
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.options import digest_of
+from colmap_affrect.options import digest_of, require_bools, takes_fields_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
-from colmap_affrect.progress import SILENT, Progress, show
+from colmap_affrect.progress import GivenProgress, Progress, show
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.record import content_of
@@ -33,22 +33,48 @@ from colmap_affrect.stages.context import Inputs
 NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
 
 
+@takes_fields_of(CompareOptions)
 def compare(
     image_path: PathLike,
     output_path: PathLike,
     options: CompareOptions | None = None,
     *,
     overwrite: bool = False,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
+    **keywords: Unpack[CompareKeywords],
 ) -> Comparison:
     """Find out how many photographs each method registers, and which; go on after a stop.
 
-    Each method runs in a process of its own; one that fails is reported, and the others go on. With
-    ``overwrite`` methods run again. Writes ``comparison.json`` and ``report.html``, too. Raises
-    AffrectError for anything that the caller can mend, before any method is run.
+    Each method runs in a process of its own; one that fails is reported, and the others go on.
+    Writes ``comparison.json`` and ``report.html``, too.
+
+    Args:
+        image_path: folder of the photographs, searched with its sub-folders.
+        output_path: folder for all results, made if missing.
+        options: options to begin with; None for the usual ones.
+        overwrite: run methods again that have results.
+        progress: True shows it on standard error, False nowhere; None where somebody looks at it,
+            on a terminal or in a notebook.
+        keywords: fields of :class:`CompareOptions`, as ``methods=["sift", "default"]``.
+
+    Returns:
+        What each method registers, with which seed.
+
+    Raises:
+        OptionError: for wrong arguments, by their names.
+        AffrectError: for anything else that the caller can mend, before any method is run.
     """
-    image_path, output_path = as_path(image_path), as_path(output_path)
-    options = options or CompareOptions()
+    image_path = as_path(image_path, "image_path")
+    output_path = as_path(output_path, "output_path")
+    options = CompareOptions.with_keywords(options, keywords)
+    require_bools(overwrite=overwrite)
+    return _compare(image_path, output_path, options, Progress.given(progress), again=overwrite)
+
+
+def _compare(
+    image_path: Path, output_path: Path, options: CompareOptions, progress: Progress, *, again: bool
+) -> Comparison:
+    """Compare with checked arguments; ``again``: also methods that have results."""
     Workspace(output_path).require_own(image_path)
     Workspace(output_path).refuse_run()
     methods = parse_methods(options.methods)
@@ -56,16 +82,16 @@ def compare(
     listed = options.pairs.match_list_path
     pairs = list(read_pairs(Path(listed), names, image_path)) if listed else exhaustive_pairs(names)
     truth = _ground_truth(options.ground_truth_path, names)
-    options = replace(options, mapping=MAPPERS.make(options.mapping).options)
+    options = options.changed(mapping=MAPPERS.make(options.mapping).options)
     same = _same_for_all(inputs, names, pairs, options)
     given = output_path.resolve(), image_path.resolve(), options, same
     runs = [MethodRun(method, *given) for method in methods]
-    recipes = [run.method.recipe for run in runs if overwrite or not run.finished()]
+    recipes = [run.method.recipe for run in runs if again or not run.finished()]
     keys = {key for recipe in recipes if recipe for key in recipe.required_weights}
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
     with Workspace(output_path).locked():
         for run in runs:
-            run.begin(overwrite=overwrite)
+            run.begin(overwrite=again)
         results, units, pace, start_s = [], len(names) + len(pairs) / 4, 1.0, time.monotonic()
         left = {run.method.label: units * run.seconds for run in runs if not run.finished()}
         total = sum(left.values())

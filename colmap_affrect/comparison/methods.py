@@ -5,7 +5,9 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import suggestion
@@ -45,6 +47,14 @@ class Method:
         """Name of the folder of its results, different for every label."""
         plain = re.sub(r"[^\w-]+", "_", self.label)
         return plain if plain == self.label else f"{plain}-{zlib.crc32(self.label.encode()):08x}"
+
+
+def _as_tuple(given: Any) -> Any:
+    return (given,) if isinstance(given, str) else given
+
+
+GivenMethods = Annotated[tuple[str | Method, ...], BeforeValidator(_as_tuple), Field(strict=False)]
+"""Field of options that takes what :func:`parse_methods` takes, a single text too."""
 
 
 def parse_methods(

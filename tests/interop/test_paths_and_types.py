@@ -20,7 +20,7 @@ from colmap_affrect.interop.hdf5 import export_h5, import_h5
 
 TAKING_PATHS: dict[str, Callable[[Any, Any], object]] = {
     "run": colmap_affrect.run,
-    "map_from_database": colmap_affrect.map_from_database,
+    "map_database": colmap_affrect.map_database,
     "compare": colmap_affrect.compare,
     "evaluate": lambda a, b: colmap_affrect.evaluate("evd", a, b),
     "export_h5": lambda a, b: export_h5(a, b, b + b),
@@ -30,7 +30,7 @@ TAKING_PATHS: dict[str, Callable[[Any, Any], object]] = {
     "diagnose": lambda a, b: diagnose(a, weights_path=b),
     "extract_features": lambda a, b: colmap_affrect.extract_features(b, a),
     "match_exhaustive": lambda a, _: colmap_affrect.match_exhaustive(a),
-    "verify": lambda a, _: colmap_affrect.verify(a),
+    "verify_matches": lambda a, _: colmap_affrect.verify_matches(a),
     "incremental_mapping": lambda a, b: colmap_affrect.incremental_mapping(a, "", b),
 }
 
@@ -41,7 +41,7 @@ def test_paths_are_text_too_and_bytes_are_refused_in_words(name: str, tmp_path: 
     with pytest.raises(AffrectError, match="missing"):
         TAKING_PATHS[name](missing, out)
     with pytest.raises(
-        OptionError, match=r"^b'.*': give a path as str or os\.PathLike, not bytes$"
+        OptionError, match=r"^\w+_?path=b'.*': give a path as str or os\.PathLike, not bytes$"
     ):
         TAKING_PATHS[name](missing.encode(), out.encode())
 
@@ -49,11 +49,11 @@ def test_paths_are_text_too_and_bytes_are_refused_in_words(name: str, tmp_path: 
 def test_options_take_both_kinds_of_paths() -> None:
     options = colmap_affrect.RunOptions(
         image_list_path="list.txt",  # type: ignore[arg-type]
-        extend=colmap_affrect.Extension("model"),  # type: ignore[arg-type]
+        extend=colmap_affrect.Extension(model_path="model"),  # type: ignore[arg-type]
         cameras=colmap_affrect.CameraOptions(cameras_path=Path("model")),  # type: ignore[arg-type]
     )
     assert options.image_list_path == Path("list.txt")
-    assert options.extend == colmap_affrect.Extension(Path("model"))
+    assert options.extend == colmap_affrect.Extension(model_path=Path("model"))
     assert (options.cameras.cameras_path, options.from_database) == ("model", None)
 
 
