@@ -36,7 +36,9 @@ WRONG = {
     ),
     "cannot be loaded (ZeroDivisionError: division by zero)": "1 / 0",
     "cannot be loaded (AttributeError: module 'own_part' has no attribute 'Own')": "",
-    "has no class 'Options' with the base RectifierOptions": RIGHT.replace("Options = Own", "x = Own"),
+    "has no class 'Options' with the base RectifierOptions": RIGHT.replace(
+        "Options = Own", "x = Own"
+    ),
     "the name in its options is 'other'": RIGHT.replace('"own"', '"other"'),
     "OwnOptions must say what its 'warps' are": RIGHT.replace("warps: ClassVar", "else_: ClassVar"),
     "has no method 'plan'": RIGHT.replace("def plan", "def plans"),
