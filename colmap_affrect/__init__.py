@@ -23,7 +23,6 @@ if not PYCOLMAP_CAME_FIRST:
 _NAMES_OF_MODULES = {
     # Photographs to a model: everything, one stage after the other, or the database of others.
     "pipeline": (
-        "RunOptions",
         "choose_pairs",
         "extract",
         "map_database",
@@ -49,6 +48,7 @@ _NAMES_OF_MODULES = {
     "recipes": ("ExtractionOptions", "Recipe", "load_recipe", "recipe_names"),
     "report.run_report": ("RunReport",),
     "stages.context": ("Resources",),
+    "stages.run_options": ("RunOptions",),
     # Models and files for and from other programs.
     "colmap.old_databases": ("export_database",),
     "images.conversion": ("convert_images",),

@@ -47,7 +47,6 @@ from colmap_affrect.mappers.incremental import IncrementalOptions as Incremental
 from colmap_affrect.mappers.sparse import SparseOptions as SparseOptions
 from colmap_affrect.matchers.nearest import NearestOptions as NearestOptions
 from colmap_affrect.pairs.lists import PairOptions as PairOptions
-from colmap_affrect.pipeline import RunOptions as RunOptions
 from colmap_affrect.pipeline import choose_pairs as choose_pairs
 from colmap_affrect.pipeline import extract as extract
 from colmap_affrect.pipeline import map_database as map_database
@@ -67,6 +66,7 @@ from colmap_affrect.report.run_report import RunReport as RunReport
 from colmap_affrect.stages.context import Resources as Resources
 from colmap_affrect.stages.descriptors import match_descriptors as match_descriptors
 from colmap_affrect.stages.descriptors import match_feature_sets as match_feature_sets
+from colmap_affrect.stages.run_options import RunOptions as RunOptions
 
 __version__: str
 PYCOLMAP_CAME_FIRST: bool

@@ -42,12 +42,13 @@ from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.match import match as match_pairs
 from colmap_affrect.stages.one_image import prepare
 from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.run_options import RunOptions
 from colmap_affrect.stages.verify import verify_matches
 
 
 def run(options: argparse.Namespace) -> None:
     recipe = given.recipe(options)
-    run_options = pipeline.RunOptions(
+    run_options = RunOptions(
         recipe=recipe,
         database_descriptors=bool(options.database_descriptors),
         extend=given.extension(options),
@@ -63,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
             options.output_path,
             run_options,
             executor=executor,
-            overwrite=options.overwrite,
+            overwrite=bool(options.overwrite),
             page=options.page,
             progress=given.progress(options),
         )
@@ -71,11 +72,11 @@ def run(options: argparse.Namespace) -> None:
 
 
 def extract(options: argparse.Namespace) -> None:
-    known = pipeline.RunOptions(**given.inputs(options))
+    known = RunOptions(**given.inputs(options))
     inputs = known.inputs(options.image_path)
     with given.context(options) as context:
         report = extract_features(
-            context, inputs, given.recipe(options), overwrite=options.overwrite
+            context, inputs, given.recipe(options), overwrite=bool(options.overwrite)
         )
         if options.database_descriptors:
             fill_descriptors(context.workspace.database, context.features)
@@ -85,7 +86,7 @@ def extract(options: argparse.Namespace) -> None:
 
 def stage(options: argparse.Namespace) -> None:
     """Run one stage, with the options on record and those that are given in their place."""
-    how = {"overwrite": options.overwrite}
+    how = {"overwrite": bool(options.overwrite)}
     with given.context(options) as at:
         match options.command:
             case "pairs":
@@ -99,7 +100,7 @@ def stage(options: argparse.Namespace) -> None:
 
 def map(options: argparse.Namespace) -> None:
     extend = given.extension(options)
-    how = {"overwrite": options.overwrite, "page": options.page}
+    how = {"overwrite": bool(options.overwrite), "page": options.page}
     if options.from_database:
         report = pipeline.map_database(
             options.from_database,
@@ -134,7 +135,7 @@ def compare(options: argparse.Namespace) -> None:
             ground_truth_path=options.ground_truth_path,
             **given.inputs(options),
         ),
-        overwrite=options.overwrite,
+        overwrite=bool(options.overwrite),
         progress=SILENT if options.quiet else Progress(sys.stderr, num_plain_lines=1),
     )
     show(tables.to_json(comparison) if options.json else tables.summary(comparison))
@@ -160,7 +161,7 @@ def evaluate(options: argparse.Namespace) -> None:
             scores=ScoreOptions(random_seed=options.random_seed or 0),
             resources=given.resources(options),
         ),
-        overwrite=options.overwrite,
+        overwrite=bool(options.overwrite),
         progress=given.progress(options),
     )
     show(evaluation.to_json() if options.json else evaluation.summary())

@@ -164,7 +164,7 @@ def context(options: argparse.Namespace) -> Iterator[Context]:
             by_hand=by_hand(options) if options.command == "map" else NOTHING,
             command=options.words,
         )
-        with one_stage(options.command, found, overwrite=options.overwrite):
+        with one_stage(options.command, found, overwrite=bool(options.overwrite)):
             yield found
 
 

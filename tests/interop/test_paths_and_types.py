@@ -41,7 +41,7 @@ def test_paths_are_text_too_and_bytes_are_refused_in_words(name: str, tmp_path: 
     with pytest.raises(AffrectError, match="missing"):
         TAKING_PATHS[name](missing, out)
     with pytest.raises(
-        OptionError, match=r"^\w+_?path=b'.*': give a path as str or os\.PathLike, not bytes$"
+        OptionError, match=r"^\w+(=|: )b'.*': give a path as str or os\.PathLike, not bytes$"
     ):
         TAKING_PATHS[name](missing.encode(), out.encode())
 
