@@ -47,8 +47,8 @@ _NAMES_OF_MODULES = {
     "project.report": ("ModelSummary", "ReconstructionReport", "StageReport"),
     "recipes": ("ExtractionOptions", "Recipe", "load_recipe", "recipe_names"),
     "report.run_report": ("RunReport",),
-    "stages.context": ("Resources",),
-    "stages.run_options": ("RunOptions",),
+    "session.context": ("Resources",),
+    "session.run_options": ("RunOptions",),
     # Models and files for and from other programs.
     "colmap.old_databases": ("export_database",),
     "images.conversion": ("convert_images",),

@@ -63,10 +63,10 @@ from colmap_affrect.recipes import Recipe as Recipe
 from colmap_affrect.recipes import load_recipe as load_recipe
 from colmap_affrect.recipes import recipe_names as recipe_names
 from colmap_affrect.report.run_report import RunReport as RunReport
-from colmap_affrect.stages.context import Resources as Resources
+from colmap_affrect.session.context import Resources as Resources
+from colmap_affrect.session.run_options import RunOptions as RunOptions
 from colmap_affrect.stages.descriptors import match_descriptors as match_descriptors
 from colmap_affrect.stages.descriptors import match_feature_sets as match_feature_sets
-from colmap_affrect.stages.run_options import RunOptions as RunOptions
 
 __version__: str
 PYCOLMAP_CAME_FIRST: bool

@@ -32,7 +32,7 @@ from colmap_affrect.options import Options
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.rectifiers.base import RECTIFIERS
 from colmap_affrect.report.run_report import RunReport
-from colmap_affrect.stages.run_options import RunKeywords, RunOptions
+from colmap_affrect.session.run_options import RunKeywords, RunOptions
 
 PACKAGE = Path(colmap_affrect.__file__).parent
 PINHOLE = {"model": "PINHOLE", "params": INTRINSICS, "mode": "single"}

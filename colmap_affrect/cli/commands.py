@@ -38,11 +38,11 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.report.pairs import draw_pair
+from colmap_affrect.session.run_options import RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.match import match as match_pairs
 from colmap_affrect.stages.one_image import prepare
 from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.run_options import RunOptions
 from colmap_affrect.stages.verify import verify_matches
 
 

@@ -24,7 +24,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe, with_settings
-from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.session.context import Context, Resources
 
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 

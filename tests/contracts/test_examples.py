@@ -20,6 +20,7 @@ from synthetic import texture, write_image
 
 from colmap_affrect.comparison import results, tables
 from colmap_affrect.errors import OptionError
+from colmap_affrect.escalation.expected_gain import kind_of
 from colmap_affrect.features.base import EXTRACTORS, FeatureExtractor, NetworkContext
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
@@ -28,8 +29,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Level, load_recipe
 from colmap_affrect.rectifiers.base import RECTIFIERS, Rectifier, RectifierInputs
 from colmap_affrect.report import run_page
-from colmap_affrect.stages.context import Context, Inputs
-from colmap_affrect.stages.expected_gain import kind_of
+from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs

@@ -16,7 +16,7 @@ from colmap_affrect.options import EffortName, Options
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.project.paths import GivenPath, PathLike
 from colmap_affrect.recipes import AnyMapper, GivenRecipe, Recipe, load_recipe
-from colmap_affrect.stages.context import Inputs, Resources
+from colmap_affrect.session.context import Inputs, Resources
 
 
 class InputOptions(Options):
