@@ -20,7 +20,7 @@ from colmap_affrect.colmap.model_files import has_model, model_folder, read_give
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
-from colmap_affrect.options import documented
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.paths import PathLike, as_path_or_none
 from colmap_affrect.project.report import installed_versions
@@ -53,7 +53,7 @@ class Finding:
 
 @documented
 @dataclass
-class Diagnosis:
+class Diagnosis(Summarized):
     """The result of an examination: what was looked at, and what was found, the worst first."""
 
     checked: list[str] = field(default_factory=list)

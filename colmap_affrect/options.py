@@ -14,6 +14,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
+from html import escape
 from importlib import metadata
 from itertools import pairwise
 from os import PathLike
@@ -23,7 +24,7 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from colmap_affrect.errors import OptionError, such_as
+from colmap_affrect.errors import OptionError, shown, such_as
 
 EffortName = Literal["low", "normal", "high"]  # how much is tried for photographs in need
 EFFORT_NAMES: tuple[EffortName, ...] = get_args(EffortName)
@@ -101,6 +102,20 @@ def _field_text(options: type[BaseModel], name: str) -> str:
 
 def _limits(item: object) -> list[float]:
     return [getattr(item, end) for end in ("ge", "le") if hasattr(item, end)]
+
+
+class Summarized:
+    """Base of results that show their summary when they are printed, or end a notebook's cell."""
+
+    def summary(self) -> str:
+        """Return text for people."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(shown(self.summary()))}</pre>"
 
 
 class Options(BaseModel):

@@ -17,10 +17,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from small_comparison import make_comparison
 from small_run import NAMES, small_report
 from small_scene import INTRINSICS
 
 import colmap_affrect
+from colmap_affrect.comparison import tables
 from colmap_affrect.comparison.method_run import CompareKeywords, CompareOptions
 from colmap_affrect.errors import AffrectError, NoModelError, OptionError
 from colmap_affrect.evaluation.evaluate import EvaluateKeywords, EvaluateOptions
@@ -28,7 +30,7 @@ from colmap_affrect.features.base import EXTRACTORS, SHAPES
 from colmap_affrect.interop.align import Reference, ReferenceKeywords
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.matchers.base import MATCHERS
-from colmap_affrect.options import Options
+from colmap_affrect.options import Options, Summarized
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.rectifiers.base import RECTIFIERS
 from colmap_affrect.report.run_report import RunReport
@@ -335,3 +337,14 @@ def test_stage_by_stage_makes_the_model_of_a_run(photos: Path, tmp_path: Path) -
     assert whole.models[0].num_points3D == report.models[0].num_points3D
     assert whole.page_path is None
     assert "output_path" not in whole.to_mapping(), "folders may be moved"
+
+
+def test_other_results_show_their_summary(tmp_path: Path) -> None:
+    comparison = make_comparison(tmp_path)
+    assert str(comparison) == comparison.summary() == tables.summary(comparison)
+    (text,) = Text(comparison._repr_html_()).words
+    assert text == comparison.summary()
+    diagnosis = colmap_affrect.Diagnosis(checked=["<out>"])
+    assert "".join(Text(diagnosis._repr_html_()).words) == str(diagnosis)
+    for name in ("StageReport", "Alignment", "Evaluation"):
+        assert PUBLIC[name].__str__ is Summarized.__str__

@@ -12,7 +12,7 @@ from statistics import fmean, median
 from typing import Any, Self
 
 from colmap_affrect.colmap.model_files import Poses, pose_errors, relative_pose
-from colmap_affrect.options import documented
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import Pair
 
 PairErrors = Mapping[Pair, tuple[float, float]]
@@ -204,7 +204,7 @@ def _in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
 
 @documented
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Summarized):
     """Several methods on one set of photographs."""
 
     image_names: tuple[str, ...]
@@ -221,6 +221,12 @@ class Comparison:
     """Cameras, masks, pair list, preset and mapper of all methods."""
     versions: Mapping[str, str]
     """Versions of Python and of the packages that decide results."""
+
+    def summary(self) -> str:
+        """Return the table of methods, and what it means."""
+        from colmap_affrect.comparison.tables import summary  # which imports this module
+
+        return summary(self)
 
     @property
     def finished(self) -> list[MethodResult]:

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
 from colmap_affrect.evaluation.truths import PairResult
-from colmap_affrect.options import documented
+from colmap_affrect.options import Summarized, documented
 
 DATA = Path(__file__).with_name("published.toml")
 SECONDS = "seconds"  # the column of all time that a recipe took
@@ -42,7 +42,7 @@ class RecipeResult:
 
 @documented
 @dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Summarized):
     """All recipes on the pairs of one dataset."""
 
     protocol: str

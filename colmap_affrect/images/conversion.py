@@ -24,7 +24,7 @@ from colmap_affrect.images.photographs import (
     require_folder,
 )
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, PNG, pages
-from colmap_affrect.options import documented
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import LONGEST_NAME, fitting_name, new_results
@@ -36,7 +36,7 @@ JPEG = b"\xff\xd8"
 
 @documented
 @dataclass
-class ConversionReport:
+class ConversionReport(Summarized):
     """What became of the files of a folder, by their names."""
 
     written: dict[str, list[str]] = field(default_factory=dict)

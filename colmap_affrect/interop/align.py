@@ -22,7 +22,7 @@ from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.interop.consensus import agreeing
 from colmap_affrect.interop.consensus import residuals as residuals_of
 from colmap_affrect.interop.finished_models import read_finished_model
-from colmap_affrect.options import Options, documented, takes_fields_of
+from colmap_affrect.options import Options, Summarized, documented, takes_fields_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.paths import GivenPath, PathLike, as_path
@@ -55,7 +55,7 @@ class Reference(Options):
 
 @documented
 @dataclass(frozen=True)
-class Alignment:
+class Alignment(Summarized):
     """What was done."""
 
     scale: float

@@ -51,7 +51,7 @@ from colmap_affrect.geometry.conventions import (
     pixel_from_colmap,
 )
 from colmap_affrect.images.photographs import CameraOptions, list_images, refuse_colliding_keys
-from colmap_affrect.options import documented
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.given_matches import (
     GivenMatches,
     MatchType,
@@ -73,7 +73,7 @@ SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
 
 @documented
 @dataclass(frozen=True)
-class InterchangeReport:
+class InterchangeReport(Summarized):
     """What was imported or exported."""
 
     action: str

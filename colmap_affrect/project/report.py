@@ -9,7 +9,7 @@ from importlib import metadata
 from typing import Any
 
 from colmap_affrect.errors import such_as
-from colmap_affrect.options import documented
+from colmap_affrect.options import Summarized, documented
 
 NUM_WORST = 3  # tie points that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
@@ -130,7 +130,7 @@ class MatchedAgain:
 
 @documented
 @dataclass(frozen=True)
-class StageReport:
+class StageReport(Summarized):
     """One stage of a run."""
 
     name: str
@@ -267,7 +267,7 @@ class ModelSummary:
 
 @documented
 @dataclass(frozen=True)
-class ReconstructionReport:
+class ReconstructionReport(Summarized):
     """A whole run; numbers of points and tracks are those of the largest model."""
 
     images_total: int

@@ -63,9 +63,6 @@ class RunReport(ReconstructionReport):
             f"RunReport(registered={registered!r}, status={self.status!r}, output_path={where!r})"
         )
 
-    def __str__(self) -> str:
-        return self.summary()
-
     def _repr_html_(self) -> str:
         """Return what a notebook shows: counts, photographs, what to try next."""
         counts = {
