@@ -255,8 +255,8 @@ class Registry(Generic[Part]):
     group: str  # of the entry points by which other packages add theirs
     built_in: Mapping[str, str]  # ``module:Class`` of ours; imported when needed
     default: str  # name of the part where none is given
+    protocol: type = object  # what a part has to do
     options_base: type[PartOptions] = PartOptions  # of the options of every part
-    protocol: type = object  # what a part must do
 
     def names(self) -> list[str]:
         """Return the names of all parts, those of this package first."""

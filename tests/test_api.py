@@ -22,9 +22,11 @@ from small_run import NAMES, small_report
 from small_scene import INTRINSICS
 
 import colmap_affrect
+from colmap_affrect import ByHand, CameraOptions, MaskOptions, PairOptions, Resources
+from colmap_affrect.cli.flags import FLAGS
 from colmap_affrect.comparison import tables
 from colmap_affrect.comparison.method_run import CompareKeywords, CompareOptions
-from colmap_affrect.errors import AffrectError, NoModelError, OptionError
+from colmap_affrect.errors import ARGUMENTS, AffrectError, NoModelError, OptionError
 from colmap_affrect.evaluation.evaluate import EvaluateKeywords, EvaluateOptions
 from colmap_affrect.features.base import EXTRACTORS, SHAPES
 from colmap_affrect.interop.align import Reference, ReferenceKeywords
@@ -199,8 +201,22 @@ def test_wrong_arguments_are_refused_by_name_before_anything_is_made(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_errors_name_fields_of_options_where_flags_stand_for_them() -> None:
+    fields = {dest for settings in FLAGS.values() if "." in (dest := settings.get("dest", ""))}
+    fields -= {"cameras.model", "pairs.match_list_path"}  # of export and map_database, too
+    assert fields <= set(ARGUMENTS.values())
+    arguments = {name for function in PUBLIC.values() if inspect.isfunction(function)
+                 for name in inspect.signature(function).parameters}  # fmt: skip
+    parts = {"cameras": CameraOptions, "masks": MaskOptions, "pairs": PairOptions,
+             "by_hand": ByHand, "resources": Resources}  # fmt: skip
+    for name in ARGUMENTS.values():
+        part, _, field = name.rpartition(".")
+        known = parts[part].model_fields if part else arguments | {"mapper_options"}
+        assert field in known, name
+
+
 def test_a_format_is_a_word_or_several(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r"^format plx: unknown .did you mean 'ply'"):
+    with pytest.raises(OptionError, match=r"^formats plx: unknown .did you mean 'ply'"):
         colmap_affrect.export(tmp_path, tmp_path / "out", "text,plx")
     with pytest.raises(OptionError, match=r"not a COLMAP model"):
         colmap_affrect.export(tmp_path, tmp_path / "out", "ply")

@@ -78,8 +78,8 @@ EXTRACTORS: Registry[FeatureExtractor] = Registry(
         "aliked": "colmap_affrect.features.learned:Aliked",
     },
     default="rootsift",
-    options_base=FeatureOptions,
     protocol=FeatureExtractor,
+    options_base=FeatureOptions,
 )
 
 
@@ -109,6 +109,6 @@ SHAPES: Registry[ShapeSource] = Registry(
         "affnet": "colmap_affrect.features.affnet_shapes:AffNet",
     },
     default="second-moment",
-    options_base=ShapeOptions,
     protocol=ShapeSource,
+    options_base=ShapeOptions,
 )

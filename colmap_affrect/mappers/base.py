@@ -120,6 +120,6 @@ MAPPERS: Registry[Mapper] = Registry(
         "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },
     default="sparse",
-    options_base=MapperOptions,
     protocol=Mapper,
+    options_base=MapperOptions,
 )

@@ -80,8 +80,8 @@ MATCHERS: Registry[Matcher] = Registry(
         "lightglue": "colmap_affrect.matchers.lightglue:LightGlue",
     },
     default="nearest",
-    options_base=MatcherOptions,
     protocol=Matcher,
+    options_base=MatcherOptions,
 )
 
 

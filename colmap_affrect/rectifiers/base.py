@@ -112,6 +112,6 @@ RECTIFIERS: Registry[Rectifier] = Registry(
         "dense-shapes": "colmap_affrect.rectifiers.affine_warps:DenseShapes",
     },
     default="dense-shapes",
-    options_base=RectifierOptions,
     protocol=Rectifier,
+    options_base=RectifierOptions,
 )

@@ -64,7 +64,7 @@ def test_errors_of_functions_name_arguments(
     with pytest.raises(OptionError, match=r"^image_path \S+none: no such folder$"):
         export(tmp_path, tmp_path / "out", ["ply"], image_path=tmp_path / "none")
     assert str(AffrectError("--mask-path x: use 'colmap-affrect run --set a=1' or --extend")) == (
-        "mask_path x: use 'colmap-affrect run --set a=1' or extend"
+        "masks.path x: use 'colmap-affrect run --set a=1' or extend"
     )
     with pytest.raises(OptionError, match=r"call extract_features first, or move this folder"):
         colmap_affrect.match_exhaustive(tmp_path / "a.db")
@@ -75,14 +75,19 @@ import colmap_affrect
 from colmap_affrect import pycolmap
 from colmap_affrect.pycolmap.panorama import reconstruct
 
-report = colmap_affrect.run("photos", "out", colmap_affrect.RunOptions())
+report = colmap_affrect.run(
+    "photos", "out", colmap_affrect.RunOptions(effort="low"), cameras={"mode": "single"}
+)
 reveal_type(report)
+reveal_type(report.reconstruction())
 reveal_type(pycolmap.extract_features("a.db", "photos"))
 reveal_type(pycolmap.match_exhaustive("a.db"))
 reveal_type(pycolmap.Reconstruction())
 reveal_type(reconstruct("panoramas", "out"))
 reveal_type(pycolmap.__version__)
 pycolmap.no_such_name
+colmap_affrect.run("photos", "out", efort="low")
+colmap_affrect.CameraOptions(mod="single")
 """
 
 
@@ -95,14 +100,17 @@ def test_type_checkers_see_the_types(tmp_path: Path) -> None:
         env={**os.environ, "MYPYPATH": str(Path(colmap_affrect.__file__).parents[1])},
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
-    *lines, error, _ = done.stdout.splitlines()
+    *lines, name, keyword, field, _ = done.stdout.splitlines()
     report = "colmap_affrect.project.report"
     assert [line.partition("Revealed type is ")[2] for line in lines] == [
-        f'"{report}.ReconstructionReport"',
+        '"colmap_affrect.report.run_report.RunReport"',
+        '"pycolmap._core.Reconstruction"',
         f'"{report}.StageReport"',
         f'"tuple[{report}.StageReport, ...]"',
         '"pycolmap._core.Reconstruction"',
         '"dict[int, pycolmap._core.Reconstruction]"',
         '"str"',
     ]
-    assert "no_such_name" in error
+    assert "no_such_name" in name
+    assert 'Unexpected keyword argument "efort"' in keyword
+    assert 'Unexpected keyword argument "mod"' in field
