@@ -20,8 +20,9 @@ from colmap_affrect.colmap.model_files import has_model, model_folder, read_give
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path_or_none
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
@@ -35,22 +36,30 @@ HARMLESS = WARNED | {"camera-panorama"}  # problems of databases that may be of 
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
+@documented
 @dataclass(frozen=True)
 class Finding:
     """One thing that was found."""
 
     severity: Severity
-    where: str  # file, folder or part of the installation
+    """``error``, ``warning`` or ``note``."""
+    where: str
+    """File, folder or part of the installation."""
     what: str
+    """What is wrong with it."""
     advice: str
+    """What helps."""
 
 
+@documented
 @dataclass
-class Diagnosis:
+class Diagnosis(Summarized):
     """The result of an examination: what was looked at, and what was found, the worst first."""
 
     checked: list[str] = field(default_factory=list)
+    """What was looked at."""
     findings: list[Finding] = field(default_factory=list)
+    """What was found, the worst first."""
 
     def add(self, severity: Severity, where: Path | str, what: str, advice: str) -> None:
         """Add what is wrong with a file, folder or part of the installation, and what helps."""
@@ -91,7 +100,8 @@ def diagnose(path: PathLike | None = None, *, weights_path: PathLike | None = No
 
     OptionError when something that is given is not there.
     """
-    path, weights_path = (as_path(given) if given else None for given in (path, weights_path))
+    path = as_path_or_none(path, "path")
+    weights_path = as_path_or_none(weights_path, "weights_path")
     if path is not None and not path.exists():
         wanted = "give an output folder, a COLMAP database or the folder of a model"
         raise OptionError(f"{path}: no such file or folder; {wanted}")

@@ -36,6 +36,20 @@ def lacks_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or any(t in str(error).lower() for t in NO_MEMORY)
 
 
+ARGUMENTS = {
+    "camera-mask-path": "masks.camera_path", "camera-mode": "cameras.mode",
+    "camera-params": "cameras.params", "cameras-path": "cameras.cameras_path",
+    "device": "resources.device", "distance": "distances", "film-width-mm": "cameras.film_width_mm",
+    "focal-length-px": "cameras.focal_length_px", "focal-mm": "cameras.focal_mm",
+    "format": "formats", "gps": "gps_database", "ignore-exif": "cameras.ignore_exif",
+    "leave-out": "by_hand.left_out", "mapper": "mapping", "mapper-options": "mapper_options",
+    "mask-path": "masks.path", "max-distance-m": "pairs.max_distance_m", "max-time": "max_minutes",
+    "num-neighbors": "pairs.num_neighbors", "pairs": "pairs.methods", "points": "points_path",
+    "positions": "positions_path", "principal-point": "cameras.principal_point",
+    "reject-pair": "by_hand.rejected", "scheduler": "executor",
+    "tie-points": "by_hand.tie_points_path", "weights": "resources.weights_path",
+}  # fmt: skip
+"""What functions call the flags whose argument has another name; a dot leads to a field."""
 FLAG = re.compile(r"(?:colmap-affrect|colmap|pip) [^';)]*|--([a-z][a-z-]*)")  # not of a command
 
 
@@ -51,7 +65,10 @@ class AffrectError(Exception):
 
 
 def _argument(flag: re.Match[str]) -> str:
-    return (flag[1] or "").replace("-", "_") or flag[0]
+    name = flag[1]
+    if name is None:  # a command, whose flags stay
+        return flag[0]
+    return ARGUMENTS.get(name, name.replace("-", "_"))
 
 
 class OptionError(AffrectError, ValueError):

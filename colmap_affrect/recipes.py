@@ -6,6 +6,7 @@ A section is the options of a part, which ``name`` chooses; what is left out kee
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -26,6 +27,7 @@ from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOp
 AnyRectifier = Annotated[SerializeAsAny[RectifierOptions], BeforeValidator(RECTIFIERS.options)]
 AnyFeatures = Annotated[SerializeAsAny[FeatureOptions], BeforeValidator(EXTRACTORS.options)]
 AnyMatcher = Annotated[SerializeAsAny[MatcherOptions], BeforeValidator(MATCHERS.options)]
+AnyMapper = Annotated[SerializeAsAny[MapperOptions], BeforeValidator(MAPPERS.options)]
 ImageSize = Annotated[int, within(16, 1_000_000)]
 
 
@@ -33,9 +35,13 @@ class LevelOptions(Options):
     """A level of escalation; what is not given is as it is for all images."""
 
     rectifier: AnyRectifier = IdentityOptions()
+    """Warps of this level."""
     features: AnyFeatures | None = None
+    """Features of the image and its warps; None: those of all images."""
     matching: AnyMatcher | None = None
+    """How pairs are matched; None: as the recipe says."""
     max_image_size_px: ImageSize | None = None
+    """Larger images are shrunk to this longer side; None: as the recipe says."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,8 @@ class Level:
     def name(self) -> str:
         """Name in reports."""
         warps, own = self.rectifier.name, self.features.name if self.base else ""
-        return own if own and warps == "identity" else f"{warps} {own}".rstrip()
+        adds_nothing = self.rectifier.warps == "none"
+        return own if own and adds_nothing else f"{warps} {own}".rstrip()
 
     @property
     def network_parts(self) -> tuple[NetworkOptions, ...]:
@@ -83,7 +90,9 @@ class ExtractionOptions(Options):
     escalation: Annotated[tuple[LevelOptions, ...], Field(strict=False)] = ()
     """For pairs that fail verification, one after the other until it succeeds."""
     features: AnyFeatures = SiftOptions()
+    """Features of the image and its warps."""
     depth: DepthOptions = DepthOptions()
+    """Depth maps, for rectifiers that read them."""
     max_image_size_px: ImageSize = 2400
     """Larger images are shrunk to this longer side before extraction, which bounds memory. COLMAP's
     limit for SIFT is 3200."""
@@ -150,8 +159,11 @@ class Recipe(ExtractionOptions):
     summary: str = ""
     """One line for people."""
     matching: AnyMatcher = NearestOptions()
+    """How pairs are matched."""
     escalate: EscalateOptions = EscalateOptions()
+    """Which pairs are matched again by the levels of ``escalation``."""
     guided: GuidedOptions = GuidedOptions()
+    """Matching once more along the epipolar lines of verified pairs."""
     mapping: dict[str, Any] = Field(default_factory=dict)
     """``name`` of the mapper and options that differ from the preset."""
 
@@ -214,7 +226,22 @@ def recipe_names() -> list[str]:
     return sorted(path.stem for path in recipe_folder().glob("*.toml"))
 
 
-def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
+def as_recipe(given: Any) -> Recipe:
+    """Return a recipe: as it is, by its name or the path of a TOML file, or from its sections."""
+    if isinstance(given, Recipe):
+        return given
+    if isinstance(given, str | PathLike):
+        return load_recipe(str(given))
+    if isinstance(given, Mapping):
+        return Recipe(**given)
+    raise OptionError(f"recipe={given!r}: give a Recipe, a name, a path or a dictionary")
+
+
+GivenRecipe = Annotated[Recipe, BeforeValidator(as_recipe)]
+"""Field of options that takes what :func:`as_recipe` takes."""
+
+
+def load_recipe(name: str, settings: str | Sequence[str] = ()) -> Recipe:
     """Load a recipe by its name or the path of a TOML file, and change single options.
 
     ``settings`` are ``section.option=value`` with a TOML value; strings may go without quotes.
@@ -233,7 +260,7 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
         raise OptionError(f"recipe {name}: no such file") from error
     except (OSError, ValueError, RecursionError) as error:  # what tomllib raises on odd files
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
-    changed = with_settings(values, settings)
+    changed = with_settings(values, [settings] if isinstance(settings, str) else settings)
     return Recipe.from_mapping({**changed, "name": name}, f"recipe {name}")
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import inspect
 import pkgutil
 import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
@@ -22,7 +24,8 @@ from colmap_affrect.project.record import STAGES
 from colmap_affrect.recipes import load_recipe
 
 ROOT = Path(__file__).parents[1]
-PAGES = ["README.md", "BENCHMARKS.md", "sample_scenes/README.md"]
+PAGES = ["README.md", "BENCHMARKS.md", "CHANGELOG.md", "CONTRIBUTING.md"]
+PAGES += ["sample_scenes/README.md"]
 PAGES += sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.md"))
 TEXTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in PAGES}
 FOREIGN = {
@@ -95,7 +98,9 @@ def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
             script = "recipes/" in code or "tests/" in code
             assert script or flag in {*ALL_FLAGS, *FOREIGN}, code
         if re.fullmatch(r"colmap_affrect(\.\w+)+", code):
-            pkgutil.resolve_name(code)
+            found = pkgutil.resolve_name(code)
+            is_public = code.split(".")[1] in colmap_affrect.__all__
+            assert is_public or inspect.ismodule(found), f"{code}: import colmap_affrect has none"
         if words[0] == "--recipe" and words[1:] and not words[1].isupper() and ".toml" not in code:
             load_recipe(words[1])
         if words[0] == "--set" and "=" in code:
@@ -165,6 +170,19 @@ def test_pages_name_every_command_and_readme_is_short() -> None:
     assert len(readme.split()) < MAX_WORDS
     # The commands that set everything up, which .ci/run executes.
     assert len(re.findall(r"^python3 -m venv", readme, re.MULTILINE)) == 2
+
+
+def test_version_and_citation_agree_and_no_address_is_invented() -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    fields = dict(re.findall(r"^(\S+): (.+)$", citation, re.MULTILINE))
+    assert fields["version"] == colmap_affrect.__version__
+    assert {"cff-version", "message", "title", "license"} <= fields.keys()
+    assert citation.count("family-names") == citation.count("given-names") == 3
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert all(url.startswith("https://") for url in project.get("urls", {}).values())
+    extras = project["optional-dependencies"]
+    assert {"dev", "docs", "test"} <= extras.keys()
+    assert fields["license"] == project["license"]
 
 
 @pytest.mark.long

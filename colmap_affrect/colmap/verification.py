@@ -34,10 +34,12 @@ class VerificationOptions(PresetOptions):
     """Two-view geometry, by default the sparse preset (names as in pycolmap)."""
 
     max_error_px: Annotated[float, within(0.01, 1000.0)] = 3.0
+    """Largest error of an inlier."""
     scale_max_error: bool = True
     """Whether ``max_error_px`` counts pixels of photographs as they were when features were
     extracted, shrunk to ``max_image_size_px`` of the recipe; else those of the files."""
     min_num_inliers: Annotated[int, within(5, 1_000_000)] = 15
+    """Fewest inliers of a verified pair."""
     min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.0
     """Share of the raw matches; those that are wrong say little about the others."""
     min_significance: Annotated[float, within(0.0, 1e9)] = 5.0
@@ -46,8 +48,11 @@ class VerificationOptions(PresetOptions):
     frames agree with the geometry. With 5, all pairs of 450 unrelated photographs have about one. 0
     accepts what COLMAP accepts."""
     max_num_trials: Annotated[int, within(1, 100_000_000)] = 10000
+    """Most samples that RANSAC draws for a pair."""
     ransac_min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.10
+    """Smallest share of inliers that RANSAC draws enough samples for."""
     random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
+    """Of the samples; -1: another one each time."""
 
     COLMAP: ClassVar[Mapping[str, Any]] = {
         "max_error_px": 4.0,

@@ -8,10 +8,10 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
-from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
+from colmap_affrect.comparison.method_run import CompareKeywords, CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, pose_scores
@@ -20,9 +20,9 @@ from colmap_affrect.comparison.worker import run_alone
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.options import digest_of
+from colmap_affrect.options import digest_of, require_bools, takes_fields_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
-from colmap_affrect.progress import SILENT, Progress, show
+from colmap_affrect.progress import GivenProgress, Progress, show
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.record import content_of
@@ -34,13 +34,15 @@ NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
 PAIRS_PER_IMAGE = 4  # that take roughly as long as an image, for the forecast
 
 
+@takes_fields_of(CompareOptions)
 def compare(
     image_path: PathLike,
     output_path: PathLike,
     options: CompareOptions | None = None,
     *,
     overwrite: bool = False,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
+    **keywords: Unpack[CompareKeywords],
 ) -> Comparison:
     """Find out how many photographs each method registers, and which.
 
@@ -48,21 +50,32 @@ def compare(
     Writes ``comparison.json`` and ``report.html``, too. A comparison that was stopped goes on.
 
     Args:
-        image_path: folder of the photographs.
-        output_path: folder of the results.
-        options: methods, seeds and everything else that results depend on.
-        overwrite: run methods again that are finished.
-        progress: where to show it.
+        image_path: folder of the photographs, searched with its sub-folders.
+        output_path: folder for all results, made if missing.
+        options: options to begin with; None for the usual ones.
+        overwrite: run methods again that have results.
+        progress: True shows it on standard error, False nowhere; None where somebody looks at it,
+            on a terminal or in a notebook.
+        keywords: fields of :class:`CompareOptions`, as ``methods=["sift", "default"]``.
 
     Returns:
         What each method registers, and how long it takes.
 
     Raises:
-        AffrectError: something that the caller can mend, before any method is run.
+        OptionError: for wrong arguments, by their names.
+        AffrectError: for anything else that the caller can mend, before any method is run.
     """
-    image_path = as_path(image_path)
-    output_path = as_path(output_path)
-    options = options or CompareOptions()
+    image_path = as_path(image_path, "image_path")
+    output_path = as_path(output_path, "output_path")
+    options = CompareOptions.with_keywords(options, keywords)
+    require_bools(overwrite=overwrite)
+    return _compare(image_path, output_path, options, Progress.given(progress), again=overwrite)
+
+
+def _compare(
+    image_path: Path, output_path: Path, options: CompareOptions, progress: Progress, *, again: bool
+) -> Comparison:
+    """Compare with checked arguments; ``again``: also methods that have results."""
     workspace = Workspace(output_path)
     workspace.require_own(image_path)
     workspace.refuse_run()
@@ -70,14 +83,14 @@ def compare(
     inputs, names = _checked_inputs(image_path, options)
     pairs = _pairs(image_path, names, options.pairs)
     truth = _ground_truth(options.ground_truth_path, names)
-    options = replace(options, mapping=MAPPERS.make(options.mapping).options)
+    options = options.changed(mapping=MAPPERS.make(options.mapping).options)
     common = _common_record(inputs, names, pairs, options)
     folders = (output_path.resolve(), image_path.resolve())
     runs = [MethodRun(method, *folders, options, common) for method in methods]
-    _resolve_weights(runs, options, progress, overwrite=overwrite)
+    _resolve_weights(runs, options, progress, overwrite=again)
     with workspace.locked():
         num_images = len(names) + len(pairs) / PAIRS_PER_IMAGE
-        results = _run_methods(runs, num_images, progress, overwrite=overwrite)
+        results = _run_methods(runs, num_images, progress, overwrite=again)
         if truth:
             results = [_scored(result, output_path, truth, names) for result in results]
         comparison = Comparison(

@@ -16,9 +16,9 @@ from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
@@ -26,7 +26,7 @@ from colmap_affrect.colmap.database import image_ids, open_database, unverified_
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.comparison import DEFAULT_METHODS
-from colmap_affrect.comparison.methods import SIFT_COLMAP, Method
+from colmap_affrect.comparison.methods import SIFT_COLMAP, GivenMethods, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.errors import AffrectError, ConflictError
 from colmap_affrect.escalation.climb import climb
@@ -34,19 +34,21 @@ from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database, read_summaries
+from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.lists import Pair, read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
-from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_bytes, replace_text
 from colmap_affrect.project.outputs import new_results, remove_own, temporary_folder
+from colmap_affrect.project.paths import GivenPath, PathLike
 from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import Recipe
+from colmap_affrect.recipes import AnyMapper, Recipe
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.database_export import add_images
+from colmap_affrect.session.run_options import InputKeywords, InputOptions
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
@@ -147,13 +149,28 @@ RECIPE_SECONDS = 1.5
 ESCALATION_SECONDS = 6.0
 
 
-@dataclass(frozen=True, kw_only=True)
 class CompareOptions(InputOptions):
-    """Everything a comparison depends on beside its images and its output folder."""
+    """Everything a comparison depends on beside its images and its output folder.
 
-    methods: Sequence[str | Method] = DEFAULT_METHODS  # names as the command line has them
-    seeds: Sequence[int] = (0, 1, 2)  # of verification and mapping, which run once with each
-    ground_truth_path: Path | None = None  # of a COLMAP model with true poses, in any world frame
+    Options of a part, as ``cameras``, may be a dictionary, and ``mapping`` a name.
+    """
+
+    mapping: AnyMapper = SparseOptions()
+    """The mapper and its options, the same for all methods."""
+    methods: GivenMethods = DEFAULT_METHODS
+    """``sift-colmap``, ``sift``, or recipes, as ``NAME`` or ``LABEL=NAME:OPTION=VALUE``."""
+    seeds: Annotated[tuple[int, ...], Field(strict=False)] = (0, 1, 2)
+    """Of verification and mapping, which run once for each."""
+    ground_truth_path: GivenPath | None = None
+    """COLMAP model with true poses, in any frame."""
+
+
+class CompareKeywords(InputKeywords, total=False):
+    """The fields of :class:`CompareOptions` as keywords of a function."""
+
+    methods: str | Sequence[str | Method]
+    seeds: Sequence[int]
+    ground_truth_path: PathLike | None
 
 
 @dataclass

@@ -6,7 +6,9 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import suggestion
@@ -49,6 +51,14 @@ class Method:
         if name == self.label:
             return name
         return f"{name}-{zlib.crc32(self.label.encode()):08x}"
+
+
+def _as_tuple(given: Any) -> Any:
+    return (given,) if isinstance(given, str) else given
+
+
+GivenMethods = Annotated[tuple[str | Method, ...], BeforeValidator(_as_tuple), Field(strict=False)]
+"""Field of options that takes what :func:`parse_methods` takes, a single text too."""
 
 
 def parse_methods(

@@ -12,6 +12,7 @@ from statistics import fmean, median
 from typing import Any, Self
 
 from colmap_affrect.colmap.model_files import Poses, pose_errors, relative_pose
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import Pair
 
 PairErrors = Mapping[Pair, tuple[float, float]]
@@ -240,17 +241,31 @@ def _in_most(names_by_seed: Sequence[Iterable[str]]) -> list[str]:
     return sorted(name for name, count in counts.items() if 2 * count > len(names_by_seed))
 
 
+@documented
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Summarized):
     """Several methods on one set of photographs."""
 
-    image_names: tuple[str, ...]  # all images given, sorted
+    image_names: tuple[str, ...]
+    """All images that were given, sorted."""
     image_path: str
+    """Folder of the photographs."""
     methods: tuple[MethodResult, ...]
+    """What each method found."""
     seeds: tuple[int, ...]
-    num_pairs: int  # that each method has to match
-    settings: Mapping[str, Any]  # cameras, masks, pair list, preset and mapper of all methods
+    """Seeds of verification and mapping."""
+    num_pairs: int
+    """Pairs that were to be matched."""
+    settings: Mapping[str, Any]
+    """Cameras, masks, pair list, preset and mapper of all methods."""
     versions: Mapping[str, str]
+    """Versions of Python and of the packages that decide results."""
+
+    def summary(self) -> str:
+        """Return the table of methods, and what it means."""
+        from colmap_affrect.comparison.tables import summary  # which imports this module
+
+        return summary(self)
 
     @property
     def finished(self) -> list[MethodResult]:

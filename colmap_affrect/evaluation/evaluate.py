@@ -8,19 +8,19 @@ escalation the one with most inliers of COLMAP's verification counts.
 import itertools
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean
 from threading import Lock
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
-from colmap_affrect.comparison.methods import Method, parse_methods
+from colmap_affrect.comparison.methods import GivenMethods, Method, parse_methods
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.evaluation import truths
 from colmap_affrect.evaluation.datasets import PROTOCOLS, EvaluationPair
@@ -29,9 +29,9 @@ from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
-from colmap_affrect.options import digest_of
+from colmap_affrect.options import Options, digest_of, require_bools, takes_fields_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
-from colmap_affrect.progress import SILENT, Progress, Stopwatch
+from colmap_affrect.progress import GivenProgress, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.paths import PathLike, as_path
@@ -57,14 +57,26 @@ class _Matched:
     failure: str = ""  # why the pair could not be matched
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
+class EvaluateOptions(Options):
     """Everything an evaluation depends on beside protocol, dataset and output folder."""
 
-    recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")
-    max_num_keypoints: int | None = None  # of each image, the strongest; None: all
-    scores: ScoreOptions = field(default_factory=ScoreOptions)
-    resources: Resources = field(default_factory=Resources)
+    recipes: GivenMethods = ("unrectified-rootsift", "default")
+    """Recipes by name, or as ``LABEL=NAME:OPTION=VALUE``."""
+    max_num_keypoints: int | None = None
+    """Of each image the strongest are matched; None: all."""
+    scores: ScoreOptions = ScoreOptions()
+    """How models are estimated from matches."""
+    resources: Resources = Resources()
+    """Weights and device of networks."""
+
+
+class EvaluateKeywords(TypedDict, total=False):
+    """The fields of :class:`EvaluateOptions` as keywords of a function."""
+
+    recipes: str | Sequence[str | Method]
+    max_num_keypoints: int | None
+    scores: ScoreOptions | Mapping[str, Any]
+    resources: Resources | Mapping[str, Any]
 
 
 class RecipeRun:
@@ -243,6 +255,7 @@ class RecipeRun:
         return len(geometry.inlier_matches)
 
 
+@takes_fields_of(EvaluateOptions)
 def evaluate(
     protocol: str,
     dataset_path: PathLike,
@@ -250,31 +263,30 @@ def evaluate(
     options: EvaluateOptions | None = None,
     *,
     overwrite: bool = False,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
+    **keywords: Unpack[EvaluateKeywords],
 ) -> Evaluation:
-    """Score recipes on a dataset.
+    """Score recipes on a dataset, and write ``evaluation.json``, too.
 
-    A pair with an image that cannot be used counts as failed. Writes ``evaluation.json``, too.
+    A pair with an image that cannot be used counts as failed. AffrectError for what the caller can
+    mend, before any image is worked on.
 
     Args:
         protocol: one of ``PROTOCOLS``.
         dataset_path: folder of the dataset.
-        output_path: folder of the results, which keeps features for another evaluation.
-        options: recipes, and how they are scored.
+        output_path: folder for all results; features that are there are used again.
+        options: options to begin with; None for the usual ones.
         overwrite: discard the features of these recipes.
-        progress: where to show it.
-
-    Returns:
-        The scores of all pairs.
-
-    Raises:
-        AffrectError: something that the caller can mend, before any image is worked on.
+        progress: True, False, or None for where somebody looks at it.
+        keywords: fields of :class:`EvaluateOptions`, as ``recipes=["default"]``.
     """
-    dataset_path = as_path(dataset_path)
-    output_path = as_path(output_path)
+    dataset_path = as_path(dataset_path, "dataset_path")
+    output_path = as_path(output_path, "output_path")
     if protocol not in PROTOCOLS:
         raise OptionError(f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}")
-    options = options or EvaluateOptions()
+    options = EvaluateOptions.with_keywords(options, keywords)
+    require_bools(overwrite=overwrite)
+    progress = Progress.given(progress)
     methods = parse_methods(options.recipes)
     _check(options, dataset_path)
     Workspace(output_path).require_own(dataset_path)
@@ -290,7 +302,7 @@ def evaluate(
             protocol=protocol,
             dataset_path=inputs["dataset_path"],
             settings={
-                "scores": asdict(options.scores),
+                "scores": options.scores.to_mapping(),
                 "max_num_keypoints": options.max_num_keypoints,
             },
             recipes=tuple(_recipe_result(run, results[run.label]) for run in runs),

@@ -11,6 +11,7 @@ from pydantic import TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
 from colmap_affrect.evaluation.truths import PairResult
+from colmap_affrect.options import Summarized, documented
 
 DATA = Path(__file__).with_name("published.toml")
 SECONDS = "seconds"  # the column of all time that a recipe took
@@ -40,16 +41,23 @@ class RecipeResult:
     pairs: tuple[PairResult, ...]  # in the order of the dataset; failed ones among them
 
 
+@documented
 @dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Summarized):
     """All recipes on the pairs of one dataset."""
 
     protocol: str
+    """Name of the protocol."""
     dataset_path: str
-    settings: Mapping[str, Any]  # everything that decides scores
+    """Folder of the dataset."""
+    settings: Mapping[str, Any]
+    """Everything that decides scores."""
     recipes: tuple[RecipeResult, ...]
-    published: Mapping[str, Mapping[str, float]]  # rows of the paper's tables for the protocol
+    """What each recipe reached."""
+    published: Mapping[str, Mapping[str, float]]
+    """Rows of the paper's tables for the protocol."""
     versions: Mapping[str, str]
+    """Versions of Python and of the packages that decide results."""
 
     def to_json(self) -> str:
         """Return everything as JSON, recipes by name; infinite errors are null."""

@@ -8,11 +8,11 @@ D. Mishkin et al., *WxBS: Wide Baseline Stereo Generalizations*, 2015.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean, median_low
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ from colmap_affrect.geometry.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
 from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 from colmap_affrect.images.reading import read_gray
+from colmap_affrect.options import Options, within
 
 Points = Floats
 Sides = tuple[Floats, Floats]  # points or rays of both images
@@ -46,13 +47,15 @@ MAX_AUC_ERROR_DEG = 10.0  # of the area under the curve of recall; that of the I
 NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
 
 
-@dataclass(frozen=True)
-class ScoreOptions:
+class ScoreOptions(Options):
     """How models are estimated from matches."""
 
-    threshold_px: float = 0.5  # of an inlier of RANSAC, for homographies and poses: the paper's
-    max_num_iterations: int = 100_000  # as the paper says; its numbers of poses are those of 1000
-    random_seed: int = 0  # of the order of the matches
+    threshold_px: Annotated[float, within(0.01, 1000.0)] = 0.5
+    """Largest error of an inlier of plain RANSAC, for homographies and poses."""
+    max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
+    """As the paper says; its numbers of poses are those of 1000."""
+    random_seed: int = 0
+    """Of the order in which matches are taken."""
 
 
 @dataclass(frozen=True)
@@ -340,7 +343,7 @@ class Correspondences:
                 (points1, points2),
                 cv2.USAC_MAGSAC,
                 MAX_EPIPOLAR_NOISE_PX,
-                replace(options, random_seed=seed),
+                options.changed(random_seed=seed),
             )
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
             estimates.append((float(np.median(distances)), num_inliers, seed, distances))

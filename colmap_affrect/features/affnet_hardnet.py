@@ -40,6 +40,7 @@ class AffNetHardNetOptions(DogOptions):
 
     name: Literal["affnet-hardnet"] = "affnet-hardnet"
     descriptor: Literal["hardnet", "hardtfeat"] = "hardnet"
+    """Network that describes patches."""
 
     @property
     def weights(self) -> tuple[str, ...]:

@@ -86,6 +86,8 @@ EXTRACTORS: Registry[FeatureExtractor] = Registry(
         "aliked": "colmap_affrect.features.learned:Aliked",
     },
     default="rootsift",
+    protocol=FeatureExtractor,
+    options_base=FeatureOptions,
 )
 
 
@@ -115,4 +117,6 @@ SHAPES: Registry[ShapeSource] = Registry(
         "affnet": "colmap_affrect.features.affnet_shapes:AffNet",
     },
     default="second-moment",
+    protocol=ShapeSource,
+    options_base=ShapeOptions,
 )

@@ -25,8 +25,11 @@ class DogOptions(FeatureOptions):
     contrast_threshold: Annotated[float, within(0.0, 1.0)] = 0.013
     """OpenCV's contrast threshold; lower finds fainter features (OpenCV and the paper: 0.04)."""
     edge_threshold: Annotated[float, within(1.0, 1e6)] = 10.0
+    """OpenCV's edge threshold: largest ratio of the principal curvatures of a keypoint."""
     num_octave_layers: Annotated[int, within(1, 10)] = 3
+    """Scales in an octave."""
     sigma_px: Annotated[float, within(0.5, 10.0)] = 1.6
+    """Blur of the first scale."""
 
 
 class SiftOptions(DogOptions):

@@ -38,8 +38,13 @@ class CameraOptions(Options):
     """How images share cameras (COLMAP's camera modes, models and parameters)."""
 
     mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
+    """Which images share a camera. ``auto``: as ``cameras_path`` says, else those of one body,
+    lens, focal length and size by EXIF; without EXIF each has its own, unless matches show that
+    images of one size share one."""
     model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the camera model."""
     params: str = ""
+    """Known intrinsics in COLMAP's order, separated by commas; empty if they are not known."""
     default_focal_length_factor: Annotated[float, within(0.01, 100.0)] = 1.2
     """Focal length in units of the longer side where EXIF has none."""
     ignore_exif: bool = False
@@ -47,9 +52,10 @@ class CameraOptions(Options):
     cameras_path: str = ""
     """COLMAP model, or CSV table by image name, with cameras that are known; empty for none."""
     focal_length_px: Annotated[float, within(0.0, 1e7)] = 0.0
-    """Of all images that ``cameras_path`` does not name; 0 if it is not known."""
+    """Focal length of all images that ``cameras_path`` does not name; 0 if it is not known."""
     focal_mm: Annotated[float, within(0.0, 1e5)] = 0.0
-    """Of the lens of all images whose focal length nothing else says; 0 if it is not known."""
+    """Focal length of the lens of all images of which nothing else tells one; 0 if it is not
+    known. Needs ``film_width_mm``."""
     film_width_mm: Annotated[float, within(0.0, 1e5)] = 0.0
     """Longer side of what these images show of film, plate or sensor."""
     principal_point: str = ""

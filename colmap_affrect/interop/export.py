@@ -22,7 +22,7 @@ from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class Source:
 def export(
     model_path: PathLike,
     output_path: PathLike,
-    formats: Sequence[str] = (),
+    formats: str | Sequence[str] = (),
     *,
     image_path: PathLike | None = None,
     camera_model: str = "",
@@ -63,8 +63,8 @@ def export(
     Args:
         model_path: folder of a model, or the output folder of a run, whose largest model it is.
         output_path: folder for the files.
-        formats: some of ``FORMATS``; by default those of ``USUAL``, without text where COLMAP could
-            not read it back.
+        formats: one or some of ``FORMATS``, in a text separated by commas; by default those of
+            ``USUAL``, without text where COLMAP could not read it back.
         image_path: the photographs to undistort, by default those of the run.
         camera_model: of ``text`` and ``cameras``, fitted to the cameras; empty: their own.
         note: is told how well that fits.
@@ -75,11 +75,10 @@ def export(
     Raises:
         AffrectError: a format cannot hold the model, or a file exists; nothing is written then.
     """
-    model_path, output_path = model_folder(as_path(model_path)), as_path(output_path)
-    image_path = as_path(image_path) if image_path else None
-    for name in formats:
-        if name not in FORMATS:
-            raise OptionError(f"--format {name}: unknown{suggestion(name, FORMATS)}")
+    model_path = model_folder(as_path(model_path, "model_path"))
+    output_path = as_path(output_path, "output_path")
+    image_path = as_path_or_none(image_path, "image_path")
+    formats = _checked_formats(formats)
     if image_path is not None and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
     photographs = image_path or Workspace(model_path.resolve().parent.parent).photographs()
@@ -96,6 +95,14 @@ def export(
         folder = made[0].parent
         written = {name: write(source, folder) for name, (write, _) in chosen.items()}
     return {name: output_path / path.relative_to(folder) for name, path in written.items()}
+
+
+def _checked_formats(given: str | Sequence[str]) -> list[str]:
+    formats = given.split(",") if isinstance(given, str) else list(given)
+    for name in formats:
+        if name not in FORMATS:
+            raise OptionError(f"--format {name}: unknown{suggestion(str(name), FORMATS)}")
+    return formats
 
 
 def _change_cameras(

@@ -52,17 +52,18 @@ from colmap_affrect.geometry.conventions import (
     pixel_from_colmap,
 )
 from colmap_affrect.images.photographs import CameraOptions, list_images, refuse_colliding_keys
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.given_matches import (
     GivenMatches,
     MatchType,
     given_matches,
 )
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
-from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.progress import Advance, GivenProgress, Progress
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.given_h5 import GivenFile, opened
 from colmap_affrect.project.outputs import leads_outside, new_results
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.stores import PairMatches, frame_datasets, hloc_matches, pair_key
 from colmap_affrect.stages.descriptors import Arrays, matched, unit_rows, write_given_matches
 
@@ -73,17 +74,25 @@ Datasets = dict[str, NDArray[Any]]
 SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
 
 
+@documented
 @dataclass(frozen=True)
-class InterchangeReport:
+class InterchangeReport(Summarized):
     """What was imported or exported."""
 
-    action: str  # ``imported`` or ``exported``
-    num_images: int  # in the database or the file, also those without features
+    action: str
+    """``imported`` or ``exported``."""
+    num_images: int
+    """Images in the database or the file, also those without features."""
     num_keypoints: int
+    """Keypoints of all images."""
     num_pairs: int
+    """Pairs of images with matches."""
     num_matches: int
-    num_verified: int | None  # pairs with a two-view geometry; None if not asked for
-    left_out: Mapping[str, Sequence[str]]  # names by what happened to them
+    """Matches of all pairs."""
+    num_verified: int | None
+    """Pairs with a two-view geometry; None if not asked for."""
+    left_out: Mapping[str, Sequence[str]]
+    """Names by what happened to them."""
 
     def summary(self) -> str:
         """Return a line of numbers, and one for each note."""
@@ -115,10 +124,10 @@ def import_h5(
     *,
     match_type: MatchType = "raw",
     match_list_path: PathLike | None = None,
-    cameras: CameraOptions | None = None,
+    cameras: CameraOptions | Mapping[str, Any] | None = None,
     skip_verification: bool = False,
     random_seed: int = 0,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
 ) -> InterchangeReport:
     """Make a new COLMAP database from features and matches of other programs.
 
@@ -146,15 +155,17 @@ def import_h5(
         OptionError: when the database exists.
         StoreError: for files that cannot be read, or contradict the photographs or each other.
     """
-    features_path, image_path = as_path(features_path), as_path(image_path)
-    database_path = as_path(database_path)
-    cameras = cameras or CameraOptions()
+    features_path = as_path(features_path, "features_path")
+    image_path = as_path(image_path, "image_path")
+    database_path = as_path(database_path, "database_path")
+    cameras = CameraOptions.given(cameras, "cameras")
+    progress = Progress.given(progress)
     if matches_path and match_list_path:
         raise OptionError("--match-list-path: only without --matches-path: it says what to match")
     wanted = _Wanted(
-        as_path(matches_path) if matches_path else None,
+        as_path_or_none(matches_path, "matches_path"),
         match_type,
-        as_path(match_list_path) if match_list_path else None,
+        as_path_or_none(match_list_path, "match_list_path"),
         image_path,
         None if skip_verification else VerificationOptions(random_seed=random_seed),
     )
@@ -373,7 +384,7 @@ def export_h5(
     features_path: PathLike,
     matches_path: PathLike,
     *,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
 ) -> InterchangeReport:
     """Write features and raw matches of a COLMAP database, which stays as it is, for hloc.
 
@@ -381,8 +392,10 @@ def export_h5(
     have, are 1. Of several matches of a keypoint of the first image one is kept. Raises OptionError
     when a file exists, StoreError for names that hloc's layout cannot hold.
     """
-    paths = database_path, features_path, matches_path
-    database_path, features_path, matches_path = map(as_path, paths)
+    database_path = as_path(database_path, "database_path")
+    features_path = as_path(features_path, "features_path")
+    matches_path = as_path(matches_path, "matches_path")
+    progress = Progress.given(progress)
     if features_path.resolve() == matches_path.resolve():
         raise OptionError(f"{features_path}: features and matches need a file each")
     with open_copy(database_path) as database:

@@ -15,7 +15,7 @@ from colmap_affrect.errors import ImageError, NoModelError, OptionError
 from colmap_affrect.images.exif import read_camera_tags
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.interop import pycolmap_api as ours
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.outputs import refuse_link
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.workspace import Workspace
@@ -60,7 +60,7 @@ def reconstruct_panoramas(
     *,
     order: Order = "sequence",
     random_seed: int = 0,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
 ) -> dict[int, pycolmap.Reconstruction]:
     """Reconstruct panoramas of 360 x 180 degrees.
 
@@ -71,7 +71,7 @@ def reconstruct_panoramas(
             ``sparse_equirectangular``, the views into ``images`` and ``masks``.
         order: match panoramas that follow each other by name, or all.
         random_seed: of mapping.
-        progress: where to show progress.
+        progress: True, False, or None for where somebody looks at it.
 
     Returns:
         The models of the panoramas, by the number of their folder.
@@ -81,7 +81,9 @@ def reconstruct_panoramas(
         OptionError: when ``output_path`` holds something else.
         NoModelError: when no two panoramas can be registered.
     """
-    image_path, output_path = as_path(image_path), as_path(output_path)
+    image_path = as_path(image_path, "image_path")
+    output_path = as_path(output_path, "output_path")
+    progress = Progress.given(progress)
     names = list_images(image_path)
     _check(image_path, names)
     _check_output(image_path, output_path)

@@ -27,10 +27,12 @@ class MapperOptions(PartOptions, PresetOptions):
     ignore_two_view_tracks: bool = False
     """COLMAP's True leaves sparse sets without a model: there most tracks have two views."""
     min_model_size: Annotated[int, within(2, 1_000_000)] = 2
+    """Models of fewer images are dropped."""
     keep_given_intrinsics: bool = True
     """Leave camera parameters that the user gave as they are; refining them on a few images of a
     sparse set moves them far away."""
     random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
+    """Of all that mapping leaves to chance; -1: another one each time."""
     mapper_options: dict[str, Any] = Field(default_factory=dict)
     """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
     over those above."""
@@ -118,4 +120,6 @@ MAPPERS: Registry[Mapper] = Registry(
         "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },
     default="sparse",
+    protocol=Mapper,
+    options_base=MapperOptions,
 )

@@ -5,9 +5,10 @@ and cameras, poses and points are moved into a reconstruction with the ids of th
 """
 
 import hashlib
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,18 +18,20 @@ from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import model_folder, read_given_model
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.project.paths import TakesPaths
+from colmap_affrect.options import Options
+from colmap_affrect.project.paths import GivenPath
 from colmap_affrect.project.regular_files import read_regular
 
 SAME_POSE = 1e-6  # largest difference of elements of two poses that are the same: quaternions round
 
 
-@dataclass(frozen=True)
-class Extension(TakesPaths):
-    """What is to be extended, and how."""
+class Extension(Options):
+    """A finished model that photographs are registered into."""
 
-    model_path: Path  # folder of a COLMAP model, text or binary
-    refine_existing: bool = False  # its poses and cameras may move; else they stay as they are
+    model_path: GivenPath
+    """Folder of a COLMAP model, text or binary."""
+    refine_existing: bool = False
+    """Whether its poses and cameras may move; else they stay as they are."""
 
     def refuse_discarding(self, output_path: Path) -> None:
         """Raise OptionError for a model in a folder whose results are to be discarded first."""
@@ -44,6 +47,15 @@ class Extension(TakesPaths):
         for path in sorted(model_folder(self.model_path).glob("*.[bt][ix][nt]")):
             found.update(read_regular(path))
         return found.hexdigest()
+
+
+def as_extension(given: Any) -> Any:
+    """Return what a function is given as ``extend``; a path is that of the model."""
+    if isinstance(given, Mapping):
+        return Extension(**given)
+    if given is None or isinstance(given, Extension):
+        return given
+    return Extension(model_path=given)
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,14 @@ class PipelineOptions(MapperOptions):
     """Options of COLMAP's incremental pipeline."""
 
     init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
+    """Smallest angle between the rays of a point, in the first pair of images."""
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50
+    """Fewest inliers of the first pair of images."""
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12
+    """Fewest points that an image is registered by."""
     max_focal_length_ratio: Annotated[float, within(1.0, 1000.0)] = 30.0
-    """Longer sides; COLMAP's 10 leaves nothing of the photographs of a narrow lens."""
+    """Longest focal length, in longer sides of the image; COLMAP's 10 leaves nothing of the
+    photographs of a narrow lens."""
 
     COLMAP: ClassVar[Mapping[str, Any]] = {
         "ignore_two_view_tracks": True,

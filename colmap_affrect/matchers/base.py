@@ -90,6 +90,8 @@ MATCHERS: Registry[Matcher] = Registry(
         "lightglue": "colmap_affrect.matchers.lightglue:LightGlue",
     },
     default="nearest",
+    protocol=Matcher,
+    options_base=MatcherOptions,
 )
 
 

@@ -10,6 +10,7 @@ from importlib import metadata
 from typing import Any
 
 from colmap_affrect.errors import such_as
+from colmap_affrect.options import Summarized, documented
 
 NUM_WORST = 3  # tie points that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
@@ -144,12 +145,15 @@ def by_story(stories: Mapping[str, str]) -> list[str]:
     return [f"{such_as(same, MAX_LINES)}: {story}" for story, same in names.items()]
 
 
+@documented
 @dataclass(frozen=True)
 class Advice:
     """What may help."""
 
     why: str
-    command: str = ""  # for a shell; empty where none does it
+    """What it would be good for."""
+    command: str = ""
+    """Command for a shell; empty where none does it."""
 
 
 LEVELS = {  # how pairs are matched again, by the kind of the level
@@ -158,13 +162,17 @@ LEVELS = {  # how pairs are matched again, by the kind of the level
 }  # fmt: skip
 
 
+@documented
 @dataclass(frozen=True)
 class MatchedAgain:
     """Pairs that were, or might be, matched again in one way."""
 
-    kind: str  # of the level, a key of ``LEVELS``
+    kind: str
+    """Kind of the level that matched them, a key of ``LEVELS``."""
     num_pairs: int
-    core_s: float  # about how many seconds of one core that takes
+    """How many pairs."""
+    core_s: float
+    """Seconds of one core that this takes, roughly."""
 
     def text(self) -> str:
         """Return a few words."""
@@ -172,16 +180,23 @@ class MatchedAgain:
         return f"{LEVELS.get(self.kind, self.kind)} {self.num_pairs} {pairs}"
 
 
+@documented
 @dataclass(frozen=True)
-class StageReport:
+class StageReport(Summarized):
     """One stage of a run."""
 
-    name: str  # extract, pairs, match, verify, escalate, guide or map
+    name: str
+    """``extract``, ``pairs``, ``match``, ``verify``, ``escalate``, ``guide`` or ``map``."""
     wall_s: float
-    num_done: int  # images, pairs, cameras or models made now
-    num_kept: int = 0  # those found done already
-    failures: dict[str, str] = field(default_factory=dict)  # image name to reason
-    warnings: dict[str, str] = field(default_factory=dict)  # to what went less well than asked
+    """Seconds that it took."""
+    num_done: int
+    """Images, pairs, cameras or models that were made now."""
+    num_kept: int = 0
+    """Those that were there already."""
+    failures: dict[str, str] = field(default_factory=dict)
+    """Why images cannot be used, by their names."""
+    warnings: dict[str, str] = field(default_factory=dict)
+    """What went less well than asked for, by what it is about."""
 
     def summary(self) -> str:
         """Return one line."""
@@ -201,14 +216,19 @@ def summed(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
     return tuple(found.values())
 
 
+@documented
 @dataclass(frozen=True)
 class Bridge:
     """How one verified pair registered an image, with its scale by the depths of neighbours."""
 
-    by: str  # the image of the pair that had been there
-    num_agreeing: int  # depths that agree on the scale
-    num_ratios: int  # depths compared
-    scale_error_frac: float  # standard error of the scale
+    by: str
+    """The other image of the pair, which was registered before."""
+    num_agreeing: int
+    """Depths that agree on the scale."""
+    num_ratios: int
+    """Depths compared."""
+    scale_error_frac: float
+    """Standard error of the scale."""
 
     def text(self) -> str:
         """Return a few words."""
@@ -216,33 +236,52 @@ class Bridge:
         return f"bridged by {self.by}, {agreeing}, scale +-{self.scale_error_frac:.1%}"
 
 
+@documented
 @dataclass(frozen=True)
 class Residual:
     """How far a tie point is from where the model sees it, in px of the photograph."""
 
     point: str
+    """Name of the tie point."""
     image: str
+    """Name of the photograph."""
     error_px: float
+    """Distance from the mark to where the model sees the point."""
 
 
+@documented
 @dataclass(frozen=True)
 class ModelSummary:
     """One COLMAP model; mappings are by image name."""
 
     registered_names: tuple[str, ...]
+    """Names of the registered images."""
     num_points3D: int
+    """Number of points."""
     mean_track_length: float
-    mean_reprojection_error_px: float  # over observations
-    probabilities: dict[str, float] = field(default_factory=dict)  # to be right within 5 degrees
-    gains: dict[str, float] = field(default_factory=dict)  # what more matches may add to these
-    doubtful: dict[str, str] = field(default_factory=dict)  # rather wrong than right: why
-    unsure: dict[str, str] = field(default_factory=dict)  # between doubtful and sure: why
-    bridges: dict[str, Bridge] = field(default_factory=dict)  # in no track through three images
-    taken_out: dict[str, str] = field(default_factory=dict)  # surely wrong: why
-    focals_px: dict[str, float] = field(default_factory=dict)  # of the cameras of the images
-    moves: tuple[str, ...] = ()  # what made the model, by the sparse mapper
-    tie_points: tuple[Residual, ...] = ()  # those by hand, the worst first
-    one_view: tuple[tuple[str, str], ...] = ()  # prints of one negative, or from one place
+    """Images that see a point, on average."""
+    mean_reprojection_error_px: float
+    """Mean over all observations."""
+    probabilities: dict[str, float] = field(default_factory=dict)
+    """Probability of each image that its pose is right within 5 degrees."""
+    gains: dict[str, float] = field(default_factory=dict)
+    """What more matches may add to these probabilities."""
+    doubtful: dict[str, str] = field(default_factory=dict)
+    """Why images are rather wrong than right."""
+    unsure: dict[str, str] = field(default_factory=dict)
+    """Why images are neither sure nor doubtful."""
+    bridges: dict[str, Bridge] = field(default_factory=dict)
+    """How images came in that are in no track through three images."""
+    taken_out: dict[str, str] = field(default_factory=dict)
+    """Why images that were surely wrong were taken out."""
+    focals_px: dict[str, float] = field(default_factory=dict)
+    """Focal length of the camera of each image."""
+    moves: tuple[str, ...] = ()
+    """What made the model, by the sparse mapper."""
+    tie_points: tuple[Residual, ...] = ()
+    """Residuals of the tie points by hand, the worst first."""
+    one_view: tuple[tuple[str, str], ...] = ()
+    """Pairs of prints of one negative, or of photographs from one place."""
 
     @property
     def sure(self) -> tuple[str, ...]:
@@ -281,33 +320,50 @@ class ModelSummary:
         ]
 
 
+@documented
 @dataclass(frozen=True)
-class ReconstructionReport:
+class ReconstructionReport(Summarized):
     """A whole run; numbers of points and tracks are those of the largest model."""
 
     images_total: int
-    # image name to reason: unreadable, no features, no verified pair, not registered (with its
-    # best pairs), taken out, or in another model
+    """Number of photographs."""
     unregistered: dict[str, str]
-    models: tuple[ModelSummary, ...]  # largest first, as written to sparse/0, sparse/1, ...
+    """Why images are in no model or in a smaller one, by their names."""
+    models: tuple[ModelSummary, ...]
+    """The models, the largest first, as written to ``sparse/0``, ``sparse/1`` and so on."""
     num_verified_pairs: int
+    """Pairs with a two-view geometry."""
     num_pairs: int
+    """Pairs that were to be matched."""
     stages: tuple[StageReport, ...]
+    """What each stage did, and how long that took."""
     recipe: str
+    """Name of the recipe; empty for the database of another program."""
     versions: dict[str, str]
-    preset: str  # of mapping: ``sparse``, ``colmap`` or ``custom``
-    verification: dict[str, Any]  # options of two-view geometry
-    mapping: dict[str, Any]  # the mapper and its options
-    extended: tuple[str, ...] = ()  # names of the images of the model that was extended, if any
-    advice: tuple[Advice, ...] = ()  # what to try for images that are missing or doubtful
-    # ``pairs`` that guided matching gave more inliers, and these inliers ``matches_before`` and
-    # ``matches_after``; empty where no pair needed it
+    """Versions of Python and of the packages that decide results."""
+    preset: str
+    """Preset of mapping: ``sparse``, ``colmap`` or ``custom``."""
+    verification: dict[str, Any]
+    """Options of two-view geometry."""
+    mapping: dict[str, Any]
+    """The mapper and its options."""
+    extended: tuple[str, ...] = ()
+    """Names of the images of the model that was extended, if any."""
+    advice: tuple[Advice, ...] = ()
+    """What to try for images that are missing or doubtful."""
     guided: dict[str, int] = field(default_factory=dict)
-    cameras: tuple[dict[str, Any], ...] = ()  # see ``CameraRecord.to_report``
-    by_hand: tuple[str, ...] = ()  # what was done otherwise than matches alone say
-    effort: str = ""  # how much was tried for images in need; empty where nothing had to be
-    matched_again: tuple[MatchedAgain, ...] = ()  # for images that were in need
-    untried: tuple[MatchedAgain, ...] = ()  # what a greater effort would try for those that are
+    """``pairs`` that guided matching gave more inliers, and these inliers
+    ``matches_before`` and ``matches_after``; empty where no pair needed it."""
+    cameras: tuple[dict[str, Any], ...] = ()
+    """The cameras, and where their focal lengths are from."""
+    by_hand: tuple[str, ...] = ()
+    """What was done otherwise than matches alone say."""
+    effort: str = ""
+    """How much was tried for images in need; empty where nothing had to be."""
+    matched_again: tuple[MatchedAgain, ...] = ()
+    """How pairs of images in need were matched again."""
+    untried: tuple[MatchedAgain, ...] = ()
+    """What a greater effort would try for images that are in need."""
 
     @property
     def status(self) -> str:

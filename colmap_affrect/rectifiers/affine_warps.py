@@ -4,7 +4,7 @@
 the paper's DenseAffNet (Sec. 3) with an exchangeable shape source.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ class IdentityOptions(base.RectifierOptions):
     """No warps."""
 
     name: Literal["identity"] = "identity"
+    warps: ClassVar[base.Warps] = "none"
 
 
 class Identity(base.WithInputs):
@@ -41,6 +42,7 @@ class AsiftOptions(base.AffineWarpOptions):
     """The same warps of the whole image for every photograph."""
 
     name: Literal["asift"] = "asift"
+    warps: ClassVar[base.Warps] = "all tilts"
     covering: Literal["near-optimal", "asift"] = "near-optimal"
     """``near-optimal``: 24 maps that with the identity cover all tilts to 5.8 (Rodriguez et al.
     2018); ``asift``: the 60 of ASIFT with tilts to 8 (Morel & Yu 2009, the paper)."""
@@ -61,6 +63,7 @@ class AffNetShapesOptions(base.CoverOptions):
     """The whole photograph is warped by every covering map of its shapes."""
 
     name: Literal["affnet-shapes"] = "affnet-shapes"
+    warps: ClassVar[base.Warps] = "some"
 
 
 class AffNetShapes(base.WithInputs):
@@ -100,6 +103,7 @@ class DenseShapesOptions(base.CoverOptions):
     """Each block of the photograph is warped by the covering map nearest to its shape."""
 
     name: Literal["dense-shapes"] = "dense-shapes"
+    warps: ClassVar[base.Warps] = "some"
     min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.02
     """Regions of a smaller share of the image are not warped."""
     min_part_frac: Annotated[float, within(0.0, 1.0)] = 0.002

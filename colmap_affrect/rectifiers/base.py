@@ -6,7 +6,7 @@ object.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from pydantic import BeforeValidator, SerializeAsAny
@@ -37,9 +37,16 @@ class RectifierInputs:
     depth: DepthMaps | None = None  # None if the recipe needs no depth
 
 
+Warps = Literal["none", "some", "all tilts"]
+"""Which views a rectifier adds to a photograph: none; those that its content or its depth asks
+for; all tilts, whatever the photograph shows."""
+
+
 class RectifierOptions(PartOptions):
     """Base of the options of all rectifiers."""
 
+    warps: ClassVar[Warps]
+    """Every rectifier declares it: what matching its views again costs and brings hangs on it."""
     uses_depth: ClassVar[bool] = False
     """Whether it reads a depth map of every photograph."""
 
@@ -129,4 +136,6 @@ RECTIFIERS: Registry[Rectifier] = Registry(
         "dense-shapes": "colmap_affrect.rectifiers.affine_warps:DenseShapes",
     },
     default="dense-shapes",
+    protocol=Rectifier,
+    options_base=RectifierOptions,
 )

@@ -19,7 +19,7 @@ from colmap_affrect.geometry import planes
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.options import Options, within
-from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, WithInputs
+from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, Warps, WithInputs
 from colmap_affrect.rectifiers.regions import Region, homography_rectification
 
 MAX_DEPTH_SIZE_PX = 640
@@ -45,6 +45,7 @@ class PlaneOptions(Options):
     min_separation_deg: Annotated[float, within(0.0, 180.0)] = 87.5
     """Planes are at least this far apart."""
     max_num_planes: Annotated[int, within(1, 100)] = 3
+    """Most planes of a photograph."""
     min_votes_frac: Annotated[float, within(0.0, 1.0)] = 0.15
     """Share of the pixels that a plane must have."""
     max_angle_deg: Annotated[float, within(0.0, 85.0)] = 75.0
@@ -57,7 +58,9 @@ class DepthPlanesOptions(RectifierOptions):
     """One homography per planar region, as if seen from the front."""
 
     name: Literal["depth-planes"] = "depth-planes"
+    warps: ClassVar[Warps] = "some"
     planes: PlaneOptions = PlaneOptions()
+    """How planes are found in a depth map."""
     keep_original: Literal["everywhere", "outside"] = "everywhere"
     """Features of the photograph itself are kept ``everywhere`` or ``outside`` of the rectified
     regions (the paper)."""
@@ -171,7 +174,9 @@ class DepthAffNetOptions(CoverOptions):
     """Planar regions from depth, each warped by a cover of the shapes inside it."""
 
     name: Literal["depth-affnet"] = "depth-affnet"
+    warps: ClassVar[Warps] = "some"
     planes: PlaneOptions = PlaneOptions()
+    """How planes are found in a depth map."""
     uses_depth: ClassVar[bool] = True
 
 

@@ -31,7 +31,7 @@ from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.outputs import database_files
-from colmap_affrect.project.paths import TakesPaths, resolved
+from colmap_affrect.project.paths import GivenPath, resolved
 from colmap_affrect.project.record import Content, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
@@ -142,12 +142,13 @@ def source_files(path: Path) -> list[Path]:
     return sorted(file for file in files if file.is_file() and not file.name.endswith("-shm"))
 
 
-@dataclass(frozen=True)
-class Resources(TakesPaths):
+class Resources(Options):
     """What is needed from outside and does not change results."""
 
-    weights_path: Path | None = None  # folder with the weights of networks; None: the usual places
-    device: str = "auto"  # of networks and of matching: auto, cpu, cuda, cuda:1, mps
+    weights_path: GivenPath | None = None
+    """Folder with the weights of networks; None: the usual places."""
+    device: str = "auto"
+    """Of networks and of matching: ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``."""
 
     def require_device(self, *, uses_network: bool = False) -> str:
         """Return the device, if it is there; torch is loaded only to ask for one or use it."""

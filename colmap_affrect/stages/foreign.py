@@ -22,7 +22,6 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.given_matches import MatchType, given_matches
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.project.paths import TakesPaths
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.session.context import Context, source_files
@@ -38,7 +37,7 @@ Records = dict[int, CameraRecord]
 
 
 @dataclass(frozen=True)
-class ForeignDatabase(TakesPaths):
+class ForeignDatabase:
     """A database of another program, and what is known beside it."""
 
     path: Path

@@ -129,7 +129,7 @@ def main() -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     paths = sorted(arguments.image_path.iterdir())[: arguments.num_images]
     methods = [parse_method(text) for text in arguments.methods]
-    resources = Resources(arguments.weights)
+    resources = Resources(weights_path=arguments.weights)
     commands: dict[str, list[Row]] = {method.label: [] for method in methods}
     for _ in range(arguments.num_rounds):
         for method in methods:

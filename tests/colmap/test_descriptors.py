@@ -61,7 +61,7 @@ def test_colmap_matches_what_float_descriptors_match(tmp_path: Path) -> None:
     expected, found = float_matches(first, second), colmap_matches(path)
     assert len(expected) > 500
     old = tmp_path / "old.db"
-    assert export_database(path, old, store) == 2
+    assert export_database(path, old, descriptors=True) == 2
     with open_database(path) as database, closing(sqlite3.connect(old)) as copied:
         data = copied.execute("SELECT data FROM descriptors WHERE image_id = 1").fetchone()[0]
         assert data == np.asarray(database.read_descriptors(1).data).tobytes()

@@ -91,7 +91,7 @@ def extended(
 ) -> tuple[pycolmap.Reconstruction, list[int]]:
     """Write a model into a folder and extend it; return the result and what progress showed."""
     shown: list[int] = []
-    existing = read_existing(Extension(written(old, folder / at), **options), database)
+    existing = read_existing(Extension(model_path=written(old, folder / at), **options), database)
     task = MappingTask(database, None, extend=existing)
     (model,) = map_database(mapper_of("incremental"), task, folder / "sparse", shown.append)
     assert len(model.registered_names) == NUM_IMAGES
@@ -173,7 +173,7 @@ def test_rigs_get_the_poses_of_their_cameras(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     truth = synthesize(path, **SCENE | {"num_rigs": 1, "num_cameras_per_rig": 2})
     single = with_other_ids(truth)
-    existing = read_existing(Extension(written(single, tmp_path / "old")), path)
+    existing = read_existing(Extension(model_path=written(single, tmp_path / "old")), path)
     for name, pose in poses(existing.reconstruction).items():
         np.testing.assert_allclose(pose, poses(truth)[name], atol=1e-9)
     assert existing.reconstruction.num_reg_frames() == 5
@@ -228,10 +228,10 @@ def test_model_that_does_not_fit_is_one_clear_line(
 ) -> None:
     path = broken(old, kind, tmp_path / "old")
     with pytest.raises(AffrectError, match=message) as error:
-        read_existing(Extension(path), database)
+        read_existing(Extension(model_path=path), database)
     assert "\n" not in str(error.value)
     with pytest.raises(AffrectError, match="not a COLMAP model"):
-        read_existing(Extension(tmp_path), database)
+        read_existing(Extension(model_path=tmp_path), database)
 
 
 def stop_after(number: int, token: pycolmap.CancellationToken) -> Any:

@@ -20,6 +20,7 @@ from mapping_tasks import (
 from small_scene import NAMES, write_photographs
 from verified import verified
 
+import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
@@ -33,7 +34,7 @@ from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.reliability import Judgement
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
-from colmap_affrect.pipeline import map_and_report, map_from_database
+from colmap_affrect.pipeline import map_and_report
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
@@ -132,8 +133,11 @@ def test_mapper_that_cannot_extend_says_so_before_anything_is_made(tmp_path: Pat
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=2, num_points3D=60)
     with pytest.raises(OptionError, match=r"the global mapper cannot; use .*mapper sparse"):
-        map_from_database(
-            path, tmp_path / "out", mapping=GlobalOptions(), extend=Extension(tmp_path / "model")
+        colmap_affrect.map_database(
+            path,
+            tmp_path / "out",
+            mapping=GlobalOptions(),
+            extend=Extension(model_path=tmp_path / "model"),
         )
     assert not (tmp_path / "out").exists()
 

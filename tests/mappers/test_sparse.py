@@ -202,7 +202,7 @@ def tied(
             lines.append(f"{name},p{number},{y + 0.8 * shift:.2f},{x + 0.6 * shift:.2f}")
     table.write_text("\n".join(lines) + "\n")
     mapped_path, output_path = path.with_name("mapped.db"), path.with_name("models")
-    tie_points = ByHand(table).copy_database(path, mapped_path)
+    tie_points = ByHand(tie_points_path=table).copy_database(path, mapped_path)
     output_path.mkdir()
     task = task_with_given_cameras(mapped_path, tie_points=tie_points)
     return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None), task

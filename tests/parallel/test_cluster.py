@@ -240,7 +240,11 @@ def extracted(photos: Path, weights: Path, tmp_path_factory: pytest.TempPathFact
     """An output folder before matching."""
     out = tmp_path_factory.mktemp("out")
     with Workspace(out).locked() as workspace:
-        extract(Context(workspace, Resources(weights, "cpu")), Inputs.of(photos), WITH_NETWORK)
+        extract(
+            Context(workspace, Resources(weights_path=weights, device="cpu")),
+            Inputs.of(photos),
+            WITH_NETWORK,
+        )
         choose_pairs(Context(workspace))
     return out
 
@@ -252,7 +256,7 @@ def matched(
     if not out.exists():
         shutil.copytree(extracted, out)
     with Workspace(out).locked() as workspace:
-        match(Context(workspace, Resources(weights, "cpu"), executor))
+        match(Context(workspace, Resources(weights_path=weights, device="cpu"), executor))
     return hdf5_content(Workspace(out).matches)
 
 
@@ -275,7 +279,7 @@ def test_threads_one_pair_alone_and_a_resumed_run_find_the_same(
 ) -> None:
     expected = matched(tmp_path / "one", extracted, weights, Threads(1))
     assert matched(tmp_path / "two", extracted, weights, Threads(2)) == expected
-    context = Context(Workspace(tmp_path / "one"), Resources(weights, "cpu"))
+    context = Context(Workspace(tmp_path / "one"), Resources(weights_path=weights, device="cpu"))
     pairs = context.listed_pairs()
     assert sum(len(found.scores) for found in context.matches.read(pairs)) > 50
     matching = Matching(

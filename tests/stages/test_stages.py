@@ -175,7 +175,7 @@ def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.M
     bridged = {lost: Bridge(NAMES[1], 5, 9, 0.2)}
     alone = replace(model, doubtful={lost: f"bridged by {NAMES[1]} alone"}, bridges=bridged)
     assert commands([], alone) == [f"{again} --reject-pair '{lost},{NAMES[1]}'"]
-    said = replace(context, by_hand=ByHand(Path("t.csv")), command=())
+    said = replace(context, by_hand=ByHand(tie_points_path=Path("t.csv")), command=())
     (_, tie_points, _) = advice(said, [lost], [model], 0)
     assert tie_points.why.startswith("no point of t.csv is seen by two photographs of one model")
     assert tie_points.command.startswith("colmap-affrect map --output-path ")
@@ -343,9 +343,9 @@ def test_features_of_another_number_than_in_the_database_are_refused(
 
 
 @pytest.mark.parametrize(("values", "message"), [
-    ({"effort": "hihg"}, "effort 'hihg' is not one of low, normal, high"),
-    ({"max_minutes": -1.0}, "max_minutes -1.0: must be at least 0"),
-    ({"max_minutes": float("nan")}, "max_minutes nan: must be at least 0"),
+    ({"effort": "hihg"}, "effort='hihg': should be 'low', 'normal' or 'high'"),
+    ({"max_minutes": -1.0}, "max_minutes=-1.0: should be greater than or equal to 0"),
+    ({"max_minutes": float("nan")}, "max_minutes=nan: should be greater than or equal to 0"),
 ])  # fmt: skip
 def test_run_options_that_mean_nothing_are_refused_at_once(
     values: dict[str, Any], message: str
