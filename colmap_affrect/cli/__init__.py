@@ -24,7 +24,8 @@ def main(
 ) -> int:
     """Run the command line and return the exit code.
 
-    ``begin`` is called when everything is loaded, before the command begins to work.
+    ``begin`` is called when everything is loaded, before the command begins to work. Ctrl-C goes on
+    to the caller, as KeyboardInterrupt.
     """
     errors.AffrectError.names_flags = True
     try:
