@@ -13,6 +13,7 @@ import numpy as np
 import pyceres
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.tie_points import TiePoints
 
@@ -123,9 +124,24 @@ def _refine(
         config.add_image(image_id)
     for point_id in sorted(held):
         config.add_constant_point(point_id)
+    poses = _pose_parameters(model)
+    before = [pose.copy() for pose in poses]
     problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
     solver = pyceres.SolverOptions()
     solver.max_num_iterations = MAX_ITERATIONS
     solver.num_threads = 1
     solver.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
     pyceres.solve(solver, problem, pyceres.SolverSummary())
+    for pose, known in zip(poses, before, strict=True):
+        pose[:] = known  # COLMAP makes quaternions of length 1 again, which may change a last bit
+
+
+def _pose_parameters(model: pycolmap.Reconstruction) -> list[Array]:
+    """Return the parameters of the poses of frames, and of the sensors in rigs, as the model's."""
+    found = [model.frames[key].rig_from_world.params for key in sorted(model.reg_frame_ids())]
+    for rig_id in sorted(model.rigs):
+        rig = model.rigs[rig_id]
+        for sensor, pose in rig.non_ref_sensors.items():
+            if pose is not None:
+                found.append(rig.sensor_from_rig(sensor).params)
+    return found
