@@ -80,11 +80,11 @@ class Panel:
             cv2.polylines(self.image, [outline], True, colors[index], 1, cv2.LINE_AA)
 
     def draw_labels(self, labels: Mapping[Point, str]) -> None:
-        """Write texts at points of the image, pixel-centre px."""
+        """Draw texts at points of the image, pixel-centre px."""
         for point, text in labels.items():
             in_panel = project(self.panel_from_image, np.array([point]))[0]
             x, y = np.rint(in_panel).astype(int).tolist()
-            write_text(self.image, text, (x, y))
+            draw_text(self.image, text, (x, y))
 
 
 def row_of(panels: Sequence[Panel], per_row: int) -> ColorImage:
@@ -95,7 +95,7 @@ def row_of(panels: Sequence[Panel], per_row: int) -> ColorImage:
         left = index * WIDTH_PX // per_row
         right = left + panel.image.shape[1]
         row[TITLE_PX : TITLE_PX + len(panel.image), left:right] = panel.image
-        write_text(row, panel.title, (left + MARGIN_PX, TITLE_PX - TITLE_BASELINE_PX))
+        draw_text(row, panel.title, (left + MARGIN_PX, TITLE_PX - TITLE_BASELINE_PX))
     return row
 
 
@@ -104,8 +104,8 @@ def text_row(text: str) -> ColorImage:
     return row_of([Panel(np.zeros((0, WIDTH_PX, 3), np.uint8), text)], 1)
 
 
-def write_text(image: ColorImage, text: str, position: tuple[int, int]) -> None:
-    """Write a text, black with a white outline.
+def draw_text(image: ColorImage, text: str, position: tuple[int, int]) -> None:
+    """Draw a text, black with a white outline.
 
     Args:
         image: (H, W, 3) uint8, changed in place.
