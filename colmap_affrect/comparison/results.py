@@ -5,7 +5,7 @@ Registered is not correct: poses are held against ground truth where there is on
 
 import itertools
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from statistics import fmean, median
@@ -117,48 +117,57 @@ class SeedResult:
         return self.models[0] if self.models else ()
 
 
+Value = Callable[[SeedResult], float | None]
+
+
 @dataclass(frozen=True)
 class Measure:
     """A number of every seed, and how tables write it."""
 
     title: str  # of its column
+    value: Value  # None where a seed has no such number
     digits: int = 1  # decimals, where not all values are whole
 
 
+def _of_model(name: str) -> Value:
+    """Return what tells a number of the largest model, where there is one."""
+    return lambda seed: getattr(seed, name) if seed.models else None
+
+
+def _num_correct(seed: SeedResult) -> float | None:
+    return len(seed.scores.correct_names) if seed.scores else None
+
+
+def _median_rotation_error_deg(seed: SeedResult) -> float | None:
+    return seed.scores.median_rotation_error_deg if seed.scores else None
+
+
+def _num_sure(seed: SeedResult) -> float | None:
+    """Return how many images are sure, where no truth tells more."""
+    return None if seed.scores else len(seed.sure)
+
+
+def _num_doubtful(seed: SeedResult) -> float | None:
+    return None if seed.scores else len(seed.doubtful)
+
+
 MEASURES = {
-    "registered": Measure("registered"),
-    "correct": Measure("correct"),
-    "num_sure": Measure("sure"),
-    "num_doubtful": Measure("doubtful"),
-    "verified_pairs": Measure("pairs"),
-    "points3D": Measure("points", 0),
-    "mean_track_length": Measure("track", 2),
-    "mean_reprojection_error_px": Measure("px", 2),
-    "median_rotation_error_deg": Measure("degrees", 2),
+    "registered": Measure("registered", lambda seed: len(seed.registered_names)),
+    "correct": Measure("correct", _num_correct),
+    "num_sure": Measure("sure", _num_sure),
+    "num_doubtful": Measure("doubtful", _num_doubtful),
+    "verified_pairs": Measure("pairs", lambda seed: seed.verified_pairs),
+    "points3D": Measure("points", _of_model("points3D"), 0),
+    "mean_track_length": Measure("track", _of_model("mean_track_length"), 2),
+    "mean_reprojection_error_px": Measure("px", _of_model("mean_reprojection_error_px"), 2),
+    "median_rotation_error_deg": Measure("degrees", _median_rotation_error_deg, 2),
 }
 """Numbers of every seed, by their names in JSON."""
 
 
 def measured(seed: SeedResult) -> dict[str, float | None]:
-    """Return the values of ``MEASURES``, None where a seed has no such number.
-
-    With ground truth it counts how many images are correct, without how many are of high
-    confidence.
-    """
-    values: dict[str, float | None] = dict.fromkeys(MEASURES)
-    values["registered"] = len(seed.registered_names)
-    values["verified_pairs"] = seed.verified_pairs
-    if seed.models:
-        values["points3D"] = seed.points3D
-        values["mean_track_length"] = seed.mean_track_length
-        values["mean_reprojection_error_px"] = seed.mean_reprojection_error_px
-    if seed.scores:
-        values["correct"] = len(seed.scores.correct_names)
-        values["median_rotation_error_deg"] = seed.scores.median_rotation_error_deg
-    else:
-        values["num_sure"] = len(seed.sure)
-        values["num_doubtful"] = len(seed.doubtful)
-    return values
+    """Return the values of ``MEASURES``, None where a seed has no such number."""
+    return {key: measure.value(seed) for key, measure in MEASURES.items()}
 
 
 @dataclass(frozen=True)
