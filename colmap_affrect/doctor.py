@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
@@ -86,12 +87,15 @@ class Diagnosis:
         return json.dumps(content, indent=2, ensure_ascii=False)
 
 
+@checks_arguments
 def diagnose(path: PathLike | None = None, *, weights_path: PathLike | None = None) -> Diagnosis:
     """Examine the installation and, if a path is given, an output folder, a database or a model.
 
     OptionError when something that is given is not there.
     """
-    path, weights_path = (as_path(given) if given else None for given in (path, weights_path))
+    path, weights_path = (
+        None if given is None else as_path(given) for given in (path, weights_path)
+    )
     if path is not None and not path.exists():
         wanted = "give an output folder, a COLMAP database or the folder of a model"
         raise OptionError(f"{path}: no such file or folder; {wanted}")

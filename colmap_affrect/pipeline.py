@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks, SizeOf
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
@@ -20,7 +21,7 @@ from colmap_affrect.images.reading import header_size
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
-from colmap_affrect.options import EFFORT_NAMES, EffortName
+from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
@@ -86,12 +87,11 @@ class RunOptions(InputOptions):
     def __post_init__(self) -> None:
         """Refuse what would fail, or do nothing, once the first model is there."""
         super().__post_init__()
-        if self.effort not in EFFORT_NAMES:
-            raise OptionError(f"effort {self.effort!r} is not one of {', '.join(EFFORT_NAMES)}")
         if not self.max_minutes >= 0.0:
             raise OptionError(f"max_minutes {self.max_minutes!r}: must be at least 0")
 
 
+@checks_arguments
 def run(
     image_path: PathLike,
     output_path: PathLike,
@@ -198,6 +198,7 @@ def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> 
     return count if is_all else min(count, len(names) * options.num_neighbors)
 
 
+@checks_arguments
 def map_from_database(
     database_path: PathLike,
     output_path: PathLike,

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap.model_files import Poses, read_poses
 from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import parse_methods
@@ -33,6 +34,7 @@ from colmap_affrect.stages.context import Inputs
 NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
 
 
+@checks_arguments
 def compare(
     image_path: PathLike,
     output_path: PathLike,

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
@@ -33,7 +34,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, TakesPaths, as_path
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
@@ -47,7 +48,7 @@ NOTHING = np.zeros((0, 2)), np.zeros((0, 2))  # points of a pair that could not 
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
+class EvaluateOptions(TakesPaths):
     """Everything an evaluation depends on beside protocol, dataset and output folder."""
 
     recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")  # also by name
@@ -183,6 +184,7 @@ class RecipeRun:
         return len(estimate_geometry((first, second), rows, options, extracted_px).inlier_matches)
 
 
+@checks_arguments
 def evaluate(
     protocol: str,
     dataset_path: PathLike,

@@ -93,11 +93,13 @@ def without_duplicates(points1: Floats, points2: Floats, radius_px: float) -> Bo
     """Return whether (M, 2) matches, best first, are not near a better one, kept, at both ends."""
     rows, others = neighbors_within(points1, radius_px).of(np.arange(len(points1)))
     near = ((points2[rows] - points2[others]) ** 2).sum(axis=1) <= radius_px**2
-    near &= others < rows
+    near &= rows < others
+    better, worse = rows[near], others[near]  # ``better`` rises
+    starts = np.searchsorted(better, np.arange(len(points1) + 1))
     keep = np.ones(len(points1), dtype=bool)
-    for row, other in zip(rows[near], others[near], strict=True):
-        if keep[other]:
-            keep[row] = False
+    for row in np.unique(better):
+        if keep[row]:
+            keep[worse[starts[row] : starts[row + 1]]] = False
     return keep
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import model_folder, read_given_model, write_model
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
@@ -47,6 +48,7 @@ class Source:
         return sorted(images, key=lambda image: str(image.name))
 
 
+@checks_arguments
 def export(
     model_path: PathLike,
     output_path: PathLike,

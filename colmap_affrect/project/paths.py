@@ -4,18 +4,24 @@ import os
 from dataclasses import fields
 from pathlib import Path
 
+from colmap_affrect.argument_types import require_type, types_of_fields
 from colmap_affrect.errors import OptionError
 
 PathLike = str | os.PathLike[str]
 
 
 def as_path(given: PathLike) -> Path:
-    """Return a path; OptionError for bytes and anything else that is none."""
+    """Return a path; OptionError for bytes, an empty text and anything else that is none."""
     try:
-        return Path(given)
+        path = Path(given)
     except TypeError as error:
         kind = type(given).__name__
         raise OptionError(f"{given!r}: give a path as str or os.PathLike, not {kind}") from error
+    if not os.fspath(given):  # Path takes it for the current folder, and nobody means that
+        raise OptionError("an empty text is no path; the current folder is '.'")
+    if "\0" in str(path):
+        raise OptionError(f"{str(path)!r}: no path holds the character 0")
+    return path
 
 
 def resolved(path: Path) -> Path:
@@ -25,10 +31,12 @@ def resolved(path: Path) -> Path:
 
 
 class TakesPaths:
-    """Base of dataclasses whose fields of paths may be given as text."""
+    """Base of dataclasses that refuse values of a wrong type; paths may be given as text."""
 
     def __post_init__(self) -> None:
+        kinds = types_of_fields(type(self))
         for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if field.type in (Path, Path | None) and value is not None:
+            value, kind = getattr(self, field.name), kinds[field.name]
+            require_type(field.name, value, kind)
+            if kind in (Path, Path | None) and value is not None:
                 object.__setattr__(self, field.name, as_path(value))  # of a frozen one, too
