@@ -12,14 +12,13 @@ from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks, SizeOf
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
-from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
-from colmap_affrect.mappers.existing import Extension, existing_names
+from colmap_affrect.mappers.existing import Extension, existing_names, read_to_extend
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.given_matches import MatchType
@@ -242,7 +241,7 @@ def map_from_database(
     schema_version(database_path)  # refuses what is no database before anything is made
     _check_extension(extend, mapper, output_path, overwrite=overwrite)
     if extend:
-        read_given_model(extend.model_path, "--extend ")
+        read_to_extend(extend.model_path)
     sizes = read_sizes(database_path)
     _check_by_hand(by_hand, read_names(database_path), mapper, sizes.get)
     foreign = ForeignDatabase(
