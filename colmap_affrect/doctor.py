@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
@@ -22,7 +23,7 @@ from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, re
 from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.project.paths import PathLike, as_path_or_none
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
@@ -95,12 +96,13 @@ class Diagnosis(Summarized):
         return json.dumps(content, indent=2, ensure_ascii=False)
 
 
+@checks_arguments
 def diagnose(path: PathLike | None = None, *, weights_path: PathLike | None = None) -> Diagnosis:
     """Examine the installation and, if a path is given, an output folder, a database or a model.
 
     OptionError when something that is given is not there.
     """
-    path = as_path_or_none(path, "path")
+    path = None if path is None else as_path(path, "path")
     weights_path = as_path_or_none(weights_path, "weights_path")
     if path is not None and not path.exists():
         wanted = "give an output folder, a COLMAP database or the folder of a model"

@@ -11,7 +11,6 @@ from typing import Any, Unpack, get_args
 from colmap_affrect.colmap.by_hand import ByHand, Marks, SizeOf
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
-from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.escalation.climb import climb
@@ -20,7 +19,12 @@ from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
-from colmap_affrect.mappers.existing import Extension, as_extension, existing_names
+from colmap_affrect.mappers.existing import (
+    Extension,
+    as_extension,
+    existing_names,
+    read_to_extend,
+)
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.mend import watched
 from colmap_affrect.options import require_bools, takes_fields_of
@@ -415,7 +419,7 @@ def _check_foreign(
     schema_version(foreign.path)
     _check_extension(extend, mapper, context.workspace.path, overwrite=overwrite)
     if extend:
-        read_given_model(extend.model_path, "--extend ")
+        read_to_extend(extend.model_path)
     sizes = read_sizes(foreign.path)
     _check_by_hand(context.by_hand, read_names(foreign.path), mapper, sizes.get)
     foreign.check()

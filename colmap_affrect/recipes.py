@@ -12,6 +12,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import EXTRACTORS, FeatureOptions, NetworkOptions
 from colmap_affrect.features.sift import SiftOptions
@@ -21,6 +22,7 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.options import Options, suggestion, within
+from colmap_affrect.project.paths import as_path
 from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions, IdentityOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
 
@@ -241,13 +243,15 @@ GivenRecipe = Annotated[Recipe, BeforeValidator(as_recipe)]
 """Field of options that takes what :func:`as_recipe` takes."""
 
 
-def load_recipe(name: str, settings: str | Sequence[str] = ()) -> Recipe:
+@checks_arguments
+def load_recipe(name: str | PathLike[str], settings: str | Sequence[str] = ()) -> Recipe:
     """Load a recipe by its name or the path of a TOML file, and change single options.
 
     ``settings`` are ``section.option=value`` with a TOML value; strings may go without quotes.
     ``section=name`` chooses another part, with its defaults.
     Raises OptionError for an unknown recipe or option, or a value out of range.
     """
+    name = name if isinstance(name, str) else str(as_path(name))
     is_file = name.endswith(".toml")
     if not is_file and name not in recipe_names():
         raise OptionError(f"unknown recipe '{name}'{suggestion(name, recipe_names())}")

@@ -28,7 +28,7 @@ from colmap_affrect.colmap.tables import (
     rows_of,
 )
 from colmap_affrect.errors import DatabaseError, such_as
-from colmap_affrect.geometry.arrays import Singles
+from colmap_affrect.geometry.arrays import Floats, Singles
 
 logger = logging.getLogger(__name__)
 
@@ -208,7 +208,7 @@ def are_in_a_corner(extents: Collection[float]) -> bool:
     return len(extents) >= MIN_IMAGES_IN_A_CORNER and max(extents) < IN_A_CORNER
 
 
-def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:
+def keypoint_problems(keypoints: Floats, size: tuple[int, int] | None) -> list[str]:
     """Return which kinds of problems some keypoints of an image have.
 
     Args:
@@ -219,9 +219,10 @@ def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[
     points, found = keypoints[finite, :2], list[str]()
     if not finite.all():
         found.append("keypoints-not-finite")
+    is_larger = size is None or max(size) > MAX_NORMALISED
+    if is_larger and len(points) >= MIN_NORMALISED and np.abs(points).max() <= MAX_NORMALISED:
+        found.append("keypoints-normalised")
     if size and len(points):
-        if len(points) >= MIN_NORMALISED and np.abs(points).max() <= MAX_NORMALISED < max(size):
-            found.append("keypoints-normalised")
         margin = MAX_OUTSIDE * max(size) + MAX_OUTSIDE_PX
         beyond = np.maximum(-points, points - np.array(size, np.float32))
         if beyond.max() > margin:

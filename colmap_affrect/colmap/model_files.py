@@ -231,12 +231,13 @@ def read_given_model(
         require_intact(folder)
         with errors.damage(folder, _mend(folder)):
             model = pycolmap.Reconstruction(folder)
-            seen = sum(image.num_points3D for image in model.images.values())
-            if seen != sum(point.track.length() for point in model.points3D.values()):
-                raise ValueError("its images and points are not of one model")
     else:
         model = _read_text(folder, option, wanted)
-    if fault := "" if is_ours else _fault(model, needs_poses=needs_poses):
+    seen = sum(image.num_points3D for image in model.images.values())
+    if seen != sum(point.track.length() for point in model.points3D.values()):
+        why = "damaged (its images and points are not of one model)"
+        raise errors.StoreError(f"{option}{folder}: {why}; {_mend(folder)}")
+    if fault := "" if is_ours else why_unusable(model, needs_poses=needs_poses):
         raise errors.StoreError(f"{option}{folder}: {fault}; {_mend(folder)}")
     return model
 
@@ -251,7 +252,7 @@ def _read_text(folder: Path, option: str, wanted: str) -> pycolmap.Reconstructio
         raise errors.OptionError(f"{option}{folder}: {why}") from error
 
 
-def _fault(model: pycolmap.Reconstruction, *, needs_poses: bool) -> str:
+def why_unusable(model: pycolmap.Reconstruction, *, needs_poses: bool = True) -> str:
     """Return why nothing can be computed with a model, empty where there is no reason."""
     names = Counter(image.name for image in model.images.values())
     if twice := sorted(name for name, count in names.items() if count > 1):
@@ -274,6 +275,21 @@ def _fault(model: pycolmap.Reconstruction, *, needs_poses: bool) -> str:
         if not (np.abs(point.xyz) < FAR).all():
             return f"point {point_id} is at no finite place"
     return ""
+
+
+def refuse_panoramas(model: pycolmap.Reconstruction, what: str) -> None:
+    """Refuse a model with cameras that look all around, which have no focal length.
+
+    Args:
+        model: any model.
+        what: cannot be done with it, to begin the line of the OptionError.
+    """
+    for camera_id, camera in sorted(model.cameras.items()):
+        if not len(camera.focal_length_idxs()):
+            raise errors.OptionError(
+                f"{what}: camera {camera_id} looks all around ({camera.model_name}) and has no "
+                "focal length; use the model of perspective views of the panoramas"
+            )
 
 
 def _is_usable(camera: pycolmap.Camera) -> bool:

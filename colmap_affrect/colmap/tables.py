@@ -30,7 +30,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
 
     Without a write-ahead log or a journal as immutable: SQLite makes no files beside it then.
     """
-    wal, journal, index = (path.with_name(path.name + end) for end in ("-wal", "-journal", "-shm"))
+    wal, journal, index = (Path(f"{path}{end}") for end in ("-wal", "-journal", "-shm"))
     for file in (path, wal, journal, index):
         try:
             require_regular(file)

@@ -235,7 +235,7 @@ def verify_pairs(
         return ids, estimate_geometry(sides, matches, options, of_pair(extracted_px, ids))
 
     tasks = (
-        ((one, two), (side(one), side(two)), database.read_matches(one, two))
+        ((one, two), (side(one), side(two)), _each_once(database.read_matches(one, two)))
         for one, two in map(tuple, pairs)
     )
     found = map_ordered(estimate, tasks, available_cores())
@@ -245,6 +245,12 @@ def verify_pairs(
                 database.write_two_view_geometry(*ids, geometry)
         if advance:
             advance(len(batch))
+
+
+def _each_once(matches: Matches) -> Matches:
+    """Leave out repetitions: each match is evidence once, and would agree with its own copies."""
+    _, first = np.unique(matches, axis=0, return_index=True)
+    return matches if len(first) == len(matches) else matches[np.sort(first)]
 
 
 class PairVerifier:

@@ -127,11 +127,14 @@ def without_duplicates(points1: Floats, points2: Floats, radius_px: float) -> Bo
     """
     rows, others = neighbors_within(points1, radius_px).of(np.arange(len(points1)))
     squares2 = ((points2[rows] - points2[others]) ** 2).sum(axis=1)
-    is_duplicate = (squares2 <= radius_px**2) & (others < rows)
+    is_duplicate = (squares2 <= radius_px**2) & (rows < others)
+    better = rows[is_duplicate]  # which rise
+    worse = others[is_duplicate]
+    starts = np.searchsorted(better, np.arange(len(points1) + 1))
     keep = np.ones(len(points1), dtype=bool)
-    for row, better in zip(rows[is_duplicate], others[is_duplicate], strict=True):
-        if keep[better]:
-            keep[row] = False
+    for row in np.unique(better):
+        if keep[row]:
+            keep[worse[starts[row] : starts[row + 1]]] = False
     return keep
 
 

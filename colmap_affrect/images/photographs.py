@@ -18,6 +18,7 @@ from colmap_affrect.images import reading
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.outputs import is_output_folder
+from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.stores import pair_key
 
@@ -345,12 +346,12 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
     return checked_names(image_path, listed, str(image_list_path))
 
 
-def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[str]:
+def checked_names(image_path: Path, names: Iterable[PathLike], where: str) -> list[str]:
     """Return the sorted names of images, each once.
 
     OptionError for one that is not below the folder, ImageError for one that lists cannot hold.
     """
-    found = sorted({PurePosixPath(name).as_posix() for name in names})
+    found = sorted({PurePosixPath(as_path(name)).as_posix() for name in names})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:
         if why := _odd(name):

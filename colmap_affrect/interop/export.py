@@ -11,8 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import model_folder, read_given_model, write_model
+from colmap_affrect.colmap.model_files import (
+    model_folder,
+    read_given_model,
+    refuse_panoramas,
+    write_model,
+)
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
 from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
 from colmap_affrect.images.orientation import forget_orientation
@@ -47,6 +53,7 @@ class Source:
         return sorted(images, key=lambda image: str(image.name))
 
 
+@checks_arguments
 def export(
     model_path: PathLike,
     output_path: PathLike,
@@ -110,6 +117,7 @@ def _change_cameras(
 ) -> None:
     if not {"text", "cameras"}.intersection(formats):
         raise OptionError("--camera-model: changes 'text' and 'cameras'; give one of these formats")
+    refuse_panoramas(model, "--camera-model")
     before = {key: camera.model_name for key, camera in model.cameras.items()}
     differences_px = with_camera_model(model, name)
     for old in sorted({before[key] for key in differences_px}):
@@ -170,6 +178,7 @@ def _not_in_text(name: str) -> str:
 def _undistorted(source: Source, folder: Path) -> Path:
     """Write undistorted photographs with their model, ready for COLMAP's patch_match_stereo."""
     path, photographs = folder / DENSE, source.image_path
+    refuse_panoramas(source.model, "undistorted photographs")
     if photographs is None:
         raise OptionError("--image-path: give the folder of the photographs, to undistort them")
     for image in source.images():

@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import (
     CHECKS,
@@ -116,6 +117,7 @@ class _Wanted:
     verification: VerificationOptions | None  # None: pairs stay unverified
 
 
+@checks_arguments
 def import_h5(
     image_path: PathLike,
     features_path: PathLike,
@@ -379,6 +381,7 @@ def _keypoint_rows(source: GivenFile, name: str) -> Singles:
         return np.column_stack([centers, sigmas, angles])
 
 
+@checks_arguments
 def export_h5(
     database_path: PathLike,
     features_path: PathLike,

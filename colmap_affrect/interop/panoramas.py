@@ -9,6 +9,7 @@ from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 from typing import Any, Literal
 
+from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.errors import ImageError, NoModelError, OptionError
@@ -54,6 +55,7 @@ class _Functions:
             )
 
 
+@checks_arguments
 def reconstruct_panoramas(
     image_path: PathLike,
     output_path: PathLike,

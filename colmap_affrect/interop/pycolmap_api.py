@@ -69,7 +69,7 @@ ARGUMENTS = """
 def extract_features(
     database_path: PathLike,
     image_path: PathLike,
-    image_names: Sequence[str] = (),
+    image_names: Iterable[PathLike] = (),
     camera_mode: pycolmap.CameraMode | str = "auto",
     reader_options: pycolmap.ImageReaderOptions | Native = None,
     extraction_options: (
@@ -101,7 +101,7 @@ def extract_features(
     recipe, asked = translate.extraction_recipe(extraction_options)
     shown = _Cancellable(Progress.given(progress), cancellation_token)
     with _context(database_path, device, asked, weights_path, shown) as context:
-        report = extract(context, inputs, recipe, image_names=image_names)
+        report = extract(context, inputs, recipe, image_names=list(image_names))
     if report.failures:  # a script of pycolmap does not look at the report
         first, *_ = report.failures.values()
         warnings.warn(f"left out: {such_as(report.failures)}; the first: {first}", stacklevel=2)

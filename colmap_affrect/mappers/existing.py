@@ -15,7 +15,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.model_files import model_folder, read_given_model
+from colmap_affrect.colmap.model_files import model_folder, read_given_model, refuse_panoramas
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options
@@ -106,13 +106,24 @@ class ExistingModel:
                 model.register_frame(image.frame_id)
 
 
+def read_to_extend(model_path: Path) -> pycolmap.Reconstruction:
+    """Read the model that is to be extended.
+
+    OptionError when there is no such folder, no model in it, or one of panoramas; StoreError when
+    it is damaged.
+    """
+    model = read_given_model(model_path, "--extend ")
+    refuse_panoramas(model, f"--extend {model_path}")
+    return model
+
+
 def existing_names(model_path: Path, known: Collection[str]) -> list[str]:
     """Return the sorted names of the images of a model that is to be extended.
 
     OptionError when there is no such folder, or no model in it; AffrectError when it has no images,
     or some that are not among the ``known`` names of photographs.
     """
-    return _known_names(read_given_model(model_path, "--extend "), model_path, known)
+    return _known_names(read_to_extend(model_path), model_path, known)
 
 
 def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
@@ -121,7 +132,7 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     OptionError as :func:`existing_names`; AffrectError when it does not fit the database.
     """
     path = extension.model_path
-    old = read_given_model(path, "--extend ")
+    old = read_to_extend(path)
     with open_database(database_path) as database:
         options = pycolmap.DatabaseCacheOptions(load_all_images=True)
         cache = pycolmap.DatabaseCache.create(database, options)

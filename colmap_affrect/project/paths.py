@@ -12,13 +12,26 @@ PathLike = str | os.PathLike[str]
 
 
 def as_path(given: PathLike, argument: str = "") -> Path:
-    """Return a path; OptionError, naming the argument, for bytes and anything else that is none."""
+    """Return a path.
+
+    Args:
+        given: what somebody has given as one.
+        argument: its name, for errors.
+
+    Raises:
+        OptionError: bytes, an empty text, and anything else that is no path.
+    """
     try:
-        return Path(given)
+        path = Path(given)
     except TypeError as error:
         kind = type(given).__name__
         named = f"{argument}={given!r}" if argument else repr(given)
         raise OptionError(f"{named}: give a path as str or os.PathLike, not {kind}") from error
+    if not os.fspath(given):  # Path takes it for the current folder, and nobody means that
+        raise OptionError("an empty text is no path; the current folder is '.'")
+    if "\0" in str(path):
+        raise OptionError(f"{str(path)!r}: no path holds the character 0")
+    return path
 
 
 def as_path_or_none(given: PathLike | None, argument: str = "") -> Path | None:

@@ -68,6 +68,8 @@ class Workspace:
     @classmethod
     def beside(cls, database_path: Path) -> Self:
         """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
+        if database_path.is_dir():  # '.' and '/' have no names
+            raise OptionError(f"{database_path}: is a folder; give the path of a database")
         return cls(database_path.with_suffix(".affrect"), database_path)
 
     def branch(self, path: Path) -> "Workspace":

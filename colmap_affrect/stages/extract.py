@@ -20,6 +20,7 @@ from colmap_affrect.features.weights import digests
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
+from colmap_affrect.project.paths import PathLike
 from colmap_affrect.project.record import WEIGHTS, Content, content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
@@ -38,7 +39,7 @@ def extract(
     inputs: Inputs,
     recipe: Recipe,
     *,
-    image_names: Sequence[str] = (),
+    image_names: Sequence[PathLike] = (),
     later: Mapping[str, Options] | None = None,
     overwrite: bool = False,
 ) -> StageReport:
