@@ -22,11 +22,13 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
+from colmap_affrect.mappers import mapping
+from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import map_and_report, map_from_database
@@ -184,3 +186,23 @@ def test_two_places_make_two_models_the_largest_first(two_places: Workspace, map
     for folder, names in zip(folders, (large, small), strict=True):
         model = pycolmap.Reconstruction(folder)
         assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(names)
+
+
+@pytest.mark.parametrize(("probability", "num_images"), [(0.2, 3), (0.04, 2)])
+def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, probability: float, num_images: int
+) -> None:
+    synthesize(tmp_path / "database.db", num_rigs=3, num_points3D=60)
+
+    def score(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
+        names = sorted(model_poses(mapped.reconstruction))
+        found = dict.fromkeys(names, Confidence(0.99, ""))
+        if len(names) == 3:
+            found[names[-1]] = Confidence(probability, "no parallax")
+        return found
+
+    monkeypatch.setattr(mapping, "score_images", score)
+    ((model,), _) = reconstruct(tmp_path / "database.db", mapper_of("incremental"))
+    assert len(model.registered_names) == num_images
+    assert len(model.doubtful) == (num_images == 3)
+    assert len(model.taken_out) == (num_images == 2)
