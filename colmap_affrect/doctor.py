@@ -24,7 +24,7 @@ from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
+from colmap_affrect.session.context import Context
 
 Read = TypeVar("Read")
 Severity = Literal["error", "warning", "note"]

@@ -14,12 +14,15 @@ from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_v
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.escalation.climb import climb
+from colmap_affrect.escalation.escalate import escalate, matched_again
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names
 from colmap_affrect.mappers.sparse import SparseOptions
+from colmap_affrect.mend import watched
 from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
@@ -36,20 +39,17 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.report.advice import advice
 from colmap_affrect.report.pairs import pairs_of_page
 from colmap_affrect.report.run_page import write_run_page
-from colmap_affrect.stages.advice import advice
-from colmap_affrect.stages.climb import climb
-from colmap_affrect.stages.context import Context, Inputs, Resources
-from colmap_affrect.stages.escalate import escalate, matched_again
+from colmap_affrect.session.context import Context, Inputs, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
 from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.map import image_names, map_images, unregistered
 from colmap_affrect.stages.match import load_matchers, match
-from colmap_affrect.stages.mend import watched
-from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
-from colmap_affrect.stages.verify import num_verified_inliers, verify_matches
+from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.verify import verify_matches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,7 +286,7 @@ def map_and_report(
     lost = dict.fromkeys(gone, "is gone since its features were extracted; these are used")
     report = replace(report, warnings={**report.warnings, **lost})
     copied = workspace.is_foreign
-    verified = num_verified_inliers(context)
+    verified = context.num_verified_inliers()
     pair_inliers = {pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)}
     missing = unregistered(context, names, models, pair_inliers)
     again = matched_again(context)
@@ -295,7 +295,7 @@ def map_and_report(
         images_total=len(names),
         unregistered=missing,
         models=tuple(models),
-        num_pairs=num_matched_pairs(workspace.database) if copied else len(listed_pairs(context)),
+        num_pairs=num_matched_pairs(workspace.database) if copied else len(context.listed_pairs()),
         num_verified_pairs=len(pair_inliers),
         stages=summed((*earlier, report)),
         recipe="" if copied else workspace.recipe(),

@@ -18,8 +18,8 @@ PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
     "lines of the longest file": 500,
     "lines of the longest function": 60,
-    "imports between folders": 170,
-    "words of ARCHITECTURE.md": 2_500,
+    "imports between folders": 215,
+    "words of ARCHITECTURE.md": 2_600,
     "words of BENCHMARKS.md": 2_600,
 }
 """What a stranger can still read in one go. How many lines there are in all has no limit."""

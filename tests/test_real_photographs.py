@@ -13,10 +13,10 @@ from command import Call
 from registration import compare, compare_subset
 
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.features.weights import find
 from colmap_affrect.project.report import SURE
 from colmap_affrect.recipes import load_recipe
+from colmap_affrect.session.view_graph import ViewGraph
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 
@@ -44,9 +44,12 @@ def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_err
 def count_distinct_inliers(path):
     """Count matches by their places: of a place with two orientations COLMAP counts both."""
     count = 0
+    graph = ViewGraph(path)
+    ids = graph.ids
+    found = graph.inliers(1)
     with open_database(path) as database:
-        for pair, rows in inlier_matches(path, 1).items():
-            points = (database.read_keypoints(image_id)[:, :2] for image_id in pair)
+        for pair, rows in found.items():
+            points = (database.read_keypoints(ids[name])[:, :2] for name in pair)
             ends = [each[column] for each, column in zip(points, rows.T, strict=True)]
             count += len(np.unique(np.hstack(ends), axis=0))
     return count
@@ -72,6 +75,7 @@ import sys; from pathlib import Path
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.stages.one_image import prepare
 from colmap_affrect.recipes import load_recipe
+from colmap_affrect.session.view_graph import ViewGraph
 extracted = prepare(load_recipe('default').extraction).extract_file(Path(sys.argv[1]))
 assert extracted.image_size == (4000, 3000) and len(extracted.features) > 5000
 print(peak_memory_bytes() // 1024)

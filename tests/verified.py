@@ -11,7 +11,7 @@ from small_scene import INTRINSICS
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.context import Context, Inputs
+from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs

@@ -16,6 +16,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
+from colmap_affrect.mend import watched
 from colmap_affrect.options import Options, flat
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
@@ -23,8 +24,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe, with_settings
-from colmap_affrect.stages.context import Context, Resources
-from colmap_affrect.stages.mend import watched
+from colmap_affrect.session.context import Context, Resources
 
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 

@@ -165,12 +165,17 @@ def keypoint_counts(path: Path) -> dict[str, int]:
 def unverified_pairs(path: Path) -> Indices:
     """Return the (N, 2) image ids with raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:
-        pair_ids, counts = map(np.asarray, database.read_num_matches())
-        verified, _ = database.read_two_view_geometry_num_inliers()
-        rest = np.setdiff1d(pair_ids[counts > 0].astype(np.int64), verified)
-        pairs = np.stack(np.divmod(rest, MAX_NUM_IMAGES), axis=1)
-        is_new = [not database.exists_two_view_geometry(*pair) for pair in pairs]
-        return pairs[np.array(is_new, np.bool_)]
+        return pairs_to_verify(database)
+
+
+def pairs_to_verify(database: pycolmap.Database) -> Indices:
+    """Return the (N, 2) image ids with raw matches and no two-view geometry, good or bad."""
+    pair_ids, counts = map(np.asarray, database.read_num_matches())
+    verified, _ = database.read_two_view_geometry_num_inliers()
+    rest = np.setdiff1d(pair_ids[counts > 0].astype(np.int64), verified)
+    pairs = np.stack(np.divmod(rest, MAX_NUM_IMAGES), axis=1)
+    is_new = [not database.exists_two_view_geometry(*pair) for pair in pairs]
+    return pairs[np.array(is_new, np.bool_)]
 
 
 def lack_matches(database: pycolmap.Database, image_ids: NDArray[np.integer]) -> Bools:

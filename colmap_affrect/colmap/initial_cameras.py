@@ -301,7 +301,8 @@ def import_images(
         remove_own(database_files(path))  # what is beside it, of one that was removed
     with temporary_folder(path.parent) as folder:
         new, read = folder / "new.db" if is_new else path, folder / "read.db"
-        missing = sorted(set(names) - set(image_ids(new)))
+        known = set[str]() if is_new else set(image_ids(new))
+        missing = sorted(set(names) - known)
         missing = [name for name in missing if not why_unusable(image_path / name)]
         if missing:
             require_database_space(new, 2 * len(missing))
@@ -314,16 +315,23 @@ def import_images(
                     raise
                 require_folder(image_path)  # it is gone, as with a drive
             with open_database(read) as found, open_database(new) as database:
-                _take_over(initial, found, database)
+                known.update(_take_over(initial, found, database))
+        if not new.exists():
+            image_ids(new)  # makes an empty one
         if is_new:
             new.replace(path)
-    return sorted(set(names) - set(image_ids(path)))
+    return sorted(set(names) - known)
 
 
 def _take_over(
     initial: InitialCameras, found: pycolmap.Database, database: pycolmap.Database
-) -> None:
-    """Take over images that COLMAP has read into a database of their own: all of them, or none."""
+) -> list[str]:
+    """Take over images that COLMAP has read into a database of their own: all of them, or none.
+
+    Returns:
+        The names of those that fit the cameras.
+    """
+    taken = list[str]()
     images = sorted(found.read_all_images(), key=lambda image: image.name)
     read = cameras_of_images(found)
     sizes = {i.name: (read[i.image_id].width, read[i.image_id].height) for i in images}
@@ -342,10 +350,12 @@ def _take_over(
             if sizes[image.name] == (camera.width, camera.height):
                 written = pycolmap.Image(name=image.name, camera_id=camera.camera_id)
                 written.image_id = database.write_image(written)
+                taken.append(image.name)
                 write_frame(database, written, rigs)
                 if prior := priors.get(image.image_id):
                     prior.corr_data_id = written.data_id
                     database.write_pose_prior(prior)
+    return taken
 
 
 def _known_cameras(
@@ -360,24 +370,25 @@ def _known_cameras(
 
 
 def record_cameras(
-    database_path: Path,
+    cameras_of: Mapping[str, pycolmap.Camera],
     records_path: Path,
     initial: InitialCameras | None = None,
     known: Mapping[int, CameraRecord] | None = None,
 ) -> None:
     """Put the cameras that are not on record yet on record, and log what is worth knowing of them.
 
-    ``initial`` is what they were made from; of cameras of another database that is None, and
-    ``known`` are its records, if there are any.
+    Args:
+        cameras_of: the cameras of the database by image name.
+        records_path: the file of the records.
+        initial: what they were made from; None for cameras of another database.
+        known: the records of that one, if there are any.
     """
     before = read_camera_records(records_path)
     known = before or known or {}
-    with open_database(database_path) as database:
-        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-        images = database.read_all_images()
+    cameras = {camera.camera_id: camera for camera in cameras_of.values()}
     names: dict[int, list[str]] = defaultdict(list)
-    for image in images:
-        names[image.camera_id].append(image.name)
+    for name, camera in cameras_of.items():
+        names[camera.camera_id].append(name)
     records = {}
     for camera_id, of_camera in names.items():
         record, same = known.get(camera_id), tuple(sorted(of_camera))

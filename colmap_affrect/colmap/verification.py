@@ -181,52 +181,89 @@ def verify(
     advance: Callable[[int], None] | None = None,
     pairs: Collection[tuple[int, int]] | None = None,
 ) -> None:
-    """Estimate the two-view geometry of every matched pair that has none yet.
+    """Estimate the two-view geometry of every matched pair of a database that has none yet.
 
-    Of ``pairs`` of image ids only, if they are given, each with the lower id first. A geometry is
-    written when it has been judged: whatever ends this, no pair counts as verified that was not.
-    ``advance`` is called with the number of pairs that are done.
+    Args:
+        path: the database.
+        options: of verification.
+        extracted_px: longest side that photographs were shrunk to before extraction.
+        advance: is called with the number of pairs that are done.
+        pairs: of image ids, the lower one first, that may be verified; None: all.
     """
-    todo = colmap_database.unverified_pairs(path)
-    if pairs is not None:
-        todo = todo[[tuple(pair) in pairs for pair in todo.tolist()]]
-    if not len(todo):
-        return
-    colmap_database.require_database_space(path, len(todo))
     with colmap_database.open_database(path) as database:
-        cameras = colmap_database.cameras_of_images(database)
+        todo = colmap_database.pairs_to_verify(database)
+        if pairs is not None:
+            todo = todo[[tuple(pair) in pairs for pair in todo.tolist()]]
+        if len(todo):
+            colmap_database.require_database_space(path, len(todo))
+            verify_pairs(database, todo, options, extracted_px, advance)
 
-        @lru_cache(NUM_CACHED_IMAGES)
-        def side(image_id: int) -> Side:
-            keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
-            return Side(cameras[image_id], keypoints)
 
-        def estimate(task: _Task) -> _Done:
-            ids, sides, matches = task
-            return ids, estimate_geometry(sides, matches, options, of_pair(extracted_px, ids))
+def verify_pairs(
+    database: pycolmap.Database,
+    pairs: Indices,
+    options: VerificationOptions,
+    extracted_px: ExtractedPx = None,
+    advance: Callable[[int], None] | None = None,
+) -> None:
+    """Estimate the two-view geometries of matched pairs.
 
-        tasks = (
-            ((one, two), (side(one), side(two)), database.read_matches(one, two))
-            for one, two in map(tuple, todo)
-        )
-        found = map_ordered(estimate, tasks, available_cores())
-        while batch := list(islice(found, PAIRS_PER_WRITE)):
-            with pycolmap.DatabaseTransaction(database):
-                for ids, geometry in batch:
-                    database.write_two_view_geometry(*ids, geometry)
-            if advance:
-                advance(len(batch))
+    A geometry is written when it has been judged: whatever ends this, no pair counts as verified
+    that was not.
+
+    Args:
+        database: has the keypoints and raw matches, and gets the geometries.
+        pairs: (N, 2) image ids.
+        options: of verification.
+        extracted_px: longest side that photographs were shrunk to before extraction.
+        advance: is called with the number of pairs that are done.
+    """
+    cameras = colmap_database.cameras_of_images(database)
+
+    @lru_cache(NUM_CACHED_IMAGES)
+    def side(image_id: int) -> Side:
+        keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
+        return Side(cameras[image_id], keypoints)
+
+    def estimate(task: _Task) -> _Done:
+        ids, sides, matches = task
+        return ids, estimate_geometry(sides, matches, options, of_pair(extracted_px, ids))
+
+    tasks = (
+        ((one, two), (side(one), side(two)), database.read_matches(one, two))
+        for one, two in map(tuple, pairs)
+    )
+    found = map_ordered(estimate, tasks, available_cores())
+    while batch := list(islice(found, PAIRS_PER_WRITE)):
+        with pycolmap.DatabaseTransaction(database):
+            for ids, geometry in batch:
+                database.write_two_view_geometry(*ids, geometry)
+        if advance:
+            advance(len(batch))
 
 
 class PairVerifier:
     """Tries matches of single pairs, with the result of :func:`verify` and the same seed."""
 
     def __init__(
-        self, path: Path, options: VerificationOptions, extracted_px: ExtractedPx = None
+        self,
+        ids: Mapping[str, int],
+        cameras: Mapping[str, pycolmap.Camera],
+        options: VerificationOptions,
+        extracted_px: ExtractedPx = None,
     ) -> None:
-        self._options, self._extracted_px = options, extracted_px
-        self._ids = colmap_database.image_ids(path)
-        self._cameras = colmap_database.read_cameras(path)
+        """Take what is known of the images.
+
+        Args:
+            ids: in the database, by image name.
+            cameras: by image name.
+            options: of verification.
+            extracted_px: longest side that photographs were shrunk to before extraction.
+        """
+        self._ids = ids
+        self._cameras = cameras
+        self._options = options
+        self._extracted_px = extracted_px
 
     def inliers(self, names: Names, frames: Frames, indices: Matches) -> Indices:
         """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected."""
@@ -273,17 +310,6 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     return [(min(p), max(p)) for p in networkx.bridges(graph) if min(map(graph.degree, p)) > 1]
 
 
-def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], Indices]:
-    """Return the (M, 2) features of each verified pair of image ids that are inliers."""
-    with colmap_database.open_database(path) as database:
-        pair_ids, geometries = database.read_two_view_geometries()
-    return {
-        pycolmap.pair_id_to_image_pair(pair_id): np.asarray(geometry.inlier_matches, np.int64)
-        for pair_id, geometry in zip(pair_ids, geometries, strict=True)
-        if len(geometry.inlier_matches) >= min_num_inliers
-    }
-
-
 def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
     """Return how many features of each image, of (M, 2) by pair, are in tracks of three or more."""
     images = sorted({image for pair in matches for image in pair})
@@ -303,3 +329,13 @@ def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
     in_track[second[is_shared[first]]] = True
     counts = np.bincount(features[in_track] >> 32, minlength=len(images)).tolist()
     return dict(zip(images, counts, strict=True))
+
+
+def weakly_connected_images(
+    matches: Mapping[tuple[str, str], Indices], min_num_features: int
+) -> set[str]:
+    """Return the images with fewer features than that in tracks through three images or more.
+
+    Mappers register images by features that two others have triangulated already.
+    """
+    return {name for name, count in num_in_tracks(matches).items() if count < min_num_features}

@@ -28,7 +28,7 @@ from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Inputs
+from colmap_affrect.session.context import Inputs
 
 NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
 

@@ -28,6 +28,7 @@ from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.errors import AffrectError, StoreError
+from colmap_affrect.escalation.climb import climb
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -43,9 +44,10 @@ from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages.climb import climb
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import add_images, extract
+from colmap_affrect.session.context import Context
+from colmap_affrect.session.database_export import add_images
+from colmap_affrect.session.view_graph import ViewGraph
+from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
@@ -213,7 +215,7 @@ class MethodRun:
         inputs = self.options.inputs(self.image_path)
         names, progress = inputs.names(), self.progress
         with watch.step("extract"), progress.stage("extract", len(names), "images") as advance:
-            failures = add_images(self.workspace, inputs, names)
+            failures = add_images(self.workspace, ViewGraph(self.database), inputs, names)
             taken = [name for name in names if name not in failures]
             if not taken:
                 raise AffrectError(f"COLMAP cannot use any of the {len(names)} images")

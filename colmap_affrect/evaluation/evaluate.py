@@ -37,7 +37,7 @@ from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.session.context import Resources
 from colmap_affrect.stages.match import CachedMatcher, Matching
 from colmap_affrect.stages.one_image import prepare
 

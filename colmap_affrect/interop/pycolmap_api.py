@@ -19,6 +19,7 @@ from colmap_affrect.colmap.database import generated_pairs, image_ids, open_data
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
 from colmap_affrect.errors import AffrectError, OptionError, such_as
+from colmap_affrect.escalation.escalate import escalate
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
@@ -26,6 +27,7 @@ from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.base import MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.mend import watched
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
@@ -35,14 +37,13 @@ from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
+from colmap_affrect.session.context import Context, Inputs, Resources
+from colmap_affrect.session.database_export import write_images_and_keypoints
 from colmap_affrect.stages import verify as verify_stage
-from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.descriptors import described_images, match_database
-from colmap_affrect.stages.escalate import escalate
-from colmap_affrect.stages.extract import extract, write_images_and_keypoints
+from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
-from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import add_pairs
 
 CANCELLED = "Operation cancelled"  # what pycolmap says

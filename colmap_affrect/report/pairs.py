@@ -34,7 +34,7 @@ from colmap_affrect.project.tables import as_row
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import inspection as sheets
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.stages.context import Context
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.map import agreements
 
 KINDS = dict(zip(("own", "warped", "learned", "guided", "by hand"), sheets.PALETTE, strict=False))

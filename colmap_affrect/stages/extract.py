@@ -7,10 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
-from colmap_affrect.colmap.database_copy import copy_without_features
-from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.errors import DatabaseError, ImageError, StoreError, one_line, such_as
 from colmap_affrect.features.weights import digests
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
@@ -21,8 +18,9 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
+from colmap_affrect.session.context import Context, Inputs
+from colmap_affrect.session.database_export import start_database, write_images_and_keypoints
 from colmap_affrect.stages import one_image
-from colmap_affrect.stages.context import Context, Inputs
 from colmap_affrect.stages.one_image import ExtractedImage, ImageExtractor, ImageTask
 
 logger = logging.getLogger(__name__)
@@ -69,7 +67,7 @@ def extract(
         overwrite=overwrite,
     )
     warnings = _forget_changed(context, inputs, contents, are_all=not image_names)
-    _start_database(workspace, inputs)
+    start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
@@ -155,7 +153,7 @@ def extract_images(
     if extractor.options.depth.path:
         files.append(Path(extractor.options.depth.path))
     path, initial = context.workspace.database, inputs.initial_cameras
-    known = colmap_database.read_cameras(path) if path.exists() else {}
+    known = context.graph.cameras if path.exists() else {}
     names = inputs.names() if extractor.options.uses_depth else []
 
     def task(name: str, level: int) -> ImageTask:
@@ -175,27 +173,6 @@ def extract_images(
         yield found
 
 
-def _start_database(workspace: Workspace, inputs: Inputs) -> None:
-    """Make the database from the one that is given, unless it is there."""
-    if inputs.from_database and not workspace.database.exists():
-        copy_without_features(Path(inputs.from_database), workspace.database)
-
-
-def add_images(workspace: Workspace, inputs: Inputs, names: Sequence[str]) -> dict[str, str]:
-    """Add images that the database lacks; return those that COLMAP does not take, with reasons."""
-    _start_database(workspace, inputs)
-    original = Path(inputs.from_database) if inputs.from_database else None
-    rejected = import_images(workspace.database, Path(inputs.image_path), names, inputs.cameras)
-    record_cameras(
-        workspace.database,
-        workspace.cameras,
-        None if original else inputs.initial_cameras,
-        read_camera_records(original.with_name(workspace.cameras.name)) if original else None,
-    )
-    reason = f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})"
-    return dict.fromkeys(rejected, reason)
-
-
 def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None:
     """Refuse to replace features of another program in a user's database."""
     if not (workspace.users_database and workspace.database.exists()):
@@ -208,20 +185,6 @@ def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None
             f"{workspace.database}: has other features of {foreign[0]}; they are not replaced, "
             "start a new database from it (from_database, --from-database)"
         )
-
-
-def write_images_and_keypoints(context: Context) -> dict[str, str]:
-    """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
-    workspace, store = context.workspace, context.features
-    counts = store.num_keypoints()
-    rejected = add_images(workspace, context.inputs, list(counts))
-    ids = colmap_database.image_ids(workspace.database)
-    with colmap_database.open_database(workspace.database) as database:
-        for name, count in counts.items():
-            if name in ids and not colmap_database.has_keypoints(database, ids[name], count):
-                ends = [part.stop for part in store.level_ranges(name).values()]
-                colmap_database.write_keypoints(database, ids[name], store.read_frames(name), ends)
-    return rejected
 
 
 # Inputs that have changed since a run began: what was made from them is forgotten, and made again.
@@ -268,6 +231,7 @@ def _forget_changed(
     lines = [*_counted(changed, "changed"), *_counted(gone, "gone"), *other_cameras]
     if lines:
         workspace.rewind(f"since it was made, {', '.join(lines)}")
+        context.graph.forget()
         workspace.pairs.unlink(missing_ok=True)
         context.matches.remove({*changed, *gone})
         if changed or gone:

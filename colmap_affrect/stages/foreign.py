@@ -25,7 +25,7 @@ from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.paths import TakesPaths
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.stages.context import Context, source_files
+from colmap_affrect.session.context import Context, source_files
 from colmap_affrect.stages.descriptors import (
     described_images,
     match_database,
@@ -128,10 +128,13 @@ def copy_verified(
             warnings[str(source)] = "has changed; its copy and the models are made anew"
             logger.warning("%s: %s", source, warnings[str(source)])
         workspace.rewind()
+        context.graph.forget()
         workspace.record_made_from(copy=digest)
     if not workspace.database.exists():
-        record_cameras(workspace.database, workspace.cameras, known=_copy(context, foreign))
-    record_cameras(workspace.database, workspace.cameras)
+        known = _copy(context, foreign)
+        context.graph.forget()
+        record_cameras(context.graph.cameras, workspace.cameras, known=known)
+    record_cameras(context.graph.cameras, workspace.cameras)
     workspace.record_options("verify", verification.to_mapping())
     _match(context, foreign)
     num_pairs = colmap_database.num_matched_pairs(workspace.database)
@@ -142,6 +145,7 @@ def copy_verified(
         logger.warning("%s: %d pairs have matches only; they are verified now", source, todo)
     with context.progress.stage("verify", todo, "pairs") as advance:
         verify(workspace.database, verification, advance=advance)
+    context.graph.forget()
     wall_s = time.perf_counter() - start
     return StageReport("verify", wall_s, todo, num_pairs - todo, warnings=warnings)
 

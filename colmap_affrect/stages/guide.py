@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.two_views import CALIBRATED, pair_model
-from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
+from colmap_affrect.colmap.verification import PairVerifier, weakly_connected_images
 from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
 from colmap_affrect.geometry.tilts import vary_singly
@@ -26,13 +26,12 @@ from colmap_affrect.pairs.lists import Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore, GuidedPair
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.expected_gain import weakly_connected_images
-from colmap_affrect.stages.match import IMAGES_IN_MEMORY, PAIRS_PER_WRITE
-from colmap_affrect.stages.pairs import listed_pairs
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.stationary import StationaryFilter
-from colmap_affrect.stages.verify import extracted_px, verified_inliers
+from colmap_affrect.stages.verify import extracted_px
 
+IMAGES_IN_MEMORY = 40  # of 13,000 features
+PAIRS_PER_WRITE = 64
 MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
 NOTHING: Indices = np.zeros((0, 2), np.int64)
 
@@ -41,8 +40,14 @@ def guide(context: Context, options: GuidedOptions | None = None) -> StageReport
     """Match the verified pairs of some images again, guided by their geometry.
 
     A pair gets the geometry of its inliers and guided matches when that has more inliers than the
-    one before. Pairs that were guided are not guided again. ``options`` are by default those on
-    record. ``num_done`` counts the pairs that were matched again now.
+    one before. Pairs that were guided are not guided again.
+
+    Args:
+        context: of the workspace, whose pairs are verified.
+        options: by default those on record.
+
+    Returns:
+        How many pairs were matched again now, and how many before.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -59,7 +64,7 @@ def guide(context: Context, options: GuidedOptions | None = None) -> StageReport
 def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, Indices]:
     """Return the inliers of each verified pair without the matches of :func:`current` ones."""
     exact = {pair.names: pair.exact for pair in guided if pair.num_inliers}
-    return {**verified_inliers(context), **exact}
+    return {**context.verified_inliers(), **exact}
 
 
 def current(context: Context) -> list[GuidedPair]:
@@ -70,12 +75,9 @@ def current(context: Context) -> list[GuidedPair]:
     path = context.workspace.database
     if not (context.workspace.guided.exists() and path.exists()):
         return []
-    ids = colmap_database.image_ids(path)
-    counts = verified_pairs(path, 0)
+    counts = context.graph.num_inliers(0)
     return [
-        pair
-        for pair in context.guided.read()
-        if pair.num_inliers in (0, counts.get((ids[pair.names[0]], ids[pair.names[1]])))
+        pair for pair in context.guided.read() if pair.num_inliers in (0, counts.get(pair.names))
     ]
 
 
@@ -108,7 +110,9 @@ class GuidedMatcher:
     """Matches pairs again, with the features that it keeps of some images."""
 
     def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
-        self._store, self._options = store, options
+        """Name the features; they are read when an image comes first."""
+        self._store = store
+        self._options = options
         self._images = lru_cache(IMAGES_IN_MEMORY)(self._read)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -116,47 +120,80 @@ class GuidedMatcher:
 
     def __call__(self, task: GuidedTask) -> Indices:
         """Return the (K, 2) inliers of a pair and its guided matches."""
-        (first, shapes1), (second, shapes2) = map(self._images, task.names)
+        descriptors1, shapes1 = self._images(task.names[0])
+        descriptors2, shapes2 = self._images(task.names[1])
+        descriptors = (descriptors1, descriptors2)
         shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
-        return guided_matches((first, second), shapes, task.model, task.inliers, self._options)
+        return guided_matches(descriptors, shapes, task.model, task.inliers, self._options)
 
     def _read(self, name: str) -> tuple[Singles, Array]:
         """Return descriptors and, where frames were measured one by one, their linear parts."""
         features = self._store.read(name)
         shapes = features.lafs[:, :, :2]
-        return features.descriptors, shapes if len(shapes) and vary_singly(shapes) else shapes[:0]
+        if not (len(shapes) and vary_singly(shapes)):
+            shapes = shapes[:0]
+        return features.descriptors, shapes
 
 
 class Guiding:
     """Guides the pairs of a workspace, with the options on record."""
 
     def __init__(self, context: Context, options: GuidedOptions) -> None:
-        self.context, self.options = context, options
+        """Name the workspace.
+
+        Args:
+            context: of the workspace, whose pairs are verified.
+            options: of guided matching.
+        """
+        self.context = context
+        self.options = options
         self.path = context.workspace.database
-        self.ids = colmap_database.image_ids(self.path)
+        self.ids = context.graph.ids
         max_size_px = context.extraction.max_image_size_px
         sizes = context.features.image_sizes()
         # Bands are as wide as features are exact: in pixels of the images as they were extracted.
         self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
-        self.verifier = PairVerifier(self.path, context.verification, extracted_px(context))
+        self.verifier = PairVerifier(
+            context.graph.ids, context.graph.cameras, context.verification, extracted_px(context)
+        )
 
     def todo(self) -> tuple[list[Pair], int]:
         """Return the pairs to guide, and how many are done."""
         known = current(self.context)
         exact = exact_inliers(self.context, known)
-        images = set(self.ids) if self.options.enabled == "always" else set[str]()
-        if self.options.enabled == "auto":  # of two images alone there are no longer tracks
-            has_three = len({name for pair in exact for name in pair}) > 2
-            limit = self.options.min_num_tracks if has_three else 0
-            images = weakly_connected_images(exact, limit)
-        levels = self.context.matches.levels(listed_pairs(self.context))
+        images = self._images_to_guide(exact)
+        levels = self.context.matches.levels(self.context.listed_pairs())
         escalated = {frozenset(pair) for pair, level in levels.items() if level}  # have enough
-        chosen = [p for p in exact if not {*p}.isdisjoint(images) and {*p} not in escalated]
         done = {pair.names for pair in known}
-        return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
+        todo = list[Pair]()
+        num_done = 0
+        for pair in exact:
+            if images.isdisjoint(pair) or frozenset(pair) in escalated:
+                continue
+            if pair in done:
+                num_done += 1
+            else:
+                todo.append(pair)
+        return todo, num_done
+
+    def _images_to_guide(self, exact: Mapping[Pair, Indices]) -> set[str]:
+        """Return the images whose verified pairs are guided, by their exact inliers."""
+        if self.options.enabled == "always":
+            return set(self.ids)
+        if self.options.enabled != "auto":
+            return set()
+        names = {name for pair in exact for name in pair}
+        # Of two images alone there are no longer tracks.
+        limit = self.options.min_num_tracks if len(names) > 2 else 0
+        return weakly_connected_images(exact, limit)
 
     def guide(self, pairs: Sequence[Pair], advance: Callable[[int], None]) -> None:
-        """Match verified pairs again, batch by batch, and keep what has more inliers."""
+        """Match verified pairs again, batch by batch, and keep what has more inliers.
+
+        Args:
+            pairs: of image names.
+            advance: is called with the number of pairs that are done.
+        """
         if not pairs:
             return
         features = self.context.features
@@ -165,42 +202,52 @@ class Guiding:
         stationary = StationaryFilter(features, self.context.matches)
         ordered = ordered_for_reuse(pairs, IMAGES_IN_MEMORY)
         for begin in range(0, len(ordered), PAIRS_PER_WRITE):
-            batch, found = ordered[begin : begin + PAIRS_PER_WRITE], []
+            batch = ordered[begin : begin + PAIRS_PER_WRITE]
             tasks = self._tasks(batch)
+            found = list[tuple[GuidedTask, Indices]]()
             matched = executor.map(matcher, tasks, [features.path])
-            for task, both in zip(tasks, matched, strict=True):
-                found.append((task, both[stationary.left(task.names, both)]))
+            for task, matches in zip(tasks, matched, strict=True):
+                moving = stationary.left(task.names, matches)
+                found.append((task, matches[moving]))
                 advance(1)
-            untold = set(batch) - {task.names for task in tasks}
-            self.context.guided.write(GuidedPair(names, NOTHING, 0) for names in sorted(untold))
-            advance(len(untold))
+            without_model = set(batch).difference(task.names for task in tasks)
+            self.context.guided.write(
+                GuidedPair(names, NOTHING, 0) for names in sorted(without_model)
+            )
+            advance(len(without_model))
             self._keep(found)
 
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
         """Return what is to be done for the pairs whose geometry says where matches may be."""
         tasks = []
-        with colmap_database.open_database(self.path) as database:
-            cameras = colmap_database.cameras_of_images(database)
+        with open_database(self.path) as database:
+            cameras = cameras_of_images(database)
             for names in pairs:
-                first, second = (self.ids[name] for name in names)
-                keypoints = database.read_keypoints(first), database.read_keypoints(second)
+                first = self.ids[names[0]]
+                second = self.ids[names[1]]
+                keypoints = (database.read_keypoints(first), database.read_keypoints(second))
                 geometry = database.read_two_view_geometry(first, second)
                 model = pair_model(geometry, (cameras[first], cameras[second]), keypoints)
-                if model:
-                    inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-                    scaled = model.scaled(self.scales[names[0]], self.scales[names[1]])
-                    tasks.append(GuidedTask(names, scaled, inliers, geometry.config == CALIBRATED))
+                if not model:
+                    continue
+                inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+                scaled = model.scaled(self.scales[names[0]], self.scales[names[1]])
+                is_calibrated = geometry.config == CALIBRATED
+                tasks.append(GuidedTask(names, scaled, inliers, is_calibrated))
         return tasks
 
     def _keep(self, found: Sequence[tuple[GuidedTask, Indices]]) -> None:
         """Put better geometries into the database, and all pairs on record before that."""
-        geometries = {}
+        features = self.context.features
+        geometries = dict[Pair, pycolmap.TwoViewGeometry]()
         for task, matches in found:
-            if len(matches) > len(task.inliers):
-                frames1, frames2 = map(self.context.features.read_frames, task.names)
-                geometry = self.verifier.geometry(task.names, (frames1, frames2), matches)
-                if _is_better(geometry, task):
-                    geometries[task.names] = geometry
+            if len(matches) <= len(task.inliers):
+                continue
+            first, second = task.names
+            frames = (features.read_frames(first), features.read_frames(second))
+            geometry = self.verifier.geometry(task.names, frames, matches)
+            if _is_better(geometry, task):
+                geometries[task.names] = geometry
         counts = {names: len(geometry.inlier_matches) for names, geometry in geometries.items()}
         self.context.guided.write(
             GuidedPair(task.names, task.inliers, counts.get(task.names, 0)) for task, _ in found
@@ -208,10 +255,12 @@ class Guiding:
         self._write(geometries)
 
     def _write(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
-        with colmap_database.open_database(self.path) as database:
+        if not geometries:
+            return
+        with self.context.graph.opened(for_pairs=True) as database:
             for names, geometry in geometries.items():
-                first, second = (self.ids[name] for name in names)
-                database.update_two_view_geometry(first, second, geometry)
+                first, second = names
+                database.update_two_view_geometry(self.ids[first], self.ids[second], geometry)
 
 
 def _is_better(geometry: pycolmap.TwoViewGeometry, task: GuidedTask) -> bool:

@@ -5,7 +5,6 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
@@ -17,8 +16,7 @@ from colmap_affrect.mappers.mapping import map_database, model_folders, read_sum
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import unmeasured_pairs
+from colmap_affrect.session.context import Context
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
@@ -33,9 +31,19 @@ def map_images(
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
-    Images are registered into the model of ``extend``, or else begin anew; ``overwrite`` discards
-    the models that are there. AffrectError when the model cannot be extended with these images,
-    StoreError when the models that are there extend another one.
+    Args:
+        context: of the workspace, whose pairs are verified.
+        mapper: what makes models.
+        extend: the model that images are registered into; None: models begin anew.
+        goes_on: models begin with those that are there.
+        overwrite: discard the models that are there.
+
+    Returns:
+        What was done, and the summaries of the models.
+
+    Raises:
+        AffrectError: the model cannot be extended with these images.
+        StoreError: the models that are there extend another one.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -53,20 +61,26 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     known_models = read_summaries(workspace.sparse)  # refuses edited ones
+    said_before = known.partition("+")[2]  # what was said by hand
     before = list[MappedModel]()
-    is_same = known.partition("+")[2] == inputs.partition("+")[2]  # as it was said by hand
-    if goes_on and known_models and is_same:
-        for folder, known_model in zip(model_folders(workspace.sparse), known_models, strict=True):
-            model = pycolmap.Reconstruction(str(folder))
-            before.append(MappedModel(model, known_model.bridges, known_model.moves))
+    if goes_on and said_before == inputs.partition("+")[2]:
+        before = _models_before(workspace.sparse, known_models)
     task = _task(context, extend, before)
     workspace.record_made_from(map="")  # a run that is killed begins anew
-    num_images = len(colmap_database.image_ids(workspace.database))
-    with context.progress.stage("map", num_images, "images") as advance:
+    with context.progress.stage("map", len(context.graph.ids), "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
     workspace.record_made_from(map=inputs)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models)), models
+
+
+def _models_before(sparse_path: Path, summaries: Sequence[ModelSummary]) -> list[MappedModel]:
+    """Return the models that are there, to begin with."""
+    models = list[MappedModel]()
+    for folder, summary in zip(model_folders(sparse_path), summaries, strict=True):
+        model = pycolmap.Reconstruction(str(folder))
+        models.append(MappedModel(model, summary.bridges, summary.moves))
+    return models
 
 
 def _task(context: Context, extend: Extension | None, before: Sequence[MappedModel]) -> MappingTask:
@@ -88,6 +102,29 @@ def _task(context: Context, extend: Extension | None, before: Sequence[MappedMod
         may_share=not copied and context.inputs.may_share,
         tie_points=tie_points,
     )
+
+
+def unmeasured_pairs(context: Context) -> list[Pair]:
+    """Return the pairs whose matches are of local affine frames that were not measured.
+
+    None where no level of the recipe measures frames.
+    """
+    is_measured = [level.features.has_shapes for level in context.extraction.levels]
+    if not any(is_measured):
+        return []
+    pairs = usable_pairs(context)
+    levels = context.matches.levels(pairs)
+    return [pair for pair, level in levels.items() if not is_measured[level]]
+
+
+def usable_pairs(context: Context) -> list[Pair]:
+    """Return the listed pairs whose images the database has, but those rejected by hand."""
+    ids = context.graph.ids
+    return [
+        (first, second)
+        for first, second in context.listed_pairs()
+        if first in ids and second in ids and context.by_hand.allows(first, second)
+    ]
 
 
 def _inputs(context: Context, extend: Extension | None) -> str:
@@ -119,7 +156,7 @@ def image_names(context: Context) -> list[str]:
     """Return the names of the images of a run, or of the database that was copied."""
     if context.workspace.is_foreign:
         context.workspace.require("verify")
-        return sorted(colmap_database.image_ids(context.workspace.database))
+        return sorted(context.graph.ids)
     return context.inputs.names()
 
 
@@ -131,34 +168,51 @@ def unregistered(
 ) -> dict[str, str]:
     """Tell for each image outside the largest model why it is not in it.
 
-    ``pair_inliers`` are the numbers of inliers of the verified pairs.
+    Args:
+        context: of the workspace.
+        names: of all images.
+        models: the largest first.
+        pair_inliers: the numbers of inliers of the verified pairs.
+
+    Returns:
+        Reasons by image name.
     """
-    num_keypoints = colmap_database.keypoint_counts(context.workspace.database)
     partners: defaultdict[str, dict[str, int]] = defaultdict(dict)
     for (first, second), count in pair_inliers.items():
-        partners[first][second] = partners[second][first] = count
-    elsewhere = {
-        name: f"in another model, sparse/{index}"
-        for index, model in reversed(list(enumerate(models)))
-        for name in model.registered_names
-    }
-    registered = set(models[0].registered_names) if models else set()
-    taken_out = models[0].taken_out if models else {}
-    reasons = {}
-    for name in [name for name in names if name not in registered]:
-        if name in elsewhere:
-            reasons[name] = elsewhere[name]
-        elif name in context.by_hand.left_out:
-            reasons[name] = "left out by hand"
-        elif name not in num_keypoints:
-            reasons[name] = "unreadable"
-        elif not num_keypoints[name]:
-            reasons[name] = "no features"
-        elif name not in partners:
-            reasons[name] = "no verified pair"
-        else:
-            best = sorted(partners[name].items(), key=lambda item: -item[1])[:NUM_BEST_PAIRS]
-            pairs = ", ".join(f"{other} ({count} inliers)" for other, count in best)
-            why = f"taken out, {taken_out[name]}" if name in taken_out else "not registered"
-            reasons[name] = f"{why}; verified with {pairs}"
+        partners[first][second] = count
+        partners[second][first] = count
+    largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
+    registered = set(largest.registered_names)
+    reasons = dict[str, str]()
+    for name in names:
+        if name in registered:
+            continue
+        reasons[name] = _why_not_mapped(context, name, models[1:]) or _why_lost(
+            name, partners[name], largest
+        )
     return reasons
+
+
+def _why_not_mapped(context: Context, name: str, others: Sequence[ModelSummary]) -> str:
+    """Return why an image could not be in the largest model; empty where it could."""
+    for number, model in enumerate(others, start=1):
+        if name in model.registered_names:
+            return f"in another model, sparse/{number}"
+    if name in context.by_hand.left_out:
+        return "left out by hand"
+    num_keypoints = context.graph.num_keypoints
+    if name not in num_keypoints:
+        return "unreadable"
+    return "" if num_keypoints[name] else "no features"
+
+
+def _why_lost(name: str, partners: Mapping[str, int], largest: ModelSummary) -> str:
+    """Return why an image with features is not in the largest model, by its verified pairs."""
+    if not partners:
+        return "no verified pair"
+    best = sorted(partners.items(), key=lambda item: -item[1])[:NUM_BEST_PAIRS]
+    pairs = ", ".join(f"{other} ({count} inliers)" for other, count in best)
+    why = "not registered"
+    if name in largest.taken_out:
+        why = f"taken out, {largest.taken_out[name]}"
+    return f"{why}; verified with {pairs}"

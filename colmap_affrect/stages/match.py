@@ -1,6 +1,7 @@
 """Match: raw matches of the listed pairs, into ``matches.h5`` and the database."""
 
 import logging
+import math
 import threading
 import time
 from collections import Counter
@@ -13,7 +14,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
@@ -25,9 +25,8 @@ from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FINISHED, IN_VAIN, FeatureStore, MatchStore, PairMatches
 from colmap_affrect.recipes import ExtractionOptions
-from colmap_affrect.stages.context import Context, Resources, require_same_files
-from colmap_affrect.stages.extract import write_images_and_keypoints
-from colmap_affrect.stages.pairs import listed_pairs
+from colmap_affrect.session.context import Context, Resources, require_same_files
+from colmap_affrect.session.database_export import write_images_and_keypoints, write_matches
 from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
@@ -35,9 +34,8 @@ logger = logging.getLogger(__name__)
 PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
 MANY_MATCHES = 300  # of the features matched first: photographs of different things have up to 76
-NUM_TRIED, MIN_GROWTH = 40, 1.1
-"""Pairs matched by all features before many are, and what these must have more matches that confirm
-each other. Small scans have none."""
+NUM_TRIED = 40  # pairs matched by all features before many are
+MIN_GROWTH = 1.1  # of the matches that confirm each other, by all features; small scans have none
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
 IMAGES_IN_MEMORY = 40  # of 13,000 features
@@ -49,21 +47,61 @@ Found = TypeVar("Found")
 def match(
     context: Context, options: MatcherOptions | None = None, *, overwrite: bool = False
 ) -> StageReport:
-    """Match the listed pairs and put the raw matches into the database."""
+    """Match the listed pairs and put the raw matches into the database.
+
+    Args:
+        context: of the workspace, whose photographs have features.
+        options: of the matcher; by default those on record.
+        overwrite: discard what there is.
+
+    Returns:
+        How many pairs were matched now, and how many before.
+
+    Raises:
+        OptionError: the matcher cannot take these features.
+    """
     start = time.perf_counter()
     context.resources.require_device()
-    pairs = listed_pairs(context)
+    pairs = context.listed_pairs()
     options = options or context.matching
-    workspace, extraction = context.workspace, context.extraction
+    _record_options(context, options, overwrite=overwrite)
+    missing = _match_missing(context, pairs, options)
+    write_images_and_keypoints(context)
+    with context.graph.opened(for_pairs=True) as database:
+        write_matches(context, database, pairs)
+    wall_s = time.perf_counter() - start
+    num_before = len(pairs) - missing.num
+    return StageReport("match", wall_s, missing.num, num_before, warnings=missing.warnings)
+
+
+def _record_options(context: Context, options: MatcherOptions, *, overwrite: bool) -> None:
     try:
-        extraction.matchers(options)
+        context.extraction.matchers(options)
     except OptionError as error:
         other = "other features than those here take 'run' with another --output-path"
         raise OptionError(f"{error}; {other}") from error
-    weights = load_matchers(context, extraction, options)
-    record = options.to_mapping() | ({WEIGHTS: digests(weights)} if weights else {})
-    workspace.record_options("match", record, overwrite=overwrite)
-    matches, digest = context.matches, file_sha256(workspace.pairs)
+    weights = load_matchers(context, context.extraction, options)
+    record = options.to_mapping()
+    if weights:
+        record = {**record, WEIGHTS: digests(weights)}
+    context.workspace.record_options("match", record, overwrite=overwrite)
+
+
+@dataclass(frozen=True)
+class _Missing:
+    """Pairs that were not matched before."""
+
+    num: int
+    warnings: dict[str, str]
+
+
+def _match_missing(context: Context, pairs: PairList, options: MatcherOptions) -> _Missing:
+    """Match the pairs that are not stored, by some of their features first, and learn what stands.
+
+    A note has the digest of the list once all is done, so that an idle run looks at no pair.
+    """
+    matches = context.matches
+    digest = file_sha256(context.workspace.pairs)
     finished = matches.note(FINISHED)
     is_finished = finished == digest and matches.num_pairs() == len(pairs)
     missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
@@ -71,21 +109,20 @@ def match(
         matches.keep_note(FINISHED, None)
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance, options.max_num_first)
-    loose = not_well_tied(context.matches, pairs) if pairs and not is_finished else []
-    with context.progress.stage("match, all features", len(loose), "pairs") as advance:
-        if not _is_in_vain(context, loose, options, digest):
-            match_pairs(context, loose, options, advance)
-    warnings = {}
-    if pairs and (missing or finished is None):
-        is_asked = options.filter_stationary_matches
-        if is_asked and (line := StationaryFilter(context.features, matches).learn(pairs)):
+    wanted = not_well_tied(matches, pairs) if pairs and not is_finished else []
+    with context.progress.stage("match, all features", len(wanted), "pairs") as advance:
+        if not _is_in_vain(context, wanted, options, digest):
+            match_pairs(context, wanted, options, advance)
+    warnings = dict[str, str]()
+    has_new = bool(pairs) and (bool(missing) or finished is None)
+    if has_new and options.filter_stationary_matches:
+        line = StationaryFilter(context.features, matches).learn(pairs)
+        if line:
             warnings["matches"] = line
             logger.warning("matches: %s", line)
     if finished != digest:
         matches.keep_note(FINISHED, digest)
-    write_matches(context, pairs)
-    wall_s = time.perf_counter() - start
-    return StageReport("match", wall_s, len(missing), len(pairs) - len(missing), warnings=warnings)
+    return _Missing(len(missing), warnings)
 
 
 def load_matchers(
@@ -95,13 +132,15 @@ def load_matchers(
 
     Their networks are built once before matching begins: AffrectError for what cannot be used.
     """
-    resources, matchers = context.resources, extraction.matchers(options)
-    learned = {matchers[k] for k in resources.usable_levels(extraction) if matchers[k].weights}
-    keys = sorted({key for options in learned for key in options.weights})
-    weights = resolve(keys, resources.weights_path)
+    resources = context.resources
+    matchers = extraction.matchers(options)
+    usable = [matchers[number] for number in resources.usable_levels(extraction)]
+    learned = {matcher for matcher in usable if matcher.weights}
+    keys = set[str]().union(*(matcher.weights for matcher in learned))
+    weights = resolve(sorted(keys), resources.weights_path)
     if "match" not in context.workspace.begun:
-        for options in learned:
-            MATCHERS.make(options, MatcherContext(weights, "cpu"))
+        for matcher in learned:
+            MATCHERS.make(matcher, MatcherContext(weights, "cpu"))
     return weights
 
 
@@ -112,7 +151,15 @@ def match_pairs(
     advance: Callable[[int], None],
     max_num: int = 0,
 ) -> None:
-    """Match pairs by the features that every image has, ``max_num`` as in :class:`Matching`."""
+    """Match pairs by the features that every image has, and store what is found.
+
+    Args:
+        context: of the workspace.
+        pairs: of image names.
+        options: of the matcher.
+        advance: is called with the number of pairs that are done.
+        max_num: features of each image that are matched, those of the largest responses; 0: all.
+    """
     with closing(matched_at_level(context, pairs, options, 0, max_num)) as found_pairs:
         write_batches(found_pairs, context.matches.write, advance)
 
@@ -130,36 +177,39 @@ def not_well_tied(matches: MatchStore, pairs: Sequence[Pair]) -> list[Pair]:
 
 
 def _is_in_vain(
-    context: Context, loose: Sequence[Pair], options: MatcherOptions, digest: str
+    context: Context, pairs: Sequence[Pair], options: MatcherOptions, digest: str
 ) -> bool:
     """Tell whether all features tie pairs no better than some, by a sample where pairs are many."""
     matches = context.matches
     known = matches.note(IN_VAIN)
-    if (not known or known[0] != digest) and len(loose) > NUM_TRIED:
-        sample = loose[:: -(-len(loose) // NUM_TRIED)]
-
-        def confirmed(found: Iterable[PairMatches]) -> int:
-            return sum(num_confirming(context.features, one.names, one.indices) for one in found)
-
+    is_known = bool(known) and known[0] == digest
+    if not is_known and len(pairs) > NUM_TRIED:
+        sample = pairs[:: math.ceil(len(pairs) / NUM_TRIED)]
         with closing(matched_at_level(context, sample, options, 0)) as found:
-            after = confirmed(found)
-        known = [digest, after < MIN_GROWTH * confirmed(matches.read(sample))]
+            num_after = _sum_confirming(context.features, found)
+        num_before = _sum_confirming(context.features, matches.read(sample))
+        known = [digest, num_after < MIN_GROWTH * num_before]
         matches.keep_note(IN_VAIN, known)
-    return bool(known and known == [digest, True])
+    return bool(known == [digest, True])
+
+
+def _sum_confirming(features: FeatureStore, found: Iterable[PairMatches]) -> int:
+    return sum(num_confirming(features, one.names, one.indices) for one in found)
 
 
 def num_confirming(features: FeatureStore, names: Pair, indices: Any) -> int:
     """Return how many of the (M, 2) raw matches of a pair confirm each other."""
-    first, second = map(features.read_frames, names)
-    rows, columns = indices.T
-    return num_consistent_matches(first[rows], second[columns])
+    first = features.read_frames(names[0])
+    second = features.read_frames(names[1])
+    return num_consistent_matches(first[indices[:, 0]], second[indices[:, 1]])
 
 
 def write_batches(
     found: Iterable[Found], write: Callable[[list[Found]], None], advance: Callable[[int], None]
 ) -> None:
     """Write what is found of pairs batch by batch, also the last one when the search is stopped."""
-    batch, written = list[Found](), time.monotonic()
+    batch = list[Found]()
+    written = time.monotonic()
     try:
         for item in found:
             batch.append(item)
@@ -167,7 +217,8 @@ def write_batches(
             is_due = time.monotonic() - written > SECONDS_PER_WRITE
             if len(batch) == PAIRS_PER_WRITE or is_due:
                 write(batch)
-                batch, written = [], time.monotonic()
+                batch = []
+                written = time.monotonic()
     finally:
         if batch:
             write(batch)
@@ -176,35 +227,32 @@ def write_batches(
 def matched_at_level(
     context: Context, pairs: Sequence[Pair], options: MatcherOptions, level: int, max_num: int = 0
 ) -> Generator[PairMatches, None, None]:
-    """Match by the features of a level and its matcher, or ``options``, but what never moves."""
-    features, chosen = context.features, context.extraction.levels[level]
-    options, extractor = chosen.matching or options, chosen.features.name
-    resources = context.resources
-    matching = Matching(features, options, level, chosen.base, extractor, resources, max_num)
-    stationary = StationaryFilter(features, context.matches)
+    """Match by the features of a level, and leave out what never moves.
+
+    Args:
+        context: of the workspace.
+        pairs: of image names.
+        options: of the matcher, where the level has none of its own.
+        level: number of the level in the recipe.
+        max_num: features of each image that are matched, those of the largest responses; 0: all.
+
+    Yields:
+        The matches of each pair, in an order in which images are read seldom.
+    """
+    chosen = context.extraction.levels[level]
+    matching = Matching(
+        context.features,
+        chosen.matching or options,
+        level,
+        chosen.base,
+        chosen.features.name,
+        context.resources,
+        max_num,
+    )
+    stationary = StationaryFilter(context.features, context.matches)
     with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
         for found in found_pairs:
             yield stationary.filtered(found)
-
-
-def write_matches(context: Context, pairs: Sequence[Pair], *, replaces: bool = False) -> None:
-    """Put the raw matches that the database lacks into it, after images and keypoints.
-
-    ``replaces``: also those that are others there, whose two-view geometry goes.
-    """
-    write_images_and_keypoints(context)
-    path, listed = context.workspace.database, PairList.of(pairs)
-    ids = colmap_database.image_ids(path)
-    known_ids = np.array([ids.get(name, 0) for name in listed.names], np.int64)
-    ids_of_pairs = known_ids[listed.numbers]
-    with colmap_database.open_database(path) as database:
-        wanted = np.min(ids_of_pairs, axis=1, initial=1) > 0  # both images are there
-        if not replaces:
-            wanted = colmap_database.lack_matches(database, ids_of_pairs)
-        todo = listed.at(wanted)
-        for found in context.matches.read(todo) if todo else ():
-            first, second = (ids[name] for name in found.names)
-            colmap_database.write_matches(database, first, second, found.indices)
 
 
 # What is done for one pair, in a thread of this process or on a worker of a cluster.
@@ -236,7 +284,8 @@ def iterate_matches(
         return
     executor = executor or Threads(available_cores())
     counts = matching.store.num_keypoints()
-    if limit := matching.max_num_features:
+    limit = matching.max_num_features
+    if limit:
         counts = {name: min(count, limit) for name, count in counts.items()}
     num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
@@ -262,7 +311,8 @@ class CachedMatcher:
 
     def __init__(self, matching: Matching, sent: Mapping[str, str] | None = None) -> None:
         """Load the networks; ``sent`` are the digests of the weights that they must have."""
-        options, resources = matching.options, matching.resources
+        options = matching.options
+        resources = matching.resources
         options.require_extractor(matching.extractor)
         self._matching = matching
         self._weights = resolve(options.weights, resources.weights_path)
@@ -270,17 +320,20 @@ class CachedMatcher:
             require_same_files(self._weights, sent)
         context = MatcherContext(self._weights, resources.device, matching.num_similarities)
         self.matcher = MATCHERS.make(options, context)
-        self._images, self._lock = lru_cache(matching.num_kept)(self._prepare), threading.Lock()
+        self._images = lru_cache(matching.num_kept)(self._prepare)
+        self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return CachedMatcher, (self._matching, digests(self._weights))
 
     def __call__(self, names: Pair) -> PairMatches:
         """Match the stored features of two images."""
-        first, second = map(self.prepared, names)
+        first = self.prepared(names[0])
+        second = self.prepared(names[1])
         found = self.matcher.match(first.content, second.content)
-        rows, columns = found.indices.T
-        indices = np.stack([first.indices[rows], second.indices[columns]], axis=1)
+        rows = first.indices[found.indices[:, 0]]
+        columns = second.indices[found.indices[:, 1]]
+        indices = np.stack([rows, columns], axis=1)
         is_of_some = first.is_part or second.is_part
         level = self._matching.level
         return PairMatches(names, indices, found.scores, first.end, level, is_of_some)
@@ -291,10 +344,13 @@ class CachedMatcher:
             return self._images(name)
 
     def _prepare(self, name: str) -> PreparedImage:
-        matching, store = self._matching, self._matching.store
+        matching = self._matching
+        store = matching.store
         indices = store.level_indices(name, matching.level, matching.base)
-        end, limit = int(indices.max(initial=-1)) + 1, matching.max_num_features
-        everything, is_part = store.read(name), 0 < limit < len(indices)
+        end = int(indices.max(initial=-1)) + 1
+        limit = matching.max_num_features
+        everything = store.read(name)
+        is_part = 0 < limit < len(indices)
         if is_part:
             order = np.argsort(-everything.responses[indices], kind="stable")
             indices = np.sort(indices[order[:limit]])

@@ -25,7 +25,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions, Level
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
 from colmap_affrect.rectifiers.execute import extract_rectified
-from colmap_affrect.stages.context import Resources, require_same_files
+from colmap_affrect.session.context import Resources, require_same_files
 
 MIN_RECTIFIABLE_PX = 32  # shorter side; else no block would see its surroundings
 

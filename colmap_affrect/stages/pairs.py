@@ -10,12 +10,12 @@ from pathlib import Path
 from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import AffrectError, such_as
 from colmap_affrect.pairs import lists
-from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
+from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import write_images_and_keypoints
+from colmap_affrect.session.context import Context
+from colmap_affrect.session.database_export import write_images_and_keypoints
 
 logger = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:
 
 def _pairs_there(context: Context) -> set[Pair]:
     path = context.workspace.pairs
-    return set(listed_pairs(context)) if path.exists() and path.stat().st_size else set()
+    return set(context.listed_pairs()) if path.exists() and path.stat().st_size else set()
 
 
 def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
@@ -130,19 +130,8 @@ def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
     if not lost:
         return {}
     context.workspace.rewind()
+    context.graph.forget()
     context.matches.remove(pairs=lost)
     why = f"{len(lost)} pairs are not listed any more, such as {' and '.join(min(lost))}"
     logger.warning("%s: %s", context.workspace.pairs, why)
     return {str(context.workspace.pairs): why}
-
-
-def listed_pairs(context: Context) -> PairList:
-    """Return the pairs of the list whose images have features."""
-    context.workspace.require("pairs")
-    if not context.workspace.pairs.exists():
-        raise AffrectError(
-            f"{context.workspace.pairs}: no such file, the photographs have changed; run "
-            "'colmap-affrect pairs' and then match again"
-        )
-    names = context.features.names()
-    return lists.read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())

@@ -1,62 +1,68 @@
 """Verify: two-view geometries of the matched pairs, into the database."""
 
-import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import (
-    ExtractedPx,
-    VerificationOptions,
-    inlier_matches,
-    verified_pairs,
-    verify,
-)
-from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.colmap.verification import ExtractedPx, VerificationOptions, verify_pairs
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.match import write_matches
-from colmap_affrect.stages.pairs import listed_pairs
-
-logger = logging.getLogger(__name__)
+from colmap_affrect.session.context import Context
+from colmap_affrect.session.database_export import write_images_and_keypoints, write_matches
 
 
 def verify_matches(
     context: Context, options: VerificationOptions | None = None, *, overwrite: bool = False
 ) -> StageReport:
-    """Estimate the two-view geometries of all matched pairs."""
+    """Estimate the two-view geometries of all matched pairs.
+
+    Args:
+        context: of the workspace.
+        options: by default those on record.
+        overwrite: discard what there is.
+
+    Returns:
+        How many pairs were verified now, and how many before.
+    """
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("match")
-    pairs = listed_pairs(context)
+    pairs = context.listed_pairs()
     options = options or context.verification
     workspace.record_options("verify", options.to_mapping(), overwrite=overwrite)
-    write_matches(context, pairs)
-    todo = len(colmap_database.unverified_pairs(workspace.database))
-    with context.progress.stage("verify", todo, "pairs") as advance:
-        verify_new(context, advance)
-    return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
+    num_verified = update_verified(context, pairs, shows=True)
+    wall_s = time.perf_counter() - start
+    return StageReport("verify", wall_s, num_verified, len(pairs) - num_verified)
 
 
-def num_verified_inliers(context: Context) -> dict[Pair, int]:
-    """Return the number of inliers of each verified pair; of its images the lower id is first.
+def update_verified(
+    context: Context, pairs: Sequence[Pair], *, replaces: bool = False, shows: bool = False
+) -> int:
+    """Bring the database up to what is stored, and verify the pairs that are not verified there.
 
-    Another program had its own threshold.
+    Args:
+        context: of the workspace.
+        pairs: of image names; those that are not stored are passed over.
+        replaces: raw matches that are others in the database are replaced.
+        shows: show progress.
+
+    Returns:
+        The number of pairs that were verified.
     """
-    path = context.workspace.database
-    names = {number: name for name, number in colmap_database.image_ids(path).items()}
-    least = 1 if context.workspace.is_foreign else context.verification.min_num_inliers
-    pairs = verified_pairs(path, least)
-    return {(names[one], names[two]): count for (one, two), count in pairs.items()}
-
-
-def verified_inliers(context: Context) -> dict[Pair, Indices]:
-    """Return the (M, 2) features of each verified pair that are inliers."""
-    path = context.workspace.database
-    names = {number: name for name, number in colmap_database.image_ids(path).items()}
-    found = inlier_matches(path, context.verification.min_num_inliers)
-    return {(names[one], names[two]): indices for (one, two), indices in found.items()}
+    write_images_and_keypoints(context)
+    sizes_px = extracted_px(context)
+    with context.graph.opened(for_pairs=True) as database:
+        write_matches(context, database, pairs, replaces=replaces)
+        todo = colmap_database.pairs_to_verify(database)
+        if len(todo):
+            colmap_database.require_database_space(context.workspace.database, len(todo))
+        advance: Callable[[int], None] | None = None
+        if not shows:
+            verify_pairs(database, todo, context.verification, sizes_px, advance)
+        else:
+            with context.progress.stage("verify", len(todo), "pairs") as advance:
+                verify_pairs(database, todo, context.verification, sizes_px, advance)
+    return len(todo)
 
 
 def extracted_px(context: Context) -> ExtractedPx:
@@ -64,16 +70,10 @@ def extracted_px(context: Context) -> ExtractedPx:
     sizes = [level.max_image_size_px for level in context.extraction.levels]
     if len(set(sizes)) == 1:
         return sizes[0]
-    ids = colmap_database.image_ids(context.workspace.database)
-    pairs = [pair for pair in listed_pairs(context) if ids.keys() >= set(pair)]
+    ids = context.graph.ids
+    pairs = [pair for pair in context.listed_pairs() if ids.keys() >= set(pair)]
     found: dict[tuple[int, int], int] = {}
     for (first, second), level in context.matches.levels(pairs).items():
         low, high = sorted((ids[first], ids[second]))
         found[low, high] = sizes[level]
     return found
-
-
-def verify_new(context: Context, advance: Callable[[int], None] | None = None) -> None:
-    """Verify the pairs of the database that have matches and no two-view geometry, good or bad."""
-    path, options = context.workspace.database, context.verification
-    verify(path, options, extracted_px(context), advance)

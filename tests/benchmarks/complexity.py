@@ -24,7 +24,7 @@ from colmap_affrect.images.photographs import list_images
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.affine_warps import IdentityOptions
 from colmap_affrect.report.inspection import inspect_level
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.session.context import Resources
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
 HEADER = (

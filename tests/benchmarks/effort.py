@@ -26,6 +26,9 @@ from registration import SUBSETS, Subset
 
 from colmap_affrect.colmap.model_files import read_poses
 from colmap_affrect.comparison.results import pose_scores
+from colmap_affrect.escalation import climb as climbing
+from colmap_affrect.escalation.escalate import Escalation
+from colmap_affrect.escalation.policy import EFFORTS
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import read_summaries
@@ -34,10 +37,7 @@ from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import LOOKED_AT
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages import climb as climbing
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation
-from colmap_affrect.stages.escalation_policy import EFFORTS
+from colmap_affrect.session.context import Context
 
 Row = dict[str, Any]
 
@@ -95,25 +95,38 @@ def curve(
         mapping=recipe_options.mapping.changed(random_seed=seed),
     )
     rows = list[Row]()
-    begun_s, wall_s = time.process_time(), time.monotonic()
+    begun_s = time.process_time()
+    wall_s = time.monotonic()
     map_once = climbing.map_images
+    choose_once = climbing.choose_learned
+
+    def add_row(context: Context) -> None:
+        row = looked_at(scene_path, names, context.workspace.sparse)
+        row["cpu_s"] = round(time.process_time() - begun_s, 1)
+        row["wall_s"] = round(time.monotonic() - wall_s, 1)
+        row |= spent(context)
+        rows.append(row)
+        print(work_path.name, json.dumps(row), flush=True)
 
     def map_images(context: Context, mapper: Mapper, **how: Any) -> tuple[StageReport, Any]:
         report, models = map_once(context, mapper, **how)
         if report.num_done or not rows:
-            row = looked_at(scene_path, names, context.workspace.sparse)
-            row["cpu_s"] = round(time.process_time() - begun_s, 1)
-            row["wall_s"] = round(time.monotonic() - wall_s, 1)
-            row |= spent(context)
-            rows.append(row)
-            print(work_path.name, json.dumps(row), flush=True)
+            add_row(context)
         return report, models
 
+    def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
+        is_chosen = choose_once(escalation, at_once=at_once)
+        if is_chosen or at_once:  # learned matching has taken its time
+            add_row(escalation.context)
+        return is_chosen
+
     climbing.map_images = map_images
+    climbing.choose_learned = choose_learned
     try:
         run(scene_path / "images", work_path / "out", options, page=False)
     finally:
         climbing.map_images = map_once
+        climbing.choose_learned = choose_once
     end = looked_at(scene_path, names, work_path / "out" / "sparse")
     end["cpu_s"] = round(time.process_time() - begun_s, 1)
     end["wall_s"] = round(time.monotonic() - wall_s, 1)
@@ -123,8 +136,8 @@ def curve(
 def spent(context: Context) -> Row:
     """Return what escalation has taken so far, in nominal seconds, and what it was."""
     escalation = Escalation(context, Recipe().escalate)
-    models = escalation.models()
-    situation = escalation.situation(escalation.needs(models), models)
+    models = escalation.state.models()
+    situation = escalation.state.situation(escalation.state.weights(models), models)
     names = [level.name for level in situation.levels]
     return {
         "first_model_s": round(situation.first_model_s, 1),
@@ -141,30 +154,28 @@ def spent(context: Context) -> Row:
     }
 
 
-def right_at(rows: Sequence[Row], spent_s: float) -> int:
-    """Return the photographs that are right when so many nominal seconds have been spent."""
-    there = [row for row in rows if row.get("spent_s", math.inf) <= spent_s]
-    last = there[-1] if there else rows[0]
-    return int(last["right"])
+def right_at(rows: Sequence[Row], seconds: float) -> int:
+    """Return the photographs that are right so many seconds of one core after the first model."""
+    there = [row for row in rows if row["cpu_s"] - rows[0]["cpu_s"] <= seconds]
+    return int(there[-1]["right"])
 
 
 def draw(found: dict[str, list[Row]], path: Path) -> None:
-    """Draw the photographs that are right in all subsets against what was spent on each."""
+    """Draw the photographs that are right in all subsets against the seconds spent on each."""
     import matplotlib.pyplot as plt
 
     known = [rows for rows in found.values() if "right" in rows[0]]
-    spent = sorted({row["spent_s"] for rows in known for row in rows if "spent_s" in row})
-    first = sum(row[0]["right"] for row in known)
+    seconds = sorted({row["cpu_s"] - rows[0]["cpu_s"] for rows in known for row in rows})
+    right = [sum(right_at(rows, limit) for rows in known) for limit in seconds]
     figure, axes = plt.subplots(figsize=(7, 3.5))
-    axes.step(spent, [sum(right_at(rows, s) for rows in known) for s in spent], where="post")
-    axes.axhline(first, linestyle=":", color="gray")
-    axes.text(spent[-1], first, "first models", ha="right", va="bottom", color="gray")
+    axes.step([max(1.0, limit) for limit in seconds], right, where="post")
     for name, effort in EFFORTS.items():
-        if effort.least_s <= spent[-1]:
+        if effort.least_s:
             axes.axvline(effort.least_s, color="tab:orange", linewidth=1)
-            axes.text(effort.least_s, axes.get_ylim()[0], f" {name}", color="tab:orange")
-    axes.set_xlabel("seconds of one core on each set, after learned matching")
-    axes.set_ylabel("photographs right")
+            axes.text(effort.least_s, right[0], f" {name}", color="tab:orange")
+    axes.set_xscale("log")
+    axes.set_xlabel("seconds of one core spent on each set after its first model")
+    axes.set_ylabel(f"photographs right, {len(known)} sets")
     figure.tight_layout()
     figure.savefig(path, dpi=120)
 

@@ -7,7 +7,7 @@ truth it needs 50 inliers. From each pair come six rows, which differ in the lev
 in vain before and in the other pairs of which the outcome is known. Usage:
 
     python tests/benchmarks/fit_expected_gain.py --scenes-path ../shared/scenes \
-        --work-path out/gain --output-path colmap_affrect/stages/expected_gain.json
+        --work-path out/gain --output-path colmap_affrect/escalation/expected_gain.json
 
 A subset whose name begins with "aged" is looked for below --aged-path, a folder like --scenes-path
 of the same photographs made to look old. What is found in --work-path is used again.
@@ -32,11 +32,11 @@ from registration import SUBSETS
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import PairVerifier
+from colmap_affrect.escalation.escalate import Escalation
+from colmap_affrect.escalation.expected_gain import PairState, kind_of, terms
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
-from colmap_affrect.stages.context import Context, Inputs
-from colmap_affrect.stages.escalate import Escalation
-from colmap_affrect.stages.expected_gain import PairState, kind_of, terms
+from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import match, matched_at_level
 from colmap_affrect.stages.pairs import choose_pairs
@@ -44,8 +44,8 @@ from colmap_affrect.stages.verify import verify_matches
 
 NUM_PAIRS, NUM_SLOW_PAIRS, NUM_ROWS = 21, 8, 6
 STRONG, ENOUGH, MAX_ERROR_DEG = 100, 50, 10.0
-PRIOR = {"constant": -1.5, "consistent": 0.5, "inliers": 0.3, "tried": -0.5, "luck": 0.3}
-RIDGE = {"constant": 0.9, "consistent": 6.0, "inliers": 6.0, "tried": 6.0, "luck": 6.0}
+PRIOR = {"constant": -1.5, "consistent": 0.5, "inliers": 0.3, "tried": -0.5, "success_ratio": 0.3}
+RIDGE = {"constant": 0.9, "consistent": 6.0, "inliers": 6.0, "tried": 6.0, "success_ratio": 6.0}
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -107,7 +107,7 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
         verify_matches(context)
         context.workspace.record_options("escalate", EscalateOptions().to_mapping())
         escalation = Escalation(context, EscalateOptions())
-        states, features = escalation.states(), context.features
+        states, features = escalation.state.states(), context.features
         weak = [pair for pair, state in states.items() if state.num_inliers < STRONG]
         chosen = sorted(random.Random(0).sample(weak, min(NUM_PAIRS, len(weak))))
         rows: dict[tuple[str, str], Row] = {
@@ -130,11 +130,12 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
             ]
             escalation._extend(missing, lambda _: None)
             verifier = PairVerifier(
-                context.workspace.database, context.verification, level.max_image_size_px
+                context.graph.ids,
+                context.graph.cameras,
+                context.verification,
+                level.max_image_size_px,
             )
-            with closing(
-                matched_at_level(context, pairs, escalation.matching, number)
-            ) as found_pairs:
+            with closing(matched_at_level(context, pairs, context.matching, number)) as found_pairs:
                 for found in found_pairs:
                     frames = [features.read_frames(name) for name in found.names]
                     inliers = verifier.inliers(found.names, (frames[0], frames[1]), found.indices)
@@ -228,7 +229,7 @@ def main() -> None:
             chance[out] = 1 / (1 + np.exp(-odds))
         kind = kind_of(levels[number])
         weights = np.round(fitted(values, outcome), 2).tolist()
-        content[kind]["weights"] = dict(zip(PRIOR, weights, strict=True))
+        content[kind]["coefficients"] = dict(zip(PRIOR, weights, strict=True))
         brier, mean = np.mean((chance - outcome) ** 2), np.var(outcome)
         print(f"{kind}: {len(found) // NUM_ROWS} pairs, Brier {brier:.3f} (mean alone {mean:.3f})")
     arguments.output_path.write_text(json.dumps(content, indent=1) + "\n")

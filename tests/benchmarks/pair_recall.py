@@ -25,7 +25,7 @@ from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
+from colmap_affrect.session.context import Context
 
 HEADER = ("chosen by", "chosen", "recall", "possible", "inliers", "s")
 

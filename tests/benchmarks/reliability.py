@@ -47,8 +47,8 @@ from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS
 from colmap_affrect.mappers.reliability_features import features_of
 from colmap_affrect.project.report import DOUBTFUL, SURE
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import unmeasured_pairs
+from colmap_affrect.session.context import Context
+from colmap_affrect.stages.map import unmeasured_pairs
 
 
 def mirrored(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:

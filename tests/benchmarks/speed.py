@@ -28,7 +28,7 @@ from colmap_affrect.comparison.methods import SIFT, Method, parse_method
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.session.context import Resources
 
 Row = dict[str, float]
 

@@ -22,7 +22,7 @@ from colmap_affrect.colmap.database import (
 from colmap_affrect.colmap.old_databases import export_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
+from colmap_affrect.session.context import Context
 
 MAX_RATIO = 0.8
 Matches = set[tuple[int, int]]

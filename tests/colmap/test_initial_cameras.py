@@ -98,7 +98,9 @@ def test_wrong_exif_of_a_shrunk_photograph_is_rescaled_in_the_database(tmp_path:
     assert camera.focal_length == pytest.approx(50 / 35.8 * 1092)
     assert camera.has_prior_focal_length
     record_cameras(
-        path, tmp_path / "cameras.json", InitialCameras(tmp_path / "photos", CameraOptions())
+        read_cameras(path),
+        tmp_path / "cameras.json",
+        InitialCameras(tmp_path / "photos", CameraOptions()),
     )
     assert read_camera_records(tmp_path / "cameras.json")[1].source == "exif-rescaled"
 
@@ -213,13 +215,13 @@ def test_records_are_kept_and_follow_the_images_that_come_later(
     path, records_path = tmp_path / "a.db", tmp_path / "cameras.json"
     initial = InitialCameras(photos, CameraOptions())
     imported(path, photos, NAMES[:1])
-    record_cameras(path, records_path, initial)
+    record_cameras(read_cameras(path), records_path, initial)
     (record,) = read_camera_records(records_path).values()
     assert (record.names, record.source, record.size) == (("a.jpg",), "exif", (90, 60))
     given = CameraRecord(("a.jpg",), "given", 70.0, "", (90, 60))
     write_camera_records(records_path, {1: given})
     imported(path, photos, NAMES)
-    record_cameras(path, records_path, initial)
+    record_cameras(read_cameras(path), records_path, initial)
     records = read_camera_records(records_path)
     assert [(r.names, r.source) for r in records.values()] == [
         (("a.jpg", "b.jpg"), "given"),
@@ -253,10 +255,10 @@ def test_cameras_of_another_program_are_given_where_they_are_flagged(
         pass
     pycolmap.import_images(path, photos, pycolmap.CameraMode.SINGLE, NAMES[:1], options)
     pycolmap.import_images(path, photos, pycolmap.CameraMode.PER_IMAGE, NAMES[5:])
-    record_cameras(path, records_path)
+    record_cameras(read_cameras(path), records_path)
     before = read_camera_records(records_path)
     assert [(r.source, r.focal_px) for r in before.values()] == [("given", 71.5), ("guess", 108)]
     records_path.unlink()
-    record_cameras(path, records_path, InitialCameras(photos, CameraOptions()))
+    record_cameras(read_cameras(path), records_path, InitialCameras(photos, CameraOptions()))
     assert [r.source for r in read_camera_records(records_path).values()] == ["given", "guess"]
     assert camera_of(path, "a.jpg").params.tolist() == [71, 72, 44, 31]

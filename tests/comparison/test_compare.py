@@ -29,7 +29,7 @@ from colmap_affrect.images.reading import read_mask
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.progress import SILENT
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.session.context import Resources
 
 CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
 NUM_IMAGES = 3

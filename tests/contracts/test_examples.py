@@ -19,7 +19,7 @@ from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.context import Context, Inputs
+from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs

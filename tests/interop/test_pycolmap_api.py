@@ -19,7 +19,7 @@ from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, Stor
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
+from colmap_affrect.session.context import Context
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import map_and_report, map_from_database
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
 
 

@@ -32,10 +32,10 @@ from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.context import Context, Inputs, Resources
+from colmap_affrect.session.context import Context, Inputs, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import Matching, iterate_matches, match
-from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
+from colmap_affrect.stages.pairs import choose_pairs
 
 START_TIMEOUT_S = 60.0
 RECIPE = load_recipe("unrectified-rootsift")
@@ -276,7 +276,7 @@ def test_threads_one_pair_alone_and_a_resumed_run_find_the_same(
     expected = matched(tmp_path / "one", extracted, weights, Threads(1))
     assert matched(tmp_path / "two", extracted, weights, Threads(2)) == expected
     context = Context(Workspace(tmp_path / "one"), Resources(weights, "cpu"))
-    pairs = listed_pairs(context)
+    pairs = context.listed_pairs()
     assert sum(len(found.scores) for found in context.matches.read(pairs)) > 50
     matching = Matching(
         context.features, WITH_NETWORK.matching, extractor="aliked", resources=context.resources

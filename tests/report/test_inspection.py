@@ -14,7 +14,7 @@ from colmap_affrect.data import Photograph, Rectification, RectificationPlan
 from colmap_affrect.errors import ImageError
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.report.inspection import PALETTE, WIDTH_PX, inspect_image, inspect_level, tinted
-from colmap_affrect.stages import context
+from colmap_affrect.session import context
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
 SIZE = (300, 200)

@@ -19,12 +19,12 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.project.stores import STATIONARY
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages import guide as stage
 from colmap_affrect.stages import stationary
-from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.guide import current, exact_inliers, guide, guided_counts
 from colmap_affrect.stages.stationary import NUM_CELLS
-from colmap_affrect.stages.verify import verified_inliers, verify_matches
+from colmap_affrect.stages.verify import verify_matches
 
 ALWAYS = GuidedOptions(enabled="always")
 
@@ -53,9 +53,9 @@ def guided(after: Workspace, tmp_path: Path) -> Context:
 
 
 def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, context: Context) -> None:
-    exact = verified_inliers(Context(before))
+    exact = Context(before).verified_inliers()
     assert guide(context, ALWAYS).num_done == len(exact) == 6
-    found = verified_inliers(context)
+    found = context.verified_inliers()
     counts = guided_counts(context)
     assert counts["pairs"] > 1
     assert counts["matches_after"] > 1.05 * counts["matches_before"]
@@ -79,7 +79,7 @@ def test_guided_matches_are_right(guided: Context) -> None:
     """A geometry of the first inliers explains nearly all that came later."""
     exact = exact_inliers(guided, current(guided))
     frames = {name: guided.features.read(name).keypoints for name in NAMES}
-    for pair, indices in verified_inliers(guided).items():
+    for pair, indices in guided.verified_inliers().items():
         known = {*map(tuple, exact[pair])}
         new = np.array([row for row in indices.tolist() if tuple(row) not in known])
         if not len(new):
@@ -99,7 +99,7 @@ def test_sets_that_hang_together_are_left_alone(before: Workspace, context: Cont
 
 
 def test_only_images_in_need(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
-    every, in_need = set(verified_inliers(context)), {NAMES[1]}
+    every, in_need = set(context.verified_inliers()), {NAMES[1]}
     monkeypatch.setattr(stage, "weakly_connected_images", lambda *_: in_need)
     assert guide(context).num_done == 3
     assert {pair.names for pair in context.guided.read()} == {p for p in every if NAMES[1] in p}
@@ -146,7 +146,7 @@ def test_killed_before_the_geometries_are_written_it_goes_on(
 
 
 def same_inliers(first: Context, second: Context) -> None:
-    one, other = verified_inliers(first), verified_inliers(second)
+    one, other = first.verified_inliers(), second.verified_inliers()
     assert one.keys() == other.keys()
     for pair, indices in one.items():
         assert_array_equal(indices, other[pair])
@@ -163,7 +163,7 @@ def test_verification_over_again_forgets_inliers_by_guiding(
 
 def test_ids_of_a_pair_are_in_order(context: Context) -> None:
     ids = image_ids(context.workspace.database)
-    assert all(ids[first] < ids[second] for first, second in verified_inliers(context))
+    assert all(ids[first] < ids[second] for first, second in context.verified_inliers())
     guide(context, ALWAYS)
     with open_database(context.workspace.database) as database:
         assert len(database.read_two_view_geometries()[0]) == 6

@@ -28,8 +28,8 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
+from colmap_affrect.session.context import Context, Inputs, Resources
 from colmap_affrect.stages import match, one_image
-from colmap_affrect.stages.context import Context, Inputs, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.one_image import num_images_at_once, prepare
 

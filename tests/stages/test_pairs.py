@@ -17,8 +17,8 @@ from colmap_affrect.colmap.database import image_ids, nearest_positions, open_da
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages import pairs as stage
-from colmap_affrect.stages.context import Context
 
 WGS84 = pycolmap.PosePriorCoordinateSystem.WGS84
 CARTESIAN = pycolmap.PosePriorCoordinateSystem.CARTESIAN

@@ -37,8 +37,8 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.stores import FeatureStore, pair_key
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.advice import advice
-from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.report.advice import advice
+from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.stages.verify import verify_matches
 
 CAMERA_ARGUMENTS = ["--camera-mode", "single", *CAMERA[2:]]

@@ -11,16 +11,17 @@ from small_scene import NAMES
 from verified import copy_of, verified
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.escalation.escalate import Escalation
+from colmap_affrect.escalation.expected_gain import Step
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import PairMatches, Worth
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages import map as stage
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, unmeasured_pairs
-from colmap_affrect.stages.expected_gain import Step
+from colmap_affrect.stages.map import unmeasured_pairs
 
 RECIPE = """
 [rectifier]
@@ -58,7 +59,7 @@ def escalation_of(context: Context) -> Escalation:
 
 def without_matches(context: Context, name: str) -> list[tuple[str, str]]:
     """Take the matches of an image, and return its pairs."""
-    own = [pair for pair in escalation_of(context).pairs if name in pair]
+    own = [pair for pair in escalation_of(context).state.pairs if name in pair]
     for found in list(context.matches.read(own)):
         none = replace(found, indices=found.indices[:0], scores=found.scores[:0])
         context.matches.write([none], own, 0)
@@ -77,13 +78,13 @@ def test_images_that_measured_frames_hold_need_no_others(context: Context) -> No
     """Only one that is not there does, or one without a pair with a likely image."""
     own = without_matches(context, NAMES[3])
     names = tuple(sorted(NAMES))
-    escalation, states = escalation_of(context), escalation_of(context).states()
+    escalation, states = escalation_of(context), escalation_of(context).state.states()
     model = ModelSummary(names, 9, 2.0, 0.5, doubtful={NAMES[0]: "few matches"})
-    assert escalation._held(model, states) == set(NAMES) - {NAMES[3]}
+    assert escalation.state._anchored(model, states) == set(NAMES) - {NAMES[3]}
     all_doubtful = replace(model, doubtful=dict.fromkeys(names, "few matches"))
-    assert escalation._held(all_doubtful, states) == set()
+    assert escalation.state._anchored(all_doubtful, states) == set()
     without = replace(model, registered_names=names[1:])
-    assert names[0] not in escalation._held(without, states)
+    assert names[0] not in escalation.state._anchored(without, states)
     assert all(NAMES[3] in pair for pair in own)
 
 
@@ -118,7 +119,7 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
     escalation = Escalation(context, options)
     assert escalation.next_step() == Step(1, own[2:])
     escalation.match_at(own[2:], 1)
-    assert min(escalation.num_inliers()[pair] for pair in own) > 30
+    assert min(escalation.state.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_step() is None
 
 

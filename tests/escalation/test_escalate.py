@@ -15,8 +15,14 @@ from results import database_content
 from verified import copy_of, verified
 
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
+from colmap_affrect.colmap.verification import (
+    PairVerifier,
+    VerificationOptions,
+    weakly_connected_images,
+)
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
+from colmap_affrect.escalation import escalate as escalation
+from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import FileTransaction
@@ -24,10 +30,8 @@ from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages import escalate as escalation
-from colmap_affrect.stages.context import Context, Resources
-from colmap_affrect.stages.escalate import Escalation
-from colmap_affrect.stages.expected_gain import weakly_connected_images
+from colmap_affrect.session.context import Context, Resources
+from colmap_affrect.stages import verify as verification
 from colmap_affrect.stages.verify import extracted_px
 
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images"
@@ -143,7 +147,8 @@ def test_hard_pair_escalates_and_succeeds(escalated: Workspace) -> None:
 
 def test_trial_of_a_pair_is_what_the_database_then_holds(escalated: Workspace) -> None:
     size_px = Context(escalated).extraction.max_image_size_px
-    verifier = PairVerifier(escalated.database, VerificationOptions(), size_px)
+    graph = Context(escalated).graph
+    verifier = PairVerifier(graph.ids, graph.cameras, VerificationOptions(), size_px)
     store = FeatureStore(escalated.features)
     for pair in (EASY, HARD, HARD[::-1]):
         frames = [store.read_frames(name) for name in pair]
@@ -231,10 +236,10 @@ def test_strong_pairs_without_a_track_of_three_escalate(
     chain = {EASY: 200, (NAMES[1], NAMES[2]): 150}
     matches = {pair: np.arange(80).reshape(40, 2) for pair in chain}
     apart = {**matches, (NAMES[1], NAMES[2]): np.arange(1, 81).reshape(40, 2)}
-    monkeypatch.setattr(work, "num_inliers", lambda: chain)
-    monkeypatch.setattr(escalation, "verified_inliers", lambda _: apart)
+    monkeypatch.setattr(work.state, "num_inliers", lambda: chain)
+    monkeypatch.setattr(Context, "verified_inliers", lambda _: apart)
     assert work.next_step() is None
-    monkeypatch.setattr(escalation, "verified_inliers", lambda _: matches)
+    monkeypatch.setattr(Context, "verified_inliers", lambda _: matches)
     step = work.next_step()
     assert step
     assert (step.level, step.pairs) == (1, list(chain))
@@ -247,7 +252,7 @@ def test_photographs_that_are_likely_right_in_another_model_need_a_quarter(
     digest = work.context.verified_digest()
     monkeypatch.setattr(Workspace, "made_from", lambda *_: digest)
     models = [ModelSummary(names, 9, 2.0, 0.5) for names in ((), EASY)]
-    assert work.needs(models) == {EASY[0]: 0.25, EASY[1]: 0.25, NAMES[2]: 1.0}
+    assert work.state.weights(models) == {EASY[0]: 0.25, EASY[1]: 0.25, NAMES[2]: 1.0}
 
 
 @pytest.mark.long
@@ -305,15 +310,12 @@ def test_again_does_nothing(
 
 
 def killed_at(patch: pytest.MonkeyPatch, where: str) -> None:
-    """Kill a function when it is called for the second time."""
-    calls = [getattr(escalation, where)]  # once before the first step
+    """Kill a function when it is called."""
 
-    def killed(*given: object, **options: object) -> None:
-        if not calls:
-            raise KeyboardInterrupt
-        calls.pop()(*given, **options)
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
 
-    patch.setattr(escalation, where, killed)
+    patch.setattr(escalation if where == "update_verified" else verification, where, killed)
 
 
 def killed_after(patch: pytest.MonkeyPatch, path: Path, number: int) -> None:
@@ -330,7 +332,7 @@ def killed_after(patch: pytest.MonkeyPatch, path: Path, number: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("when", ["write_matches", "verify_new", 1, 2, 3])
+@pytest.mark.parametrize("when", ["update_verified", "write_matches", "verify_pairs", 1, 2, 3])
 def test_killed_run_goes_on_to_the_same_result(
     before: Workspace,
     escalated: Workspace,

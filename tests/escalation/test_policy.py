@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 
-from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages import escalation_policy as policy
-from colmap_affrect.stages.escalation_policy import (
+from colmap_affrect.escalation import policy
+from colmap_affrect.escalation.expected_gain import PairState, gain_of, kind_of
+from colmap_affrect.escalation.policy import (
     EFFORTS,
     SMALL,
     Situation,
@@ -20,7 +19,8 @@ from colmap_affrect.stages.escalation_policy import (
     tried,
     untried,
 )
-from colmap_affrect.stages.expected_gain import PairState, gain_of, kind_of
+from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.recipes import load_recipe
 
 LEVELS = load_recipe("default").levels
 KINDS = [kind_of(level) for level in LEVELS]
@@ -31,19 +31,19 @@ NAMES = "abcde"
 def situation(names: str | list[str] = NAMES, **given: Any) -> Situation:
     """A set of images of one megapixel; those in need are not registered."""
     pairs: list[Pair] = list(itertools.combinations(names, 2))
-    needs = given.pop("needs", "de")
+    weights = given.pop("weights", "de")
     done = given.pop("tried", {})
     sizes = dict.fromkeys(names, 1.0)
     values: dict[str, Any] = {
         "levels": LEVELS,
         "usable": [1, 2, 3, 4],
         "states": {pair: PairState(0, 3, tried=done.get("".join(pair), 1)) for pair in pairs},
-        "needs": dict.fromkeys(needs, 1.0),
-        "loose": (),
-        "held": (),
+        "weights": dict.fromkeys(weights, 1.0),
+        "weakly_connected": (),
+        "anchored": (),
         "megapixels": [sizes] * len(LEVELS),
         "lacking": [set(names)] * len(LEVELS),
-        "registered": [name for name in names if name not in needs],
+        "registered": [name for name in names if name not in weights],
     }
     return Situation(**values | given)
 
@@ -57,8 +57,8 @@ def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need(
     step = learned_step(situation())
     assert step.level == LEARNED
     assert ["".join(pair) for pair in step.pairs] == ["ad", "ae", "bd", "be", "cd", "ce", "de"]
-    assert not learned_step(situation(needs="")).pairs
-    assert not next_step(situation(needs=""), "high").step.pairs
+    assert not learned_step(situation(weights="")).pairs
+    assert not next_step(situation(weights=""), "high").step.pairs
 
 
 def test_pairs_that_have_learned_matches_used_or_not_get_no_others(
@@ -92,11 +92,11 @@ def test_without_weights_other_levels_are_tried() -> None:
 
 def test_learned_matching_of_a_large_set_takes_as_long_as_the_first_model() -> None:
     names = [f"{number:03}" for number in range(SMALL + 1)]
-    large = situation(names, needs=names)
+    large = situation(names, weights=names)
     step = learned_step(large)
     assert 0 < len(step.pairs) < len(large.states)
     assert step.seconds <= large.first_model_s + len(names)
-    assert len(learned_step(situation(names[:SMALL], needs=names[:SMALL])).pairs) == 435
+    assert len(learned_step(situation(names[:SMALL], weights=names[:SMALL])).pairs) == 435
 
 
 def done_with_learned(**given: Any) -> Situation:
@@ -121,7 +121,7 @@ def test_afterwards_the_budget_of_the_effort_counts() -> None:
 
 def test_learned_level_of_a_large_set_is_a_step_of_its_own() -> None:
     names = [f"{number:03}" for number in range(SMALL + 1)]
-    assert next_step(situation(names, needs=names), "low").step.level == LEARNED
+    assert next_step(situation(names, weights=names), "low").step.level == LEARNED
 
 
 def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one() -> None:
@@ -154,7 +154,7 @@ def test_little_hope_ends_it_but_while_nothing_is_registered(
     monkeypatch.setattr(policy, "MIN_PHOTOGRAPHS", 100.0)
     assert not next_step(done_with_learned(), "high").step.pairs
     assert not untried(done_with_learned())
-    nothing = done_with_learned(needs=NAMES)
+    nothing = done_with_learned(weights=NAMES)
     assert not nothing.registered
     assert next_step(nothing, "normal").step.pairs
 
@@ -162,7 +162,7 @@ def test_little_hope_ends_it_but_while_nothing_is_registered(
 def test_images_that_measured_frames_hold_get_no_learned_warps() -> None:
     warps = KINDS.index("learned, warps")
     assert done_with_learned().best_at(warps, 1e9).pairs
-    assert not done_with_learned(held="de").best_at(warps, 1e9).pairs
+    assert not done_with_learned(anchored="de").best_at(warps, 1e9).pairs
 
 
 def test_what_was_tried_and_what_was_not_is_told_by_kind() -> None:

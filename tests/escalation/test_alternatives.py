@@ -17,15 +17,8 @@ from verified import copy_of, verified
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.features.base import EXTRACTORS
-from colmap_affrect.mappers.base import MAPPERS, Mapper
-from colmap_affrect.mappers.mapping import read_summaries
-from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING, LOOKED_AT, RESTORING
-from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import Recipe, load_recipe
-from colmap_affrect.stages import alternatives, climb
-from colmap_affrect.stages.alternatives import (
+from colmap_affrect.escalation import alternatives, climb
+from colmap_affrect.escalation.alternatives import (
     Choice,
     LookedAt,
     best_score,
@@ -39,8 +32,16 @@ from colmap_affrect.stages.alternatives import (
     score,
     take_over_chosen,
 )
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, begin, matched_again
+from colmap_affrect.escalation.escalate import Escalation, begin, matched_again
+from colmap_affrect.escalation.set_state import SetState
+from colmap_affrect.features.base import EXTRACTORS
+from colmap_affrect.mappers.base import MAPPERS, Mapper
+from colmap_affrect.mappers.mapping import read_summaries
+from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING, LOOKED_AT, RESTORING
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
 
@@ -72,8 +73,8 @@ def matched(photos: Path, recipe: Recipe, tmp_path_factory: pytest.TempPathFacto
     """All pairs were matched by both kinds; the learned ones have fewer features."""
     workspace = verified(photos, tmp_path_factory.mktemp("matched") / "out", recipe.name)
     escalation, _ = begin(Context(workspace), recipe.escalate)
-    escalation.matches.keep_note(LEARNING, [1, list(escalation.pairs)])
-    assert escalation.learn() == len(escalation.pairs)
+    escalation.matches.keep_note(LEARNING, [1, list(escalation.state.pairs)])
+    assert escalation.learn() == len(escalation.state.pairs)
     return workspace
 
 
@@ -92,7 +93,7 @@ def escalation_of(context: Context) -> Escalation:
 
 
 def levels(context: Context) -> set[int]:
-    return set(context.matches.levels(escalation_of(context).pairs).values())
+    return set(context.matches.levels(escalation_of(context).state.pairs).values())
 
 
 def with_models(
@@ -121,11 +122,11 @@ def with_models(
 
 
 def test_learned_matches_are_kept_beside_those_that_are_there(context: Context) -> None:
-    pairs = escalation_of(context).pairs
+    pairs = escalation_of(context).state.pairs
     learned = context.matches.learned(list(pairs))
     assert levels(context) == {0}
     assert set(learned) == set(pairs)
-    states = escalation_of(context).states()
+    states = escalation_of(context).state.states()
     for pair, kept in learned.items():
         assert kept.matches.level == 1
         assert kept.matches.names == pair
@@ -137,12 +138,12 @@ def test_step_takes_matches_that_are_kept_and_matches_nothing_anew(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     escalation = escalation_of(context)
-    (pair, *_) = escalation.pairs
+    (pair, *_) = escalation.state.pairs
     without_matches(escalation, pair)
     (kept,) = context.matches.learned([pair]).values()
-    monkeypatch.setattr("colmap_affrect.stages.escalate.matched_at_level", None)
+    monkeypatch.setattr("colmap_affrect.escalation.escalate.matched_at_level", None)
     escalation.match_at([pair], 1)
-    state = escalation.states()[pair]
+    state = escalation.state.states()[pair]
     assert (state.level, state.num_inliers, state.tried) == (1, kept.worth[0], 0b11)
     assert (state.measured_worth, state.learned_level) == ((0, 0), 1)
 
@@ -160,8 +161,8 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     escalation = escalation_of(context)
     better = replace(UNSURE, probabilities=dict.fromkeys(NAMES[:2], 0.9))
     asked = with_models(monkeypatch, found=better, there=[UNSURE])
-    learned = context.matches.learned(list(escalation.pairs))
-    before = escalation.states()
+    learned = context.matches.learned(list(escalation.state.pairs))
+    before = escalation.state.states()
     look_at_learned(escalation, mapper)
     assert len(asked) == 1
     assert not choose_learned(escalation, at_once=True)  # more may be tried without them
@@ -181,7 +182,7 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
         for pair, kept in learned.items():
             stored = database.read_matches(*(ids[name] for name in pair))
             assert_array_equal(stored, kept.matches.indices)
-    for pair, state in escalation.states().items():
+    for pair, state in escalation.state.states().items():
         assert state.measured_worth == before[pair].worth
     assert not choose_learned(escalation, at_once=False)  # that is decided
 
@@ -243,7 +244,7 @@ def made_worse(workspace: Workspace, mapper: Mapper) -> Escalation:
     keep_best(context)
     more = context.features.read(NAMES[1]).select(np.arange(7))
     context.features.extend(NAMES[1], more, 2)
-    for pair in escalation.pairs:
+    for pair in escalation.state.pairs:
         if NAMES[0] in pair:
             (there,) = escalation.matches.read([pair])
             none = replace(there, indices=there.indices[:0], scores=there.scores[:0], level=1)
@@ -282,7 +283,7 @@ def test_best_models_and_their_matches_come_back(
             assert ids[: was.num_points2D()] == [point.point3D_id for point in was.points2D]
             assert image.num_points3D == was.num_points3D
     assert model.num_points3D() == old.num_points3D()
-    tried = context.matches.levels(escalation.pairs, "tried")
+    tried = context.matches.levels(escalation.state.pairs, "tried")
     assert {levels for pair, levels in tried.items() if NAMES[0] in pair} == {0b11}
     assert map_images(context, mapper, goes_on=True)[0].num_done == 0  # nothing is mapped anew
     assert not restore_best(escalation)
@@ -320,7 +321,7 @@ def test_models_of_other_pairs_than_the_verified_ones_are_not_kept(
     mapped: Workspace, tmp_path: Path
 ) -> None:
     context = Context(copy_of(mapped, tmp_path / "out"))
-    without_matches(escalation_of(context), escalation_of(context).pairs[0])
+    without_matches(escalation_of(context), escalation_of(context).state.pairs[0])
     keep_best(context)
     assert not context.workspace.best.exists()
 
@@ -343,7 +344,7 @@ def test_images_that_are_left_out_need_nothing_and_are_no_lack(
     sure = replace(UNSURE, registered_names=others, probabilities=dict.fromkeys(others, 0.95))
     with_models(monkeypatch, found=sure, there=[UNSURE])
     said = replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
-    assert NAMES[0] not in escalation_of(said).needs([UNSURE])
+    assert NAMES[0] not in escalation_of(said).state.weights([UNSURE])
     look_at_learned(escalation_of(said), mapper)
     looked_at = LookedAt.of(said)
     assert looked_at
@@ -355,15 +356,15 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
 ) -> None:
     """Images may have got features: what is needed would look different."""
     escalation = escalation_of(context)
-    pairs = list(escalation.pairs)
+    pairs = list(escalation.state.pairs)
     context.matches.keep_note(LEARNING, None)
-    monkeypatch.setattr(Escalation, "needs", lambda *_: dict.fromkeys(NAMES, 1.0))
+    monkeypatch.setattr(SetState, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
     assert not escalation.plan_learning()  # all have learned matches
     context.matches.remove(pairs=pairs)
     match(context)
     escalation.write()
     assert escalation.plan_learning()
-    monkeypatch.setattr(Escalation, "needs", lambda *_: {})
+    monkeypatch.setattr(SetState, "weights", lambda *_: {})
     assert escalation.plan_learning()
     assert not escalation.is_learned
     monkeypatch.setattr(Escalation, "is_over_time", True)
@@ -374,7 +375,7 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
 
 
 def test_matches_of_pairs_that_are_removed_take_learned_ones_along(context: Context) -> None:
-    pairs = list(escalation_of(context).pairs)
+    pairs = list(escalation_of(context).state.pairs)
     context.matches.keep_note(LOOKED_AT, [1])
     context.matches.remove(pairs=pairs[:1])
     assert not context.matches.has(pairs).any()
@@ -387,17 +388,17 @@ def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
     photos: Path, recipe: Recipe, mapper: Mapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also the copy of the workspace is mapped here."""
-    needs = Escalation.needs
+    weights = SetState.weights
 
-    def unsure(escalation: Escalation, models: Sequence[ModelSummary]) -> dict[str, float]:
-        return needs(escalation, models) or dict.fromkeys(NAMES, 1e-3)
+    def unsure(state: SetState, models: Sequence[ModelSummary]) -> dict[str, float]:
+        return weights(state, models) or dict.fromkeys(NAMES, 1e-3)
 
-    monkeypatch.setattr(Escalation, "needs", unsure)
+    monkeypatch.setattr(SetState, "weights", unsure)
     workspace = verified(photos, tmp_path / "out", recipe.name)
     context = Context(workspace)
     with workspace.locked():
         reports = climb.climb(context, mapper, recipe)
-        assert reports[-1].num_done == len(escalation_of(context).pairs)
+        assert reports[-1].num_done == len(escalation_of(context).state.pairs)
         looked_at = LookedAt.of(context)
         assert looked_at
         assert looked_at.score > 1.0
@@ -421,7 +422,7 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
     """Mapping their matches a second time might end elsewhere."""
     spaces = [copy_of(matched, tmp_path / name) for name in ("whole", "killed")]
     monkeypatch.setattr(LookedAt, "is_enough", True)
-    monkeypatch.setattr(Escalation, "needs", lambda *_: {NAMES[0]: 1.0})
+    monkeypatch.setattr(SetState, "weights", lambda *_: {NAMES[0]: 1.0})
     monkeypatch.setattr(Escalation, "next_step", lambda _: None)
     whole, killed = (Context(space) for space in spaces)
     climb.climb(whole, mapper, recipe)

@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from colmap_affrect.colmap.verification import connected_parts
-from colmap_affrect.recipes import Level, load_recipe, recipe_names
-from colmap_affrect.stages import expected_gain
-from colmap_affrect.stages.expected_gain import (
+from colmap_affrect.escalation import expected_gain
+from colmap_affrect.escalation.expected_gain import (
     ExpectedGain,
     PairState,
     Step,
@@ -18,6 +17,7 @@ from colmap_affrect.stages.expected_gain import (
     insecure_images,
     terms,
 )
+from colmap_affrect.recipes import Level, load_recipe, recipe_names
 
 LEVELS = load_recipe("default").levels
 COVERS, LEARNED = LEVELS[1], LEVELS[2]
@@ -66,11 +66,11 @@ def test_levels_of_any_recipe_are_of_a_kind() -> None:
 
 def gains(
     inliers: dict[str, int],
-    needs: dict[str, float],
+    weights: dict[str, float],
     consistent: dict[str, int] | None = None,
     **given: Any,
 ) -> ExpectedGain:
-    """What a level may bring; ``tried`` by pair, ``loose`` and ``lacking`` are optional."""
+    """What a level may bring; ``tried`` by pair, others are optional."""
     tried = given.get("tried", {})
     states = {
         (pair[0], pair[1]): PairState(
@@ -79,9 +79,9 @@ def gains(
         for pair, count in inliers.items()
     }
     sizes = dict.fromkeys("abcdef", 1.0)
-    loose, lacking = set(given.get("loose", "")), set(given.get("lacking", ""))
+    weak, lacking = set(given.get("weakly_connected", "")), set(given.get("lacking", ""))
     registered = given.get("registered", "abc")
-    return ExpectedGain(states, loose, needs, sizes, [2, 4], lacking, registered, 100)
+    return ExpectedGain(states, weak, weights, sizes, [2, 4], lacking, registered, 100)
 
 
 def best(found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf) -> Step:
@@ -123,9 +123,9 @@ def test_no_step_takes_more_than_the_budget(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_while_there_is_no_model_strong_pairs_and_small_parts_count_too() -> None:
     pairs = {"ab": 200, "bc": 90, "de": 90}
-    needs = dict.fromkeys("abcde", 1.0)
-    none = best(gains(pairs, needs, registered="")).num_pairs
-    some = best(gains(pairs, needs, registered="abc")).num_pairs
+    weights = dict.fromkeys("abcde", 1.0)
+    none = best(gains(pairs, weights, registered="")).num_pairs
+    some = best(gains(pairs, weights, registered="abc")).num_pairs
     assert (none, some) == (3, 1)
 
 
@@ -143,12 +143,12 @@ def test_images_are_not_saved_twice() -> None:
     assert len(chosen(gains(many, {"f": 1.0}, likely))) < 5
 
 
-def test_levels_that_were_tried_are_done_and_strong_pairs_but_for_loose_images() -> None:
+def test_levels_that_were_tried_are_done_and_strong_pairs_but_for_weakly_connected_images() -> None:
     pairs = {"ab": 200, "bc": 90}
-    needs = {"a": 1.0, "b": 1.0}
-    assert chosen(gains(pairs, needs)) == ["bc"]
-    assert "ab" in chosen(gains(pairs, needs, loose="a"))
-    assert chosen(gains(pairs, needs, loose="a", tried={"ab": 0b11})) == ["bc"]
+    weights = {"a": 1.0, "b": 1.0}
+    assert chosen(gains(pairs, weights)) == ["bc"]
+    assert "ab" in chosen(gains(pairs, weights, weakly_connected="a"))
+    assert chosen(gains(pairs, weights, weakly_connected="a", tried={"ab": 0b11})) == ["bc"]
 
 
 def test_a_level_that_verified_nothing_is_less_likely_to() -> None:

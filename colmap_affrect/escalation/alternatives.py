@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from colmap_affrect.escalation.escalate import Escalation
+from colmap_affrect.escalation.policy import SMALL
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import copy_with_keypoints, model_folders, read_summaries
 from colmap_affrect.pairs.lists import Pair
@@ -31,9 +33,7 @@ from colmap_affrect.project.stores import (
     PairMatches,
     Worth,
 )
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation
-from colmap_affrect.stages.escalation_policy import SMALL
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.verify import verify_matches
@@ -155,11 +155,11 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
 
 
 def _learned_choice(escalation: Escalation) -> Choice:
-    states = escalation.states()
+    states = escalation.state.states()
     learned = escalation.matches.learned(list(states))
     levels = {pair: found.matches.level for pair, found in learned.items()}
     changed = [pair for pair, level in levels.items() if states[pair].level != level]
-    measured = [pair for pair in changed if escalation.is_measured[states[pair].level]]
+    measured = [pair for pair in changed if escalation.state.is_measured[states[pair].level]]
     worths = {pair: states[pair].worth for pair in measured}
     return Choice([learned[pair].matches for pair in changed], worths)
 
@@ -273,7 +273,7 @@ def restore_best(escalation: Escalation) -> bool:
     if best_score(context) <= present_score(context):
         return False
     before = MatchStore(best / context.workspace.matches.name)
-    pairs = list(escalation.num_inliers())
+    pairs = list(escalation.state.num_inliers())
     levels = context.matches.levels(pairs)
     changed = [p for p, level in before.levels(pairs).items() if level != levels[p]]
     choice = Choice(list(before.read(changed)), before.measured_worths(changed))

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.errors import such_as
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
@@ -16,7 +15,7 @@ from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import Advice, MatchedAgain, ModelSummary
 from colmap_affrect.project.tables import as_row
-from colmap_affrect.stages.context import Context, Inputs
+from colmap_affrect.session.context import Context, Inputs
 
 STRONGEST = "default"  # of the recipes
 ENOUGH = 100  # inliers of a pair that make a model wherever it shows depth
@@ -79,7 +78,7 @@ def advice(
     Returns:
         What may help, the most promising first.
     """
-    num_keypoints = colmap_database.keypoint_counts(context.workspace.database)
+    num_keypoints = context.graph.num_keypoints
     lost = [n for n in missing if n in num_keypoints and n not in context.by_hand.left_out]
     num_usable = sum(map(bool, num_keypoints.values()))
     case = _Case(context, lost, len(num_keypoints), models, strongest, untried, effort)

@@ -1,4 +1,4 @@
-"""What all stages of a run have in common: photographs, options on record, files, resources."""
+"""What all stages of a run have in common: photographs, options on record, files, view graph."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,10 +10,10 @@ from colmap_affrect.colmap.by_hand import NOTHING, ByHand
 from colmap_affrect.colmap.cameras import read_given_cameras
 from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.colmap.initial_cameras import InitialCameras
-from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import AffrectError, ImageError, OptionError
 from colmap_affrect.features.weights import WEIGHT_FILES, find, install_hint
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import (
     CameraOptions,
     MaskOptions,
@@ -26,7 +26,8 @@ from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import EffortName, Options
-from colmap_affrect.pairs.lists import PairOptions
+from colmap_affrect.pairs import lists
+from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.outputs import database_files
@@ -35,6 +36,7 @@ from colmap_affrect.project.record import Content, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
+from colmap_affrect.session.view_graph import ViewGraph
 
 Built = TypeVar("Built")
 
@@ -220,11 +222,38 @@ class Context:
     effort: EffortName = "normal"  # how much is tried for images in need
     by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
     command: tuple[str, ...] = ()  # words of the command line, for advice
+    graph: ViewGraph = field(default_factory=lambda: ViewGraph(Path()))  # of the database
+
+    def __post_init__(self) -> None:
+        """Begin another graph where the folder, and so the database, is another."""
+        if self.graph.path != self.workspace.database:
+            object.__setattr__(self, "graph", ViewGraph(self.workspace.database))
 
     def verified_digest(self) -> str:
         """Return digests of the verified pairs and, after a plus, of what is said by hand."""
         said = self.by_hand.digest()
-        return rows_digest(self.workspace.database) + (f"+{said}" if said else "")
+        return self.graph.digest() + (f"+{said}" if said else "")
+
+    def listed_pairs(self) -> PairList:
+        """Return the pairs of the list whose images have features."""
+        path = self.workspace.pairs
+        self.workspace.require("pairs")
+        if not path.exists():
+            raise AffrectError(
+                f"{path}: no such file, the photographs have changed; run 'colmap-affrect pairs' "
+                "and then match again"
+            )
+        names = self.features.names()
+        return lists.read_pairs(path, names) if len(names) > 1 else PairList.of(())
+
+    def num_verified_inliers(self) -> dict[Pair, int]:
+        """Return the number of inliers of each verified pair; another program has its threshold."""
+        is_foreign = self.workspace.is_foreign
+        return self.graph.num_inliers(1 if is_foreign else self.verification.min_num_inliers)
+
+    def verified_inliers(self) -> dict[Pair, Indices]:
+        """Return the (M, 2) features of each verified pair that are inliers."""
+        return self.graph.inliers(self.verification.min_num_inliers)
 
     @property
     def features(self) -> FeatureStore:

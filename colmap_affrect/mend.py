@@ -25,11 +25,10 @@ from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.record import stamp_of
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.verify import verify_matches
+from colmap_affrect.stages.verify import update_verified, verify_matches
 
 logger = logging.getLogger(__name__)
 
@@ -57,7 +56,7 @@ def watched(
         refuse_unusable(path, FATAL_AS_IT_IS)
         logger.warning("%s: %s, and is mapped as it is", path, CHANGED)
         workspace.is_changed = True
-        record_cameras(path, workspace.cameras)
+        record_cameras(context.graph.cameras, workspace.cameras)
         yield  # the seal stays: other commands make the database again
         return
     if why:
@@ -119,6 +118,7 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
         hint = f"; 'colmap-affrect {again}' maps what was there"
     logger.warning("%s: %s; it is made again from %s%s", workspace.database, why, source, hint)
     workspace.rewind()
+    context.graph.forget()
     if not (follows and "verify" in begun):
         return
     if foreign:
@@ -126,7 +126,7 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
         return
     verify_matches(context)
     if "escalate" in begun:
-        Escalation(context, context.escalation).write()
+        update_verified(context, context.listed_pairs(), replaces=True)
     if "guide" in begun:
         guide(context)
 

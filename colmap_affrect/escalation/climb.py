@@ -2,18 +2,13 @@
 
 The first model says what is needed: where it is sure of all photographs, nothing more is done.
 Later models begin with those before. Models of learned matches are looked at as well, and the
-best ones so far are gone back to in the end (:mod:`colmap_affrect.stages.alternatives`).
+best ones so far are gone back to in the end (:mod:`colmap_affrect.escalation.alternatives`).
 """
 
 import time
 from dataclasses import replace
 
-from colmap_affrect.mappers.base import Mapper
-from colmap_affrect.mappers.mapping import model_folders
-from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING
-from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages.alternatives import (
+from colmap_affrect.escalation.alternatives import (
     choose_learned,
     follow_keypoints,
     forget_others,
@@ -23,8 +18,13 @@ from colmap_affrect.stages.alternatives import (
     restore_best,
     take_over_chosen,
 )
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, begin
+from colmap_affrect.escalation.escalate import Escalation, begin
+from colmap_affrect.mappers.base import Mapper
+from colmap_affrect.mappers.mapping import model_folders
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING
+from colmap_affrect.recipes import Recipe
+from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 

@@ -1,11 +1,11 @@
 """What is matched again next, and when to stop: the policy of escalation, without its execution.
 
 1. Learned matching of whole photographs comes first, where its weights are there: it costs little
-   and helps where light, age or season differ. On small sets all pairs of images in need are
-   matched by it, beside what is there (:mod:`colmap_affrect.stages.alternatives`); on others as
+   and helps where light, age or season differ. On small sets all pairs of images to match again are
+   matched by it, beside what is there (:mod:`colmap_affrect.escalation.alternatives`); on others as
    many as take what the first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
-   (:mod:`colmap_affrect.stages.expected_gain`), until the budget of the effort is spent, or
+   (:mod:`colmap_affrect.escalation.expected_gain`), until the budget of the effort is spent, or
    nothing is likely to help.
 
 All seconds are nominal, of one core: a run that is killed and goes on, or a busy machine, decides
@@ -16,11 +16,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from colmap_affrect.options import EffortName
-from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.report import MatchedAgain
-from colmap_affrect.recipes import Level
-from colmap_affrect.stages.expected_gain import (
+from colmap_affrect.escalation.expected_gain import (
     LEARNED,
     MAPPING_S,
     ExpectedGain,
@@ -29,8 +25,12 @@ from colmap_affrect.stages.expected_gain import (
     gain_of,
     kind_of,
 )
+from colmap_affrect.options import EffortName
+from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.report import MatchedAgain
+from colmap_affrect.recipes import Level
 
-SMALL = 30  # images up to which learned matching takes all pairs of images in need
+SMALL = 30  # images up to which learned matching takes all pairs of images to match again
 MIN_PHOTOGRAPHS = 0.2  # expected of all that the budget allows, below which nothing is tried
 
 
@@ -62,9 +62,9 @@ class Situation:
     levels: Sequence[Level]  # of the recipe, that of every image first
     usable: Sequence[int]  # numbers of the levels of escalation that may be tried
     states: Mapping[Pair, PairState]  # of all pairs
-    needs: Mapping[str, float]  # images in need, and what saving them is worth in photographs
-    loose: Collection[str]  # images with few features in tracks through three images
-    held: Collection[str]  # images of the model that measured frames tie to a likely one
+    weights: Mapping[str, float]  # of the images to match again, in photographs
+    weakly_connected: Collection[str]  # images with few features in tracks through three
+    anchored: Collection[str]  # images of the model that measured frames tie to a likely one
     megapixels: Sequence[Mapping[str, float]]  # of each image, by level
     lacking: Sequence[Collection[str]]  # images without features of a level, by level
     registered: Collection[str] = ()  # images of the largest model
@@ -72,7 +72,7 @@ class Situation:
 
     @property
     def is_small(self) -> bool:
-        """Whether learned matching takes all pairs of images in need."""
+        """Whether learned matching takes all pairs of images to match again."""
         return len(self.megapixels[0]) <= SMALL
 
     @property
@@ -116,12 +116,12 @@ class Situation:
         free_s = learned_s if self.is_small else min(learned_s, self.first_model_s)
         return sum(spent.values()) - free_s
 
-    def gain(self, number: int, needs: Mapping[str, float]) -> ExpectedGain:
-        """Return what a level may bring to images in need."""
+    def gain(self, number: int, weights: Mapping[str, float]) -> ExpectedGain:
+        """Return what a level may bring to images to match again."""
         return ExpectedGain(
             self.states,
-            set(self.loose),
-            needs,
+            set(self.weakly_connected),
+            weights,
             self.megapixels[number],
             [k for k in range(len(self.levels)) if not self.is_measured(k)],
             self.lacking[number],
@@ -137,28 +137,30 @@ class Situation:
 
     def best_at(self, number: int, budget_s: float) -> Step:
         """Return the best step of a level within a budget."""
-        # Others take like for same: only for images that no measured ones hold.
-        measured = self.is_measured(number)
-        needs = {n: x for n, x in self.needs.items() if measured or n not in self.held}
-        gain = self.gain(number, needs)
+        weights = dict(self.weights)
+        if not self.is_measured(number):
+            # Frames that are not measured take like for same: not for images that others anchor.
+            for name in self.anchored:
+                weights.pop(name, None)
+        gain = self.gain(number, weights)
         return gain.best_step(number, self.levels[number], self.needless_after(number), budget_s)
 
 
 def learned_step(situation: Situation) -> Step:
     """Return the pairs for learned matching.
 
-    Of a small set all of images in need, and the others, too, where they take no longer than the
-    first model: models of learned matches alone need them. Of a larger set as many as take what the
-    first model took, the most promising ones.
+    Of a small set all of images to match again, and the others, too, where they take no longer
+    than the first model: models of learned matches alone need them. Of a larger set as many as
+    take what the first model took, the most promising ones.
     """
     number = situation.learned_level
-    if number is None or not situation.needs:
+    if number is None or not situation.weights:
         return Step()
     if not situation.is_small:
         left_s = situation.first_model_s - situation.spent_on(number)
         return situation.best_at(number, left_s)
     lacking = [p for p, state in situation.states.items() if not situation.has_learned(state)]
-    needed = [pair for pair in lacking if not situation.needs.keys().isdisjoint(pair)]
+    needed = [pair for pair in lacking if not situation.weights.keys().isdisjoint(pair)]
     sizes = situation.megapixels[number]
     others = [(sizes[a], sizes[b]) for a, b in lacking if (a, b) not in needed]
     others_s = gain_of(situation.levels[number]).seconds((), others)
@@ -191,7 +193,7 @@ def next_step(situation: Situation, effort: EffortName) -> Plan:
     Returns:
         The step, and at most how long it and those after it take, in seconds of one core.
     """
-    if not situation.needs:
+    if not situation.weights:
         return Plan()
     budget = EFFORTS[effort].budget_s(situation.first_model_s, has_model=bool(situation.registered))
     left_s = budget - situation.spent_s()
@@ -220,7 +222,7 @@ def tried(situation: Situation) -> list[MatchedAgain]:
 
 
 def untried(situation: Situation) -> list[MatchedAgain]:
-    """Return what a greater effort would try for images in need, by level."""
+    """Return what a greater effort would try for images to match again, by level."""
     found = list[MatchedAgain]()
     for number in situation.usable:
         if situation.is_small and number == situation.learned_level:

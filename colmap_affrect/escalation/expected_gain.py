@@ -15,8 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 
-from colmap_affrect.colmap.verification import connected_parts, num_in_tracks
-from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.stores import Worth
 from colmap_affrect.recipes import Level
@@ -47,13 +46,13 @@ class PairState:
 class LevelGain:
     """What a kind of level usually brings and costs."""
 
-    weights: Mapping[str, float]  # of the regression, by name of the term
+    coefficients: Mapping[str, float]  # of the regression, by name of the term
     image_s: float  # of one core, for the features of an image, by megapixel
     pair_s: float  # the same for matching a pair of images
 
     def chance(self, terms: Mapping[str, float]) -> float:
         """Return the probability that a pair verifies, and is right."""
-        log_odds = sum(self.weights[name] * value for name, value in terms.items())
+        log_odds = sum(self.coefficients[name] * value for name, value in terms.items())
         return 1.0 / (1.0 + math.exp(-log_odds))
 
     def seconds(self, images: Iterable[float], pairs: Iterable[tuple[float, float]]) -> float:
@@ -99,7 +98,7 @@ def terms(state: PairState, wins: int, losses: int) -> dict[str, float]:
         "consistent": math.log1p(state.num_consistent),
         "inliers": math.log1p(state.num_inliers),
         "tried": float((state.tried >> 1).bit_count()),  # in vain
-        "luck": math.log((1 + wins) / (1 + losses)),
+        "success_ratio": math.log((1 + wins) / (1 + losses)),
     }
 
 
@@ -140,8 +139,8 @@ class ExpectedGain:
     """The pairs of a set as they are now, and what a level may bring to them."""
 
     states: Mapping[Pair, PairState]  # of all pairs
-    loose: Set[str]  # images with few features in tracks through three images
-    needs: Mapping[str, float]  # images in need, and what saving them is worth in photographs
+    weakly_connected: Set[str]  # images with few features in tracks through three
+    weights: Mapping[str, float]  # of the images to match again, in photographs
     megapixels: Mapping[str, float]  # of each image, as its features are extracted
     unmeasured: Collection[int]  # levels whose frames are not measured
     lacking: Collection[str]  # images without features of the level yet
@@ -158,7 +157,7 @@ class ExpectedGain:
         return {name: number for number, part in enumerate(self._parts) for name in part}
 
     @cached_property
-    def _num_with_model(self) -> Counter[str]:
+    def _num_pairs_to_model(self) -> Counter[str]:
         """Count the verified pairs of each image with images of the model."""
         verified = [pair for pair, state in self.states.items() if state.num_inliers]
         both = [*verified, *(pair[::-1] for pair in verified)]
@@ -169,22 +168,23 @@ class ExpectedGain:
 
         What is apart from the largest part must be joined to others before all. Where n verified
         pairs with images of the model did not save one, another does with 1 / (n + 1), about.
-        While there is no model, each pair of images in need may begin one.
+        While there is no model, each pair of images to match again may begin one.
         """
         first, second = (self._part_of[name] for name in pair)
         if first == second:
             if first and self.registered:
                 return []
-            needy = [name for name in pair if name in self.needs]
-            return [(name, self.needs[name] / (1 + self._num_with_model[name])) for name in needy]
+            needy = [name for name in pair if name in self.weights]
+            num_pairs = self._num_pairs_to_model
+            return [(name, self.weights[name] / (1 + num_pairs[name])) for name in needy]
         smaller = max(first, second)  # parts come by size
-        need = sum(self.needs.get(name, 0.0) for name in self._parts[smaller])
+        need = sum(self.weights.get(name, 0.0) for name in self._parts[smaller])
         return [(smaller, need)] if need else []
 
     def _is_strong(self, pair: Pair) -> bool:
         """Tell whether a pair needs nothing more; while there is no model, none is."""
         is_many = self.states[pair].num_inliers >= self.strong_num_inliers
-        return is_many and bool(self.registered) and self.loose.isdisjoint(pair)
+        return is_many and bool(self.registered) and self.weakly_connected.isdisjoint(pair)
 
     def _of_measured(self, state: PairState) -> PairState:
         """Return what the best matches of measured frames say of a pair."""
@@ -298,11 +298,3 @@ def insecure_images(
     strong = (pair for pair, count in num_inliers.items() if count >= max(1, strong_num_inliers))
     names = {name for pair in num_inliers for name in pair}
     return names.difference(*strong).union(weakly_connected)
-
-
-def weakly_connected_images(matches: Mapping[Pair, Indices], min_num_features: int) -> set[str]:
-    """Return the images with fewer features than that in tracks through three images or more.
-
-    Mappers register images by features that two others have triangulated already.
-    """
-    return {name for name, count in num_in_tracks(matches).items() if count < min_num_features}

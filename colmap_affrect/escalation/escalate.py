@@ -1,0 +1,376 @@
+"""Escalation on demand: more warps for the pairs of images that need them, and only those.
+
+Images get the features that a level of the recipe adds, and pairs are matched again with them
+(Mishkin, Matas, Perdoch, MODS, 2015). New matches take the place of the old ones only when their
+two-view geometry has more inliers, or, where neither is verified, when more of them confirm each
+other. Which pairs are matched again, and at which level, is decided anew after every step
+(:mod:`colmap_affrect.escalation.policy`), by what is known then
+(:mod:`colmap_affrect.escalation.set_state`); the step that has begun is on record, so that a killed
+run goes on in the same way.
+
+Images are matched again that the model before has not, or is not sure of. While there is none,
+those that have no strong pair, or few features in tracks through three; a small set is mapped when
+one has.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
+
+from colmap_affrect.colmap.verification import PairVerifier
+from colmap_affrect.errors import ImageError, such_as
+from colmap_affrect.escalation.expected_gain import PairState, Step
+from colmap_affrect.escalation.policy import Plan, learned_step, next_step, tried, untried
+from colmap_affrect.escalation.set_state import SetState
+from colmap_affrect.options import EffortName
+from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.parallel.executor import available_cores
+from colmap_affrect.project.report import MatchedAgain, StageReport
+from colmap_affrect.project.stores import EFFORT, LEARNING, STEP, Learned, PairMatches, Worth
+from colmap_affrect.recipes import EscalateOptions
+from colmap_affrect.session.context import Context
+from colmap_affrect.stages.extract import extract_images
+from colmap_affrect.stages.match import matched_at_level, num_confirming, write_batches
+from colmap_affrect.stages.one_image import ImageExtractor, prepare
+from colmap_affrect.stages.verify import update_verified
+
+logger = logging.getLogger(__name__)
+
+PAIRS_AT_ONCE = 50  # matched between two looks at the clock
+
+
+def escalate(context: Context, options: EscalateOptions | None = None) -> StageReport:
+    """Go through the levels of the recipe, if any, without mapping in between.
+
+    Args:
+        context: folder, resources and options on record.
+        options: which pairs are strong; by default those on record.
+
+    Returns:
+        What was done; ``num_done`` counts the pairs that were matched again now.
+    """
+    escalation, report = begin(context, options)
+    while step := escalation.next_step():
+        report = escalation.taken(step, report)
+    return escalation.ended(report)
+
+
+def begin(
+    context: Context, options: EscalateOptions | None = None
+) -> tuple["Escalation", StageReport]:
+    """Return what lets pairs escalate; the database is brought up to what a killed run stored."""
+    start = time.perf_counter()
+    context.resources.require_device()
+    context.workspace.require("verify")
+    options = options or context.escalation
+    context.workspace.record_options("escalate", options.to_mapping())
+    if context.matches.note(EFFORT) != context.effort:
+        context.matches.keep_note(EFFORT, context.effort)
+    escalation = Escalation(context, options)
+    if escalation.has_begun:
+        escalation.write()
+    return escalation, StageReport("escalate", time.perf_counter() - start, 0)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What escalation did for a set, and what is left."""
+
+    effort: EffortName = "normal"  # how much was tried
+    tried: tuple[MatchedAgain, ...] = ()  # pairs by level
+    untried: tuple[MatchedAgain, ...] = ()  # what a greater effort would try
+
+
+def matched_again(context: Context) -> Tried:
+    """Return what escalation did in a workspace, and what is left for images to match again."""
+    workspace = context.workspace
+    if workspace.is_foreign or "escalate" not in workspace.begun:
+        return Tried()
+    escalation = Escalation(context, context.escalation)
+    state = escalation.state
+    models = state.models()
+    weights = state.weights(models)
+    if not (weights or escalation.has_begun):  # large sets take long to go through
+        return Tried()
+    situation = state.situation(weights, models)
+    effort = escalation.matches.note(EFFORT) or context.effort
+    return Tried(effort, tuple(tried(situation)), tuple(untried(situation)))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Matches that were found for a pair at a level, beside what was there."""
+
+    found: PairMatches
+    worth: Worth
+    before: PairState
+
+    @property
+    def is_better(self) -> bool:
+        """Whether it takes the place of what is there."""
+        return self.worth > self.before.worth
+
+
+Keep = Callable[[Sequence[Trial], int], None]  # writes trials that were made at a level
+
+
+class Escalation:
+    """Lets pairs of a workspace escalate to a level, with the options on record.
+
+    Attributes:
+        context: of the workspace.
+        state: what is known of its images and pairs.
+        matches: its raw matches.
+        left_s: seconds that all steps to come may take, if nothing helps any more.
+    """
+
+    def __init__(self, context: Context, options: EscalateOptions) -> None:
+        """Name the workspace.
+
+        Args:
+            context: of the workspace, whose pairs are verified.
+            options: which pairs are strong.
+        """
+        self.context = context
+        self.state = SetState(context, options)
+        self.matches = context.matches
+        self.left_s = 0.0
+
+    @cached_property
+    def extractor(self) -> ImageExtractor:
+        """The recipe, prepared for all images when it is needed first."""
+        context = self.context
+        names = context.features.names()
+        return prepare(context.extraction, context.resources, names, context.progress)
+
+    @property
+    def has_stepped(self) -> bool:
+        """Whether a step has begun, or was taken."""
+        return self.matches.note(STEP) is not None
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether learned matching or a step has begun, perhaps in a run that was killed."""
+        return self.has_stepped or self.matches.note(LEARNING) is not None
+
+    @property
+    def is_over_time(self) -> bool:
+        """Whether the time that the user gave is over."""
+        return time.monotonic() > self.context.deadline_s
+
+    def next_step(self) -> Step | None:
+        """Return a level, and the pairs to match at it now; None when nothing is left to do.
+
+        No pairs are left where a killed run has matched all of a step, but for the database.
+        """
+        if self.is_over_time:
+            return None
+        begun = self.matches.note(STEP)
+        if begun:
+            level, pairs = begun
+            return Step(level, self._left_of(level, [(first, second) for first, second in pairs]))
+        plan = self._plan()
+        self.left_s = plan.left_s / available_cores()
+        return plan.step if plan.step.pairs else None
+
+    def _left_of(self, level: int, pairs: Sequence[Pair]) -> list[Pair]:
+        """Return the pairs of a step that has begun for which its level was not tried yet."""
+        tried_levels = self.matches.levels(self.state.pairs, "tried")
+        left = list[Pair]()
+        for pair in pairs:
+            was_tried = tried_levels.get(pair, -1) >> level & 1
+            if not was_tried and self.context.by_hand.allows(*pair):
+                left.append(pair)
+        return left
+
+    def _plan(self) -> Plan:
+        models = self.state.models()
+        weights = self.state.weights(models)
+        if not weights:
+            return Plan()
+        return next_step(self.state.situation(weights, models), self.context.effort)
+
+    def taken(self, step: Step, report: StageReport) -> StageReport:
+        """Take a step, and return the report with its pairs and seconds."""
+        start = time.perf_counter()
+        self.match_at(step.pairs, step.level)
+        wall_s = report.wall_s + time.perf_counter() - start
+        return StageReport("escalate", wall_s, report.num_done + len(step.pairs))
+
+    def ended(self, report: StageReport) -> StageReport:
+        """Return the report with what could not be tried, which is logged, too."""
+        warnings = self.waiting()
+        if self.is_over_time:
+            warnings["time"] = "it is over; the same command without --max-time tries more"
+        for what, text in warnings.items():
+            logger.warning("%s: %s", what, text)
+        return StageReport("escalate", report.wall_s, report.num_done, warnings=warnings)
+
+    def waiting(self) -> dict[str, str]:
+        """Say what levels that lack weights may tie, if anything is left to tie."""
+        how = self.context.resources.how_to_complete(self.context.extraction)
+        if not how:
+            return {}
+        left = sorted(self.state.weights(self.state.models()))
+        if not left:
+            return {}
+        text = f"its weights are not here; it may tie {such_as(left)}: {how}; then run this again"
+        return {"learned matching": text}
+
+    def match_at(self, pairs: Sequence[Pair], level: int) -> None:
+        """Match pairs with the features of a level and keep what has more inliers.
+
+        What is to be done is on record meanwhile, so that an interrupted run can resume.
+
+        Args:
+            pairs: of image names.
+            level: number of the level in the recipe.
+        """
+        if pairs:
+            self.matches.keep_note(STEP, [level, list(pairs)])
+        learned = self.matches.learned(pairs)
+        known = {pair: one for pair, one in learned.items() if one.matches.level == level}
+        if known:
+            states = self.state.states()
+            trials = [Trial(one.matches, one.worth, states[pair]) for pair, one in known.items()]
+            self._keep(trials, level)
+        unknown = [pair for pair in pairs if pair not in known]
+        self._match_with(unknown, level, self._keep)
+        self.write()
+        self.matches.keep_note(STEP, [])
+
+    def plan_learning(self) -> bool:
+        """Put on record which pairs are to be matched by a learned level, beside what is there.
+
+        An interrupted run resumes with these: images that get features change the database.
+
+        Returns:
+            Whether there are any; none of sets that are large or need nothing, nor where no learned
+            level can be used.
+        """
+        if self.matches.note(LEARNING):
+            return True
+        models = self.state.models()
+        weights = self.state.weights(models)
+        if not weights:
+            return False
+        situation = self.state.situation(weights, models)
+        if not situation.is_small:
+            return False
+        step = learned_step(situation)
+        if step.pairs:
+            self.matches.keep_note(LEARNING, [step.level, list(step.pairs)])
+        return bool(step.pairs)
+
+    def learn(self) -> int:
+        """Match the pairs of :meth:`plan_learning` that have no learned matches yet.
+
+        Returns:
+            How many were matched; some may be left where the time that the user gave is over.
+        """
+        level, planned = self.matches.note(LEARNING)
+        pairs = [(first, second) for first, second in planned]
+        done = self.matches.learned_levels(pairs)
+        todo = [pair for pair in pairs if done[pair] < 0]
+        num_matched = 0
+        for begin in range(0, len(todo), PAIRS_AT_ONCE):
+            if self.is_over_time:
+                break
+            batch = todo[begin : begin + PAIRS_AT_ONCE]
+            self._match_with(batch, level, self._keep_learned)
+            num_matched += len(batch)
+        self.write()  # the features are keypoints of the database, too
+        return num_matched
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether all pairs of :meth:`plan_learning` have learned matches."""
+        _, planned = self.matches.note(LEARNING)
+        return min(self.matches.learned_levels(map(tuple, planned)).values()) >= 0
+
+    def write(self) -> None:
+        """Bring the database up to what is stored, and verify what is new."""
+        update_verified(self.context, self.state.pairs, replaces=True)
+
+    def _match_with(self, pairs: Sequence[Pair], level: int, keep: Keep) -> None:
+        """Give images the features of a level that they lack, and match pairs with these."""
+        features = self.context.features
+        chosen = self.context.extraction.levels[level]
+        missing = list[tuple[str, int]]()
+        for name in sorted({name for pair in pairs for name in pair}):
+            there = features.level_ranges(name)
+            missing += [(name, k) for k in sorted({chosen.base, level}) if k not in there]
+        left = f" (at most about {self.left_s / 60:.0f} min)" if self.left_s >= 60 else ""
+        title = f"escalate, {chosen.name}{left}"
+        num_steps = len(missing) + len(pairs)
+        with self.context.progress.stage(title, num_steps, "steps") as advance:
+            self._extend(missing, advance)
+            if pairs:
+                self._match_again(pairs, level, keep, advance)
+
+    def _extend(self, missing: Sequence[tuple[str, int]], advance: Callable[[int], None]) -> None:
+        """Add to images the features of levels that they lack."""
+        if not missing:
+            return
+        images = extract_images(self.context, self.context.inputs, self.extractor, missing)
+        with closing(images) as found_images:
+            for (name, level), found in zip(missing, found_images, strict=True):
+                if isinstance(found, ImageError):
+                    raise found
+                self.context.features.extend(name, found.features, level)
+                advance(1)
+
+    def _match_again(
+        self, pairs: Sequence[Pair], level: int, keep: Keep, advance: Callable[[int], None]
+    ) -> None:
+        """Match pairs with the features of a level, and keep the trials batch by batch."""
+        context = self.context
+        size_px = context.extraction.levels[level].max_image_size_px
+        graph = context.graph
+        verifier = PairVerifier(graph.ids, graph.cameras, context.verification, size_px)
+        states = self.state.states()
+
+        def trial_of(found: PairMatches) -> Trial:
+            return Trial(found, self._worth(found, verifier), states[found.names])
+
+        def write(batch: Sequence[Trial]) -> None:
+            keep(batch, level)
+
+        matched = matched_at_level(context, pairs, context.matching, level)
+        with closing(matched) as found_pairs:
+            write_batches(map(trial_of, found_pairs), write, advance)
+
+    def _worth(self, found: PairMatches, verifier: PairVerifier) -> Worth:
+        """Return the inliers of a pair, or without any how many matches confirm each other."""
+        features = self.context.features
+        first, second = found.names
+        frames = (features.read_frames(first), features.read_frames(second))
+        num_inliers = len(verifier.inliers(found.names, frames, found.indices))
+        if num_inliers:
+            return num_inliers, 0
+        return 0, num_confirming(features, found.names, found.indices)
+
+    def _keep(self, batch: Sequence[Trial], level: int) -> None:
+        """Write the better matches of some trials, and that all were made; all or nothing."""
+        better = [trial.found for trial in batch if trial.is_better]
+        tried_pairs = [trial.found.names for trial in batch]
+        self.matches.write(better, tried_pairs, level, self._measured_worths(batch))
+
+    def _keep_learned(self, batch: Sequence[Trial], _: int) -> None:
+        """Write learned matches beside those in use."""
+        self.matches.keep_learned([Learned(trial.found, trial.worth) for trial in batch])
+
+    def _measured_worths(self, batch: Sequence[Trial]) -> dict[Pair, Worth]:
+        """Return what the best measured matches are worth of pairs that use learned ones."""
+        worths = dict[Pair, Worth]()
+        for trial in batch:
+            was_measured = self.state.is_measured[trial.before.level]
+            is_measured = self.state.is_measured[trial.found.level]
+            if was_measured and not is_measured and trial.is_better:
+                worths[trial.found.names] = trial.before.worth
+            elif is_measured and not was_measured:
+                worths[trial.found.names] = max(trial.worth, trial.before.measured_worth)
+        return worths

@@ -1,0 +1,194 @@
+"""What is known of the images and pairs of a set, as escalation sees it.
+
+It is read anew for every decision, from the stores and the view graph: each step changes it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.verification import weakly_connected_images
+from colmap_affrect.escalation import expected_gain
+from colmap_affrect.escalation.expected_gain import PairState
+from colmap_affrect.escalation.policy import Situation
+from colmap_affrect.mappers.mapping import read_summaries
+from colmap_affrect.mappers.sparse import LARGE
+from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.recipes import EscalateOptions
+from colmap_affrect.session.context import Context
+from colmap_affrect.stages.match import num_confirming
+
+LIKELY = 0.25  # part of a gain that counts for images that are likely right: matches mend few
+
+
+class SetState:
+    """Reads what is known of a set.
+
+    Attributes:
+        context: of the workspace.
+        options: which pairs are strong.
+        pairs: those that are listed.
+        is_measured: whether local affine frames are measured one by one, by level.
+    """
+
+    def __init__(self, context: Context, options: EscalateOptions) -> None:
+        """Read the list of pairs; all else is read when it is asked for."""
+        self.context = context
+        self.options = options
+        self.pairs = context.listed_pairs()
+        self.is_measured = [level.features.has_shapes for level in context.extraction.levels]
+        self._confirming: dict[Pair, tuple[bytes, int]] = {}  # raw matches, and their number
+
+    def num_inliers(self) -> dict[Pair, int]:
+        """Return the inliers of the pairs that may be used, 0 of those that are not verified."""
+        ids = self.context.graph.ids
+        verified = self.context.num_verified_inliers()
+        found = dict[Pair, int]()
+        for first, second in self.pairs:
+            are_there = first in ids and second in ids
+            if are_there and self.context.by_hand.allows(first, second):
+                count = verified.get((first, second)) or verified.get((second, first), 0)
+                found[first, second] = count
+        return found
+
+    def models(self) -> list[ModelSummary]:
+        """Return what is known of the models before; an empty one where there are none."""
+        models = read_summaries(self.context.workspace.sparse)
+        return models or [ModelSummary((), 0, 0.0, 0.0)]
+
+    def weights(self, models: Sequence[ModelSummary]) -> dict[str, float]:
+        """Return the images to match again, and how much more matches may bring to each.
+
+        Images that no model has weigh 1. Doubtful ones of the first model weigh what matches may
+        add to the probability that they are right, and a quarter of all that where they are likely
+        right in the model that they are in.
+
+        Args:
+            models: those before, the largest first.
+
+        Returns:
+            Weights in photographs, by image name.
+        """
+        names = set(self.context.features.names()).difference(self.context.by_hand.left_out)
+        wanted = names.difference(models[0].sure)
+        if not self._is_mapped():
+            wanted = self._insecure(wanted, num_images=len(names))
+        likely = frozenset[str]().union(*(model.likely for model in models))
+        gains = models[0].gains
+        weights = dict[str, float]()
+        for name in sorted(wanted):
+            share = LIKELY if name in likely else 1.0
+            weights[name] = share * gains.get(name, 1.0)
+        return weights
+
+    def _is_mapped(self) -> bool:
+        """Tell whether the models are those of the verified pairs."""
+        return self.context.workspace.made_from("map") == self.context.verified_digest()
+
+    def _insecure(self, wanted: set[str], *, num_images: int) -> set[str]:
+        """Return the images that the next model may well lose; none where it will tell of them."""
+        strong = self.options.strong_num_inliers
+        weakly_connected = self._weakly_connected()
+        insecure = expected_gain.insecure_images(self.num_inliers(), strong, weakly_connected)
+        insecure &= wanted
+        has_models = self.context.workspace.sparse.exists()
+        # The next model tells of what has been tied since.
+        maps_next = insecure != wanted and has_models and num_images < LARGE
+        return set() if maps_next else insecure
+
+    def _anchored(self, model: ModelSummary, states: Mapping[Pair, PairState]) -> set[str]:
+        """Return the images of a model that measured frames tie to one that is likely right."""
+        anchored = set[str]()
+        for pair, state in states.items():
+            is_tied = state.num_inliers and self.is_measured[state.level]
+            if is_tied and not model.likely.isdisjoint(pair):
+                anchored.update(pair)
+        return anchored.intersection(model.registered_names)
+
+    def _weakly_connected(self) -> set[str]:
+        """Return the images with few features in tracks through three, where there are three."""
+        if len(self.context.features.names()) < 3:
+            return set()
+        limit = self.context.guiding.min_num_tracks
+        return weakly_connected_images(self.context.verified_inliers(), limit)
+
+    def states(self) -> dict[Pair, PairState]:
+        """Return what is known of the pairs that are in the database."""
+        matches = self.context.matches
+        num_inliers = self.num_inliers()
+        failed = [pair for pair, count in num_inliers.items() if not count]
+        confirming = self._num_confirming(failed)
+        levels = matches.levels(num_inliers)
+        tried = matches.levels(num_inliers, "tried")
+        measured = matches.measured_worths(num_inliers)
+        learned = matches.learned_levels(num_inliers)
+        return {
+            pair: PairState(
+                count,
+                confirming.get(pair, 0),
+                levels[pair],
+                tried[pair],
+                measured_worth=measured[pair],
+                learned_level=learned[pair],
+            )
+            for pair, count in num_inliers.items()
+        }
+
+    def _num_confirming(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
+        """Return how many raw matches of pairs confirm each other."""
+        if not pairs:
+            return {}
+        graph = self.context.graph
+        found = dict[Pair, int]()
+        with open_database(graph.path) as database:
+            for pair in pairs:
+                first, second = pair
+                matches = database.read_matches(graph.ids[first], graph.ids[second])
+                content = matches.tobytes()
+                before = self._confirming.get(pair)
+                if not before or before[0] != content:
+                    count = num_confirming(self.context.features, pair, matches)
+                    self._confirming[pair] = content, count
+                found[pair] = self._confirming[pair][1]
+        return found
+
+    def situation(self, weights: Mapping[str, float], models: Sequence[ModelSummary]) -> Situation:
+        """Return what the policy decides by.
+
+        Args:
+            weights: of the images to match again, by name.
+            models: those that are there, the largest first.
+
+        Returns:
+            The state of all pairs and images.
+        """
+        features = self.context.features
+        levels = self.context.extraction.levels
+        states = self.states()
+        sizes = features.image_sizes()
+        levels_of = {name: set(features.level_ranges(name)) for name in sizes}
+        megapixels = list[dict[str, float]]()
+        lacking = list[set[str]]()
+        for number, level in enumerate(levels):
+            limit_px = level.max_image_size_px
+            megapixels.append({name: _megapixels(size, limit_px) for name, size in sizes.items()})
+            lacking.append({name for name in sizes if number not in levels_of[name]})
+        return Situation(
+            levels=levels,
+            usable=self.context.resources.usable_levels(self.context.extraction)[1:],
+            states=states,
+            weights=weights,
+            weakly_connected=self._weakly_connected(),
+            anchored=self._anchored(models[0], states),
+            megapixels=megapixels,
+            lacking=lacking,
+            registered=models[0].registered_names,
+            strong_num_inliers=self.options.strong_num_inliers,
+        )
+
+
+def _megapixels(size: tuple[int, int], limit_px: int) -> float:
+    """Return the megapixels of an image of (width, height) px, shrunk to a longest side."""
+    scale = min(1.0, limit_px / max(size))
+    return math.prod(size) * scale**2 / 1e6
