@@ -73,7 +73,12 @@ class ExistingModel:
         native.constant_cameras |= {image.camera_id for image in self.images}
 
     def copy_database(self, path: Path, copy: Path) -> None:
-        """Copy a database with the model's cameras: COLMAP demands the same camera models."""
+        """Copy a database with the model's cameras: COLMAP demands the same camera models.
+
+        Args:
+            path: The database.
+            copy: File of the copy, which does not exist.
+        """
         copy_database(path, copy)
         with open_database(copy) as database:
             for camera_id in {image.camera_id for image in self.images}:

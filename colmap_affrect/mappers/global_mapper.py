@@ -61,7 +61,21 @@ class GlobalMapper:
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
-        """See :class:`colmap_affrect.mappers.base.Mapper`; all images register at once."""
+        """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
+
+        Args:
+            task: What to map.
+            output_path: An empty folder.
+            random_seed: For all that is left to chance.
+            show: Is told the number of images at the end: all register at once.
+
+        Returns:
+            The models.
+
+        Raises:
+            OptionError: When a model is to be extended.
+            AffrectError: When COLMAP ends with an error.
+        """
         if task.extend:
             raise OptionError("--extend: the global mapper cannot; use --mapper sparse")
         native = self.native(task, random_seed)
@@ -83,7 +97,12 @@ class GlobalMapper:
         return [MappedModel(model) for model in models]
 
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.GlobalPipelineOptions:
-        """Translate the options into pycolmap's, with what of a task's cameras is refined."""
+        """Translate the options into pycolmap's.
+
+        Args:
+            task: Says which parameters of cameras are refined.
+            random_seed: For all that is left to chance.
+        """
         options = self.options
         refined = task.refined_intrinsics(options)
         values: dict[str, Plain] = {

@@ -74,7 +74,12 @@ class Grower:
         return model
 
     def finish(self, model: pycolmap.Reconstruction, max_iterations: int = FINAL) -> None:
-        """Triangulate again and adjust a model, by default until it converges."""
+        """Triangulate again and adjust a model, by default until it converges.
+
+        Args:
+            model: Changed in place.
+            max_iterations: Of each adjustment.
+        """
         with self._mapping(model) as mapper:
             for _ in range(NUM_LAST_ROUNDS):
                 self._refine(mapper, max_iterations)

@@ -63,7 +63,21 @@ class IncrementalMapper:
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
-        """See :class:`colmap_affrect.mappers.base.Mapper`."""
+        """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
+
+        Args:
+            task: What to map.
+            output_path: An empty folder that models are written to.
+            random_seed: For all that is left to chance.
+            show: Is told how many images have been registered so far.
+
+        Returns:
+            The models.
+
+        Raises:
+            AffrectError: When COLMAP ends with an error.
+            KeyboardInterrupt: After mapping has been stopped.
+        """
         native = self.native(task, random_seed)
         if task.image_path is None:
             native.extract_colors = False
@@ -78,7 +92,12 @@ class IncrementalMapper:
         return [MappedModel(model) for model in models]
 
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:
-        """Translate the options into pycolmap's, with what of a task's cameras is refined."""
+        """Translate the options into pycolmap's.
+
+        Args:
+            task: Says which parameters of cameras are refined.
+            random_seed: For all that is left to chance.
+        """
         options = self.options
         refined = task.refined_intrinsics(options)
         native = pycolmap.IncrementalPipelineOptions(

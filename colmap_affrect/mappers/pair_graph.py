@@ -83,7 +83,12 @@ class PairGraph:
 
     @classmethod
     def read(cls, path: Path, min_num_matches: int = MIN_NUM_MATCHES) -> Self:
-        """Read the pairs of a database with at least as many inliers, and all images."""
+        """Read the verified pairs and all images of a database.
+
+        Args:
+            path: The database.
+            min_num_matches: Pairs with fewer inliers are left out.
+        """
         options = pycolmap.DatabaseCacheOptions(
             min_num_matches=min_num_matches, load_all_images=True
         )

@@ -96,6 +96,10 @@ class Search:
 
         Focal lengths stay near those of the first one. Bridges begin at the known models, too;
         other models grow from pairs that the first one does not explain.
+
+        Args:
+            graph: The pairs.
+            known: The known models, best first; they stay as they are.
         """
         first = pycolmap.Reconstruction(known[0].reconstruction)
         search = self._with_focals_of(first)
@@ -110,7 +114,15 @@ class Search:
         return found
 
     def with_bridges(self, graph: PairGraph, models: Sequence[MappedModel]) -> list[MappedModel]:
-        """Return the best model that bridges make of one of some, and the models outside of it."""
+        """Register images by bridges from the best models.
+
+        Args:
+            graph: Pairs that bridges are built by.
+            models: The models, best first; they stay as they are.
+
+        Returns:
+            The model with the highest score, and those models that have other images.
+        """
         if not models:
             return []
         if not self.num_starts or not graph.unexplained_by(models[0].reconstruction):

@@ -56,7 +56,21 @@ class SparseMapper(IncrementalMapper):
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
-        """See :class:`colmap_affrect.mappers.base.Mapper`."""
+        """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
+
+        Args:
+            task: What to map.
+            output_path: An empty folder that models may be written to.
+            random_seed: For all that is left to chance.
+            show: Is told how many images have been registered so far.
+
+        Returns:
+            The models; their last points come by ``finish``.
+
+        Raises:
+            AffrectError: When COLMAP ends with an error.
+            KeyboardInterrupt: After mapping has been stopped.
+        """
         native = self.native(task, random_seed)
         graph = graph_of(task, native.min_num_matches)
 
