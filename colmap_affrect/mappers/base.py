@@ -103,7 +103,7 @@ class MappedModel:
     """By the names of images that came in by one verified pair, not by tracks of three images."""
     moves: tuple[str, ...] = ()  # hypotheses that made the model, in the words of a report
     finish: Callable[[], None] | None = None
-    """Gives the reconstruction its last points and colours; called once, after it is judged."""
+    """Gives the reconstruction its last points and colours; called once, when images are scored."""
 
 
 class Mapper(Protocol):

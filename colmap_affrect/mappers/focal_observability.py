@@ -28,7 +28,7 @@ FACTORS = 1.25, 0.8
 """Other focal lengths that are tried: with these, poses are off by 5 degrees and more (judged)."""
 MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing (judged)
 MAX_GROWTH = (
-    1.0  # as of known focal lengths: more makes no photograph surer (fitted with the terms)
+    1.0  # as of known focal lengths: more makes no photograph surer (judged)
 )
 FREE_SIGMA = 1.0  # of the logarithm of a given focal length while others are tried: nearly free
 MIN_MOVE = 0.1  # of the logarithm of a given focal length, from which on another one is named

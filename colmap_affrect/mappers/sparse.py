@@ -134,7 +134,7 @@ class SparseMapper(IncrementalMapper):
         graph: PairGraph,
         native: pycolmap.IncrementalPipelineOptions,
     ) -> list[MappedModel]:
-        """Have models get the points of all tracks, and their colours, once they are judged."""
+        """Have models get the points of all tracks, and colours, once their images are scored."""
 
         def finish(model: pycolmap.Reconstruction) -> None:
             tie_points = tie_points_of(task, graph)

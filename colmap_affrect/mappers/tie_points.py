@@ -24,7 +24,7 @@ AGREES_IF_RIGHT = 0.9  # with right poses: some marks are wrong
 AGREES_BY_CHANCE = 0.05  # with wrong poses
 MIN_NUM_POINTS = 4  # that must agree to register an image: three always do, the others are the test
 MAX_LOG_ODDS = 2.5
-"""Of an image by its tie points. Fitted: of images that six tie points alone register, twelve of
+"""Of an image by its tie points. Measured: of images that six tie points alone register, twelve of
 thirteen are right."""
 NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P)
 # A tie point that one image alone sees has the median depth of the points near its mark (judged).
