@@ -97,7 +97,7 @@ def _task(context: Context, extend: Extension | None, before: Sequence[MappedMod
         workspace.photographs(),
         read_existing(extend, path) if extend else None,
         before,
-        unmeasured=frozenset() if copied else frozenset(unmeasured_pairs(context)),
+        unmeasured_pairs=frozenset() if copied else frozenset(unmeasured_pairs(context)),
         cameras=read_camera_records(workspace.cameras),
         may_share=not copied and context.inputs.may_share,
         tie_points=tie_points,

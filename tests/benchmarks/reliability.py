@@ -43,7 +43,8 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
 from colmap_affrect.comparison import results
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MappingTask
-from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS, measure
+from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS
+from colmap_affrect.mappers.reliability_features import features_of
 from colmap_affrect.project.report import DOUBTFUL, SURE
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
@@ -278,7 +279,7 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
                 task = MappingTask(
                     path,
                     None,
-                    unmeasured=frozenset(pair for pair in unmeasured if {*part} >= {*pair}),
+                    unmeasured_pairs=frozenset(pair for pair in unmeasured if {*part} >= {*pair}),
                     cameras=told[0],
                     may_share=kind == "unknown",
                 )
@@ -308,9 +309,9 @@ def rows_of(
         {
             "image": image,
             "right": right[image],
-            "terms": {key: term.value(measures) for key, term in TERMS.items()},
+            "terms": {key: term.value(features) for key, term in TERMS.items()},
         }
-        for image, measures in measure(mapped, task).items()
+        for image, features in features_of(mapped, task).items()
         if image in right
     ]
 

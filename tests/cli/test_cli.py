@@ -21,7 +21,7 @@ from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.reliability import Judgement
+from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 
@@ -413,10 +413,10 @@ def test_finished_model_is_extended_and_another_database_mapped(
 def test_model_that_nobody_can_trust_ends_with_3(
     verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def judge(mapped: MappedModel, *_: object) -> dict[str, Judgement]:
-        return dict.fromkeys(model_poses(mapped.reconstruction), Judgement(0.3, "no parallax"))
+    def score(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
+        return dict.fromkeys(model_poses(mapped.reconstruction), Confidence(0.3, "no parallax"))
 
-    monkeypatch.setattr(mapping, "judge", judge)
+    monkeypatch.setattr(mapping, "score_images", score)
     assert main(["map", "--output-path", str(verified), "--overwrite"]) == 3
     printed = capfd.readouterr()
     assert "results " in printed.out

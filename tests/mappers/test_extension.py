@@ -112,11 +112,11 @@ def test_old_poses_and_cameras_stay_to_the_bit(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["old", "sparse"]
 
 
-def test_the_model_that_is_extended_stays_until_all_is_judged(
+def test_the_model_that_is_extended_stays_until_all_images_are_scored(
     database: Path, old: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "sparse").mkdir()
-    monkeypatch.setattr(mapping, "judge", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(mapping, "score_images", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         extended(database, old, tmp_path, "sparse/0")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]

@@ -16,7 +16,7 @@ from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
-from colmap_affrect.mappers.reliability import judge
+from colmap_affrect.mappers.reliability import score_images
 from colmap_affrect.mappers.tie_points import NONE, TiePoints
 from colmap_affrect.project.report import kept_probability
 
@@ -153,7 +153,7 @@ def test_tracks_of_two_images_are_refined_where_those_of_three_make_the_model(
     assert model.num_points3D() >= 0.99 * before[2] > 700
 
 
-def test_models_are_judged_before_their_last_points(tmp_path: Path) -> None:
+def test_models_are_scored_before_their_last_points(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     synthesize(path, noise_px=NOISE_PX, num_rigs=4, num_points3D=120)
     task = task_with_given_cameras(path)
@@ -172,7 +172,7 @@ def test_models_are_judged_before_their_last_points(tmp_path: Path) -> None:
             return list(found)
 
     (summary,) = map_database(Kept(), task, tmp_path / "sparse", lambda _: None)
-    expected = judge(unfinished[0], task)
+    expected = score_images(unfinished[0], task)
     assert summary.probabilities == {
         k: kept_probability(v.probability) for k, v in expected.items()
     }

@@ -31,7 +31,7 @@ from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.mappers.reliability import Judgement
+from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import map_and_report
@@ -168,13 +168,13 @@ def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
 ) -> None:
     given = [0.49996, 0.89996, 0.99996]
 
-    def judged(mapped: MappedModel, *_: object) -> dict[str, Judgement]:
+    def scored(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
         names = sorted(image.name for image in mapped.reconstruction.images.values())
-        return {n: Judgement(p, "a reason") for n, p in zip(names, given, strict=True)}
+        return {n: Confidence(p, "a reason") for n, p in zip(names, given, strict=True)}
 
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=3, num_points3D=150)
-    monkeypatch.setattr(mapping, "judge", judged)
+    monkeypatch.setattr(mapping, "score_images", scored)
     (model,), _ = reconstruct(path, mapper_of("incremental"))
     first, second, third = model.registered_names
     assert list(model.probabilities.values()) == [0.499, 0.899, 0.999]
@@ -232,3 +232,23 @@ def test_two_places_make_two_models_the_largest_first(two_places: Workspace, map
     for folder, names in zip(folders, (large, small), strict=True):
         model = pycolmap.Reconstruction(folder)
         assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(names)
+
+
+@pytest.mark.parametrize(("probability", "num_images"), [(0.2, 3), (0.04, 2)])
+def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, probability: float, num_images: int
+) -> None:
+    synthesize(tmp_path / "database.db", num_rigs=3, num_points3D=60)
+
+    def score(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
+        names = sorted(model_poses(mapped.reconstruction))
+        found = dict.fromkeys(names, Confidence(0.99, ""))
+        if len(names) == 3:
+            found[names[-1]] = Confidence(probability, "no parallax")
+        return found
+
+    monkeypatch.setattr(mapping, "score_images", score)
+    ((model,), _) = reconstruct(tmp_path / "database.db", mapper_of("incremental"))
+    assert len(model.registered_names) == num_images
+    assert len(model.doubtful) == (num_images == 3)
+    assert len(model.taken_out) == (num_images == 2)
