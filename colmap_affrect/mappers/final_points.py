@@ -138,10 +138,8 @@ def _refine(
 
 def _pose_parameters(model: pycolmap.Reconstruction) -> list[Array]:
     """Return the parameters of the poses of frames, and of the sensors in rigs, as the model's."""
-    found = [model.frames[key].rig_from_world.params for key in sorted(model.reg_frame_ids())]
+    poses = [model.frames[frame_id].rig_from_world for frame_id in sorted(model.reg_frame_ids())]
     for rig_id in sorted(model.rigs):
         rig = model.rigs[rig_id]
-        for sensor, pose in rig.non_ref_sensors.items():
-            if pose is not None:
-                found.append(rig.sensor_from_rig(sensor).params)
-    return found
+        poses += [rig.sensor_from_rig(sensor) for sensor in rig.non_ref_sensors]
+    return [pose.params for pose in poses if pose is not None]
