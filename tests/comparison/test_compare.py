@@ -139,7 +139,7 @@ def test_finished_methods_are_not_run_again_where_photographs_moved_only(
     scene, options, compared, tmp_path, asked
 ) -> None:
     images = Path(shutil.copytree(scene / "images", tmp_path / "moved"))
-    chosen = replace(options, methods=METHODS[:2])
+    chosen = options.changed(methods=METHODS[:2])
     assert compare(images, compared[1], chosen).methods == compared[0].methods[:2]
     name = min(path.name for path in images.iterdir())
     (images / name).write_bytes((images / name).read_bytes() + b" ")
@@ -166,7 +166,7 @@ def test_other_options_than_before_are_refused(
     scene, options, compared, asked, changes, message
 ) -> None:
     with pytest.raises(StoreError, match=f"{message}.*; use --overwrite"):
-        compare(scene / "images", compared[1], replace(options, **changes))
+        compare(scene / "images", compared[1], options.changed(**changes))
     assert asked == []
 
 
@@ -186,9 +186,9 @@ def test_bad_input_is_refused_before_any_work(
     scene, options, tmp_path, changes, error, message
 ) -> None:
     with pytest.raises(error, match=message):
-        compare(scene / "images", tmp_path / "out", replace(options, **changes))
+        compare(scene / "images", tmp_path / "out", options.changed(**changes))
     write_ground_truth(tmp_path / "truth", ".jpg")
-    options = replace(options, ground_truth_path=tmp_path / "truth")
+    options = options.changed(ground_truth_path=tmp_path / "truth")
     with pytest.raises(AffrectError, match=r"shares no image name .* \(it has a.jpg, they"):
         compare(scene / "images", tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
@@ -240,7 +240,7 @@ def dying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_page", "dying")
 def test_record_of_many_photographs_reaches_the_process(scene, options, tmp_path, asked) -> None:
     """It is longer than an argument of a command may be."""
-    compare(scene / "images", tmp_path / "out", replace(options, methods=["sift"]))
+    compare(scene / "images", tmp_path / "out", options.changed(methods=["sift"]))
     many = replace(asked[0], inputs={"photographs": "x" * 200_000})
     assert "SIGSEGV" in worker.run_alone(many, "", SILENT)
 
@@ -248,7 +248,7 @@ def test_record_of_many_photographs_reaches_the_process(scene, options, tmp_path
 @pytest.mark.usefixtures("no_page", "dying")
 def test_method_whose_process_dies_is_reported(scene, options, tmp_path) -> None:
     (method,) = compare(
-        scene / "images", tmp_path / "out", replace(options, methods=["sift"])
+        scene / "images", tmp_path / "out", options.changed(methods=["sift"])
     ).methods
     assert method.failed.startswith("its process ended by SIGSEGV; ")
     assert method.failed.endswith("run.log may say why")
@@ -277,7 +277,7 @@ def killed(scene: Path, tmp_path: Path) -> Iterator[Path]:
 def test_killed_comparison_goes_on_and_ends_as_an_undisturbed_one(
     scene, options, compared, killed
 ) -> None:
-    options = replace(options, methods=[METHODS[1]], seeds=[0])
+    options = options.changed(methods=[METHODS[1]], seeds=[0])
     (method,) = compare(scene / "images", killed, options).methods
     expected = compared[0].methods[1]
     assert replace(method.seeds[0], wall_s={}) == replace(expected.seeds[0], wall_s={})
