@@ -3,8 +3,9 @@
 Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)``. What else there
 is, ``docs/python.md`` lists.
 
-A public name is loaded when it is first used, so that importing the package takes no time. Type
-checkers and editors read the same names in ``__init__.pyi``.
+A public name is loaded when it is first used, so that importing the package takes no time: these
+are the first lines of a command, too, which Ctrl-C may already meet. Type checkers and editors read
+the same names in ``__init__.pyi``.
 """
 
 import sys

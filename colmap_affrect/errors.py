@@ -2,6 +2,7 @@
 
 import codecs
 import io
+import logging
 import re
 import shlex
 import sys
@@ -15,6 +16,9 @@ DAMAGE = (
     OverflowError, EOFError,
 )  # fmt: skip
 """What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or not ours."""
+# What is logged is shown by the command line, or as the program says that uses the package.
+logging.getLogger("colmap_affrect").addHandler(logging.NullHandler())
+
 MAX_REASON = 200  # characters of what a reader says
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
@@ -68,7 +72,11 @@ def _argument(flag: re.Match[str]) -> str:
 
 
 class OptionError(AffrectError, ValueError):
-    """An option is unknown, out of range, contradicts another one, or names what is not there."""
+    """The command cannot be carried out as it is given, and nothing is computed.
+
+    An option is unknown, out of range, contradicts another one, or names what is not there or does
+    not hold what it should: a folder, a list or a table.
+    """
 
     exit_code = 2
 
@@ -85,6 +93,10 @@ class ImageError(AffrectError):
 
 class StoreError(AffrectError):
     """A file of features or matches is foreign, incomplete, or of another format version."""
+
+
+class ConflictError(StoreError, OptionError):
+    """Results are there that the command would replace, or that it cannot go on from."""
 
 
 class DatabaseError(AffrectError):
@@ -183,7 +195,7 @@ codecs.register_error(ESCAPED, _escape_lacking)
 
 def say(line: str) -> None:
     """Print a line on stderr, which nobody may read any more."""
-    with suppress(OSError):
+    with suppress(OSError, RuntimeError):  # the latter of a handler that a signal calls meanwhile
         if sys.stderr:  # it may have been closed
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()

@@ -33,8 +33,8 @@ from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport, installed_versions, summed
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.advice import advice
-from colmap_affrect.report.pairs import pairs_of_page
-from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.report.pairs import draw_pairs_to_check
+from colmap_affrect.report.run_page import RunContent, write_run_page
 from colmap_affrect.report.run_report import RunReport, cameras_of_report
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
@@ -471,11 +471,9 @@ def map_and_report(
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
     replace_text(workspace.report, result.to_json())
     if page:
-        image_path = workspace.photographs()
-        looks, progress = pairs_of_page(context, result, pair_inliers), context.progress
-        write_run_page(
-            workspace, result, names, pair_inliers, image_path, progress, marks=marks, looks=looks
-        )
+        pictures = draw_pairs_to_check(context, result, pair_inliers)
+        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures)
+        write_run_page(workspace, result, content, context.progress)
     return result
 
 

@@ -11,7 +11,7 @@ from synthetic import blobs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.features.sift import RootSift, SiftOptions
-from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.affine import project, transform_lafs
 from colmap_affrect.geometry.conventions import (
     colmap_from_pixel,
     grid_origin,
@@ -47,7 +47,7 @@ def test_resized_from_original_maps_image_corners_to_image_corners(
 
 def test_resized_from_original_scales_affine_shapes_by_rows() -> None:
     laf = np.array([[[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]])
-    resized = transform_frames(resized_from_original((8, 8), (8, 4)), laf)
+    resized = transform_lafs(resized_from_original((8, 8), (8, 4)), laf)
     assert_allclose(resized[0, :, :2], [[1.0, 2.0], [1.5, 2.0]])
 
 

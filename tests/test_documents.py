@@ -13,11 +13,13 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 import colmap_affrect
 from colmap_affrect.cli.parser import COMMANDS, build_parser
+from colmap_affrect.colmap.cameras import Source
 from colmap_affrect.project.record import STAGES
 from colmap_affrect.recipes import load_recipe
 
@@ -125,6 +127,40 @@ def test_links_lead_somewhere(name: str) -> None:
             headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
             slugs = {re.sub(r"[^\w -]", "", text).lower().replace(" ", "-") for text in headings}
             assert anchor in slugs, target
+
+
+def said_by_the_program() -> set[str]:
+    """All pieces of text in the code, between what is filled in."""
+    checks = ROOT / "colmap_affrect" / "colmap" / "checks.toml"
+    found = {checks.read_text(encoding="utf-8")}
+    for path in (ROOT / "colmap_affrect").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value.removeprefix("error: ").strip())
+    return found
+
+
+def test_lines_that_troubleshooting_quotes_are_printed() -> None:
+    """Each piece between names and numbers is in a text of the code, or holds a long one of it."""
+    texts = said_by_the_program()
+    for row in re.findall(r"^\| (`.*?) \| ", TEXTS["docs/troubleshooting.md"], re.MULTILINE):
+        for quoted in re.findall(r"`([^`]+)`", row):
+            for piece in re.split(r"\.\.\.|[;:] |\b\w+\.jpg|\b\d+\b|sparse/", quoted):
+                words = piece.strip(" -:")
+                in_words = (text for text in texts if len(text) >= 8 and text in words)
+                assert any(words in text for text in texts) or any(in_words), (row, words)
+
+
+def test_guide_names_all_sources_of_focal_lengths() -> None:
+    (sentence,) = re.findall(
+        r"where its focal length is\s+from: (.*?)\.\n", TEXTS["docs/guide.md"], re.DOTALL
+    )
+    assert re.findall(r"`([\w-]+)`", sentence) == list(get_args(Source))
+
+
+def test_readme_and_guide_say_that_complaints_of_pip_are_harmless() -> None:
+    for name in ("README.md", "docs/guide.md", "docs/troubleshooting.md"):
+        assert re.search(r"`opencv-python`.*?harmless", TEXTS[name], re.DOTALL)
 
 
 def test_pages_name_every_command_and_readme_is_short() -> None:

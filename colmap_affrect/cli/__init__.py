@@ -5,7 +5,7 @@ import errno
 import logging
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from typing import TextIO
@@ -19,8 +19,14 @@ from colmap_affrect.project.workspace import Workspace
 logger = logging.getLogger("colmap_affrect")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code."""
+def main(
+    arguments: Sequence[str] | None = None, *, begin: Callable[[], None] = lambda: None
+) -> int:
+    """Run the command line and return the exit code.
+
+    ``begin`` is called when everything is loaded, before the command begins to work. Ctrl-C goes on
+    to the caller, as KeyboardInterrupt.
+    """
     errors.AffrectError.names_flags = True
     try:
         given = sys.argv[1:] if arguments is None else arguments
@@ -30,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from colmap_affrect.cli import commands  # not for --help
 
             command = getattr(commands, options.command.replace("-", "_"), commands.stage)
+            begin()
             return command(options) or 0
     except errors.AffrectError as error:
         return _fail(str(error), error.exit_code)
@@ -46,9 +53,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not errors.lacks_memory(error):
             raise
         return _fail(f"{errors.MEMORY_HINT}: what was done before is kept")
-    except KeyboardInterrupt:
-        errors.say(errors.INTERRUPTED)
-        return errors.EXIT_INTERRUPTED
 
 
 def _fail(message: str, code: int = 1) -> int:

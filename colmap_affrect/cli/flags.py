@@ -91,10 +91,10 @@ FLAGS: dict[str, Settings] = {
     "--mask-path": _path("FOLDER", "masks, black where features are not wanted: a/b.jpg has "
         "a/b.jpg.png or a/b.png; photographs without one are used whole", dest="masks.path"),
     "--camera-mask-path": _path("FILE", "one mask for all images", dest="masks.camera_path"),
-    "--camera-mode": _value("MODE", "which images share a camera: auto, single, per-folder or "
-        "per-image (default: auto, as --cameras-path says, else those of one body, lens, focal "
-        "length and size by EXIF; without EXIF one camera each, unless matches show that images "
-        "of one size share one)", dest="cameras.mode"),
+    "--camera-mode": _value("MODE", "which images of one size share a camera: auto, single (all), "
+        "per-folder or per-image (default: auto, as --cameras-path says, else those of one body, "
+        "lens and focal length by EXIF; without EXIF all, unless they match better with one each)",
+        dest="cameras.mode"),
     "--camera-model": _value("MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
         dest="cameras.model"),
     "--camera-params": _value("A,B,...",

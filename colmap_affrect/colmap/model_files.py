@@ -7,7 +7,7 @@ So every record is followed to its end first. Models of ours have digests of fil
 import json
 import struct
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -295,9 +295,36 @@ def num_long_tracks(model: pycolmap.Reconstruction, same_view: Mapping[int, int]
 
     ``same_view``: of images that show the view of another one, the id of that.
     """
-    tracks = ({e.image_id for e in point.track.elements} for point in model.points3D.values())
-    long = (images for images in tracks if len({same_view.get(i, i) for i in images}) > 2)
-    return Counter(image_id for images in long for image_id in images)
+    found = Counter[int]()
+    for images in _long_tracks(model):
+        if len({same_view.get(image_id, image_id) for image_id in images}) > 2:
+            found.update(images)
+    return found
+
+
+def all_see_long_tracks(
+    model: pycolmap.Reconstruction, image_ids: Iterable[int], least: int
+) -> bool:
+    """Return whether each of some images sees so many points of three images or more."""
+    missing = dict.fromkeys(image_ids, least)
+    for images in _long_tracks(model):
+        for image_id in images & missing.keys():
+            missing[image_id] -= 1
+            if missing[image_id] <= 0:
+                del missing[image_id]
+        if not missing:
+            return True
+    return not missing
+
+
+def _long_tracks(model: pycolmap.Reconstruction) -> Iterator[set[int]]:
+    """Return the ids of the images of each point that three or more see."""
+    for point in model.points3D.values():
+        if point.track.length() <= 2:
+            continue
+        images = {element.image_id for element in point.track.elements}
+        if len(images) > 2:
+            yield images
 
 
 def seen_points(image: pycolmap.Image) -> Indices:

@@ -16,7 +16,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import significance
 from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
-from colmap_affrect.geometry.parallax import line_of_writing
+from colmap_affrect.geometry.parallax import text_line_matches
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -125,7 +125,7 @@ def estimate_geometry(
     inliers = np.asarray(geometry.inlier_matches)[:, 0]
     if options.min_significance:
         sizes = [(camera.width, camera.height) for camera in cameras]
-        written = line_of_writing(points1[inliers], points2[inliers], (sizes[0], sizes[1]))
+        written = text_line_matches(points1[inliers], points2[inliers], (sizes[0], sizes[1]))
         if written.mean() > MAX_WRITTEN_SHARE:
             scene = np.delete(matches, inliers[written], axis=0)
             return estimate_geometry(sides, scene, options, extracted_px)

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image, UnidentifiedImageError
 
-from colmap_affrect.errors import ImageError
+from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import (
@@ -92,7 +92,7 @@ def convert_images(
         register_heif_opener()
     names = photograph_files(image_path)
     if not names:
-        raise ImageError(f"{image_path}: holds no photographs")
+        raise OptionError(f"{image_path}: holds no photographs")
     with (
         new_results(output_path, names=names) as (folder,),
         progress.stage("convert", len(names), "images") as advance,

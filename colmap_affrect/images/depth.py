@@ -53,11 +53,11 @@ class DepthMaps:
         self._options, self._path = options, Path(options.path)
 
     def require_some(self, names: Sequence[str]) -> None:
-        """Raise DepthError when no image has a map, OptionError when there is no folder."""
+        """Refuse a folder that is not there, or has no map of any image; OptionError."""
         if not self._path.is_dir():
             raise OptionError(f"{self._path}: no such folder; give the folder of the depth maps")
         if not any(self._options.file(name) for name in names):
-            raise DepthError(
+            raise OptionError(
                 f"{self._path}: holds no depth map of any of the {len(names)} images; "
                 f"{self._places(names[0])}"
             )

@@ -179,7 +179,7 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     """Return the sorted names, relative to ``image_path``, of all images below it or of a list.
 
     Hidden files and other formats are passed over (:func:`left_out`). OptionError when there is no
-    such folder or list, ImageError when it holds none, or a listed one is missing.
+    such folder or list, it holds none, or a listed one is missing.
     """
     require_folder(image_path)
     if image_list_path is not None:
@@ -187,7 +187,7 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     names = [name for name in photograph_files(image_path, IMAGE_SUFFIXES) if not _odd(name)]
     if not names:
         others = "".join(f"; {kind}: {what}" for kind, what in left_out(image_path).items())
-        raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
+        raise OptionError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
     return names
 
 
@@ -334,26 +334,29 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
     except OSError as error:
         raise OptionError(f"{image_list_path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise ImageError(f"{image_list_path}: cannot be read ({error})") from error
+        raise OptionError(f"{image_list_path}: cannot be read ({error})") from error
     listed = [
         line if _is_below(image_path, line) else line.strip()  # a name may begin with a space or #
         for line in lines
         if _is_below(image_path, line) or (line.strip() and not line.startswith("#"))
     ]
     if not listed:
-        raise ImageError(f"{image_list_path}: is empty")
+        raise OptionError(f"{image_list_path}: is empty")
     return checked_names(image_path, listed, str(image_list_path))
 
 
 def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[str]:
-    """Return the sorted names of images, each once; ImageError for one not below the folder."""
+    """Return the sorted names of images, each once.
+
+    OptionError for one that is not below the folder, ImageError for one that lists cannot hold.
+    """
     found = sorted({PurePosixPath(name).as_posix() for name in names})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:
         if why := _odd(name):
             raise ImageError(f"{image_path}: {name!r}: {why}; rename it")
     if missing:
-        raise ImageError(f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}")
+        raise OptionError(f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}")
     return found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import ColorImage, GrayImage, Mask, Rectification
-from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
+from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.geometry.conventions import is_inside
 
@@ -102,7 +102,7 @@ def _compressions(
     points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = points[points @ image_from_tile[2, :2] + image_from_tile[2, 2] > 0.0]
     unit = lafs_from_keypoints(points, np.ones(len(points)), np.zeros(len(points)))
-    spans = transform_frames(image_from_tile, unit)
+    spans = transform_lafs(image_from_tile, unit)
     seen = is_inside(spans[:, :, 2], image_size)
     return np.asarray(np.linalg.norm(spans[seen, :, :2], axis=1).max(axis=0, initial=1.0))
 

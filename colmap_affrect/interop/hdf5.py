@@ -8,6 +8,7 @@ Matches: see :mod:`colmap_affrect.pairs.given_matches`. (0, 0) is the centre of 
 Links and data in other files are not followed, and arrays are checked.
 """
 
+import logging
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -65,6 +66,8 @@ from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.stores import PairMatches, frame_datasets, hloc_matches, pair_key
 from colmap_affrect.stages.descriptors import Arrays, matched, unit_rows, write_given_matches
+
+logger = logging.getLogger(__name__)
 
 Datasets = dict[str, NDArray[Any]]
 
@@ -178,7 +181,9 @@ def _import(
     progress: Progress,
 ) -> InterchangeReport:
     names = list_images(image_path)
-    InitialCameras(image_path, cameras).check(names)
+    note = InitialCameras(image_path, cameras).check(names)
+    if note:
+        logger.warning("cameras: %s", note)
     with (
         # Verification may take hours, and half a database must not be left behind.
         new_results(database_path, names=names) as (new,),

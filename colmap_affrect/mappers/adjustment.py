@@ -17,7 +17,7 @@ from pycolmap.cost_functions import ReprojErrorCost
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
-from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.colmap.model_files import all_see_long_tracks
 from colmap_affrect.mappers.tie_points import NONE, TiePoints
 
 USUAL_FOCAL = 1.15  # longer sides: the median of usual lenses, which are of 25 to 70 mm on film
@@ -145,8 +145,7 @@ class Adjuster:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = self.noise_px
         config, registered = pycolmap.BundleAdjustmentConfig(), set(model.reg_image_ids())
-        counts = num_long_tracks(model, {})
-        has_long = all(counts[image_id] >= MIN_LONG_TRACKS for image_id in registered)
+        has_long = all_see_long_tracks(model, registered, MIN_LONG_TRACKS)
         options.min_track_length = 3 if has_long else 2
         images = sorted(registered if image_ids is None else set(image_ids))
         for image_id in images:

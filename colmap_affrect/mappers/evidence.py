@@ -9,7 +9,7 @@ pair itself is wrong, make the evidence. More images that agree are more evidenc
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import seen_points
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.mappers.adjustment import FocalPrior
-from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair, cameras_of, poses_of
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of, poses_of
 
 GRID = 8  # cells on a side of an image: features in one cell err together and count once
 RIGHT, RIGHT_OF_THREE, CHANCE = (14.0, 1.0), (6.0, 2.0), (2.0, 4.0)
@@ -33,6 +33,7 @@ class Evidence:
 
     graph: PairGraph
     priors: Mapping[int, FocalPrior]  # by camera id
+    _num_cells: dict[Ids, int] = field(default_factory=dict, init=False, repr=False)
 
     def of(self, model: pycolmap.Reconstruction) -> float:
         """Return the evidence of a model."""
@@ -73,8 +74,11 @@ class Evidence:
 
     def num_cells(self, pair: VerifiedPair) -> int:
         """Return how many cells hold inliers, in that image of a pair which has fewer."""
-        both = zip(pair.ids, self.graph.points(pair), strict=True)
-        return min(cells(self.graph.cameras[image_id], points) for image_id, points in both)
+        if pair.ids not in self._num_cells:
+            both = zip(pair.ids, self.graph.points(pair), strict=True)
+            counts = [cells(self.graph.cameras[image_id], points) for image_id, points in both]
+            self._num_cells[pair.ids] = min(counts)
+        return self._num_cells[pair.ids]
 
 
 def cells(camera: pycolmap.Camera, points: Floats) -> int:

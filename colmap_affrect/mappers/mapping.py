@@ -4,6 +4,7 @@ What is known of finished models is kept beside them: COLMAP's files cannot hold
 """
 
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.regular_files import read_regular
-from colmap_affrect.project.report import DOUBTFUL, ModelSummary
+from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_probability
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,7 @@ def model_folders(sparse_path: Path) -> list[Path]:
 
 Judgements = Mapping[str, Judgement]  # by the names of the images
 WRONG = 0.05  # probability below which an image leaves its model: nineteen of twenty are wrong
+NUM_REMOVALS, BETWEEN_REMOVALS_S = 5, 0.05  # of what was begun, while a call still writes there
 
 
 def map_database(
@@ -137,8 +139,21 @@ def map_database(
         remove_own([sparse_path])
         partial.rename(sparse_path)
     finally:
-        remove_own([partial])
+        _remove_unfinished(partial)
     return summaries
+
+
+def _remove_unfinished(partial: Path) -> None:
+    """Remove what mapping has not finished; a call of COLMAP that was left may still write there.
+
+    What stays nevertheless, the next mapping removes.
+    """
+    for _ in range(NUM_REMOVALS):
+        try:
+            remove_own([partial])
+            return
+        except OSError:
+            time.sleep(BETWEEN_REMOVALS_S)
 
 
 def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgements]:
@@ -189,15 +204,17 @@ def _summary(
     inside, graph = set(model.reg_image_ids()), graph_of(task, MIN_NUM_MATCHES)
     images = [model.images[image_id] for image_id in sorted(inside)]
     alike = sorted(one_views(graph, task.image_path))
+    sure_of = {name: kept_probability(one.probability) for name, one in found.items()}
     focals = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
     return ModelSummary(
         registered_names=tuple(sorted(focals)),
         num_points3D=model.num_points3D(),
         mean_track_length=float(model.compute_mean_track_length()),
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
-        probabilities={name: round(one.probability, 3) for name, one in found.items()},
+        probabilities=sure_of,
         gains={name: round(one.gain, 3) for name, one in {**taken, **found}.items()},
-        doubtful={name: one.reason for name, one in found.items() if one.probability < DOUBTFUL},
+        doubtful={name: found[name].reason for name, p in sure_of.items() if p < DOUBTFUL},
+        unsure={name: found[name].reason for name, p in sure_of.items() if DOUBTFUL <= p < SURE},
         bridges={name: one for name, one in mapped.bridges.items() if name in focals},
         taken_out={name: one.reason for name, one in taken.items()},
         focals_px=focals,

@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from colmap_affrect.errors import ImageError
-from colmap_affrect.geometry.parallax import correlation, one_view_homography
+from colmap_affrect.geometry.parallax import correlation, same_view_homography
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph
 
@@ -23,7 +23,7 @@ def one_views(graph: PairGraph, image_path: Path | None) -> frozenset[Ids]:
         return frozenset()
     for pair in graph.pairs[:: -(-len(graph.pairs) // MAX_PAIRS) or 1]:
         points1, points2 = graph.points(pair)
-        homography = one_view_homography(points1, points2, graph.sizes(pair.ids))
+        homography = same_view_homography(points1, points2, graph.sizes(pair.ids))
         if homography is None:
             continue
         try:

@@ -3,7 +3,7 @@
 import copy
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Self
@@ -71,6 +71,11 @@ class PairGraph:
     pairs: Pairs  # sorted by ids
     weak: Pairs  # that are not among the strongest, and in the cache only
     min_num_matches: int  # pairs with fewer inliers are left out
+    _agreements: dict[Ids, tuple[VerifiedPair, bytes, float]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+    """The last agreement of each pair, and with which poses and cameras: models are looked at
+    several times."""
 
     @classmethod
     def read(cls, path: Path, min_num_matches: int = MIN_NUM_MATCHES) -> Self:
@@ -169,8 +174,15 @@ class PairGraph:
     def agreement(self, pair: VerifiedPair, poses: PoseById, cameras: CameraById) -> float:
         """Return the share of the inliers of a pair that agree with the poses of its images."""
         first, second = pair.ids
-        pose, both = relative_pose(poses[first], poses[second]), (cameras[first], cameras[second])
-        return float(_agrees(pose, both, self._some_points(pair))[0].mean())
+        both = cameras[first], cameras[second]
+        asked = _bytes_of((*poses[first], *poses[second]), both)
+        known = self._agreements.get(pair.ids)
+        if known and known[0] is pair and known[1] == asked:
+            return known[2]
+        pose = relative_pose(poses[first], poses[second])
+        share = float(_agrees(pose, both, self._some_points(pair))[0].mean())
+        self._agreements[pair.ids] = pair, asked, share
+        return share
 
     def unexplained_by(self, model: pycolmap.Reconstruction) -> list[VerifiedPair]:
         """Return the pairs that contradict a model, or have an image that it has not."""
@@ -238,6 +250,15 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
 def has_rigs(model: pycolmap.Reconstruction) -> bool:
     """Tell whether a model has a rig of several sensors."""
     return any(rig.num_sensors() > 1 for rig in model.rigs.values())
+
+
+def _bytes_of(arrays: Iterable[Array], cameras: Cameras) -> bytes:
+    """Return what tells poses and cameras from others, to the bit."""
+    parts = [np.asarray(values).tobytes() for values in arrays]
+    for camera in cameras:
+        numbers = [camera.model.value, camera.width, camera.height, *camera.params]
+        parts.append(np.array(numbers, np.float64).tobytes())
+    return b"".join(parts)
 
 
 def _agrees(pose: Pose, cameras: Cameras, points: tuple[Array, Array]) -> tuple[Bools, Depths]:

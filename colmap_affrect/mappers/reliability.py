@@ -19,7 +19,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import connected_parts, lone_ties
-from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
+from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
 from colmap_affrect.mappers.adjustment import (
     EXIF_SIGMA,
     FINAL,
@@ -114,11 +114,16 @@ TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
         lambda m: CONTRADICTIONS[0] if m.evidence < 0.0 else "few matches speak for its place",
     ),
     "agreement": Term(
-        lambda m: m.agreement, lambda m: f"only {m.agreement:.0%} {CONTRADICTIONS[1]}"
+        lambda m: m.agreement,
+        lambda m: f"only {math.floor(100.0 * m.agreement)}% {CONTRADICTIONS[1]}",
     ),
     "points of three": Term(
         lambda m: math.log1p(min(m.num_three, 300)),
-        lambda m: f"only {m.num_three} of its points are seen by two other photographs",
+        lambda m: (
+            f"only {m.num_three} of its points are seen by two other photographs"
+            if m.num_three
+            else "none of its points is seen by two other photographs"
+        ),
     ),
     "focal length": Term(
         lambda m: math.log(min(max(m.focal_growth, MIN_GROWTH), MAX_GROWTH)),
@@ -209,7 +214,9 @@ def measure(
     for first, second in sorted(one_view):
         same_view[second] = same_view.get(first, first)
     three, long = evidence.three_view_ratios(model), num_long_tracks(model, same_view)
-    turned, originals = _rotation_shares(graph, pairs_of), _originals(graph, pairs, agreements)
+    pairs_of_frames = _pairs_of_frames(model, pairs_of)
+    turned = _rotation_shares(graph, pairs_of_frames)
+    originals = _originals(graph, pairs, agreements)
     growths = focal_growths(model, task) if growths is None else growths
     cuts = _cuts({pair.ids: pair for pair in pairs if agreements[pair.ids] >= MIN_SHARE})
     fitting_px = _fitting_focals(model, task, priors)
@@ -220,7 +227,8 @@ def measure(
         shares, weights = [agreements[p.ids] for p in own], [len(p.matches) for p in own]
         cells_of = {p.ids: evidence.num_cells(p) for p in own if p.ids not in one_view}
         nats = sum(pair_evidence(agreements[ids] * n, n) for ids, n in cells_of.items())
-        rotations = [turned[p.ids] for p in own if p.ids in turned] or list(turned.values())
+        with_frame = pairs_of_frames[model.images[image_id].frame_id]
+        rotations = [turned[p.ids] for p in with_frame if p.ids in turned] or list(turned.values())
         name, camera = graph.names[image_id], cameras[image_id]
         focal_px = float(camera.mean_focal_length())
         found[name] = Measures(
@@ -251,10 +259,24 @@ def _cuts(agreeing: Mapping[Ids, VerifiedPair]) -> dict[int, VerifiedPair]:
     return found
 
 
+def _pairs_of_frames(
+    model: pycolmap.Reconstruction, pairs_of: Mapping[int, Sequence[VerifiedPair]]
+) -> dict[int, list[VerifiedPair]]:
+    """Return the pairs of each frame with others: what a rig took at once stands right together."""
+    frames = {image_id: model.images[image_id].frame_id for image_id in pairs_of}
+    found: dict[int, list[VerifiedPair]] = {frame_id: [] for frame_id in frames.values()}
+    for image_id, pairs in pairs_of.items():
+        for pair in pairs:
+            first, second = pair.ids
+            if frames[first] != frames[second]:
+                found[frames[image_id]].append(pair)
+    return found
+
+
 def _rotation_shares(
     graph: PairGraph, pairs_of: Mapping[int, Sequence[VerifiedPair]]
 ) -> dict[Ids, float]:
-    """Return, of the strongest pairs of images, how much a camera that turns explains."""
+    """Return, of the strongest pairs of frames, how much a camera that turns explains."""
     strongest = {
         pair.ids: pair
         for pairs in pairs_of.values()
@@ -264,7 +286,7 @@ def _rotation_shares(
     for pair in list(strongest.values())[:: -(-len(strongest) // MAX_PAIRS_TURNED) or 1]:
         sizes = graph.sizes(pair.ids)
         error = MAX_ERROR * max(map(max, sizes))
-        found[pair.ids] = rotation_share(*graph.points(pair), sizes, error)
+        found[pair.ids] = pure_rotation_ratio(*graph.points(pair), sizes, error)
     return found
 
 

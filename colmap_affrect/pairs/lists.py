@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Bools
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
@@ -189,17 +189,17 @@ def read_pairs(path: Path, names: Sequence[str], image_path: Path | None = None)
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise AffrectError(f"{path}: cannot be read ({error})") from error
+        raise OptionError(f"{path}: cannot be read ({error})") from error
     if problems:
         (count, line), more = problems[0], len(problems) - 1
-        raise AffrectError(
+        raise OptionError(
             f"{path}: line {count}: {line!r} is not two names of images"
             f"{_suggestion(line, ordered)}" + f", nor are {more} more lines" * (more > 0)
         )
     found.sort()  # np.unique takes seven times as much memory
     found = found[np.flatnonzero(np.diff(found, prepend=-1))]
     if not len(found):
-        raise AffrectError(f"{path}: holds no pair of two different images")
+        raise OptionError(f"{path}: holds no pair of two different images")
     numbers = np.empty((len(found), 2), np.int32)
     np.divmod(found, len(ordered), out=(numbers[:, 0], numbers[:, 1]), casting="unsafe")
     return PairList(ordered, numbers)

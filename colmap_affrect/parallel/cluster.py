@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 from threadpoolctl import threadpool_limits
 
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.parallel.cluster_watch import ClusterWatch
 from colmap_affrect.parallel.executor import Result, Task, in_order
 
@@ -108,7 +108,7 @@ def connected(address: str) -> Iterator[Cluster]:
             f"--scheduler: {error.name} is not installed; pip install 'colmap-affrect[cluster]'"
         ) from error
     if not re.fullmatch(r"(tcp|tls)://.+:\d+", address):
-        raise AffrectError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
+        raise OptionError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
     security = Security()  # as dask's configuration has it
     for name in ("distributed", "distributed.client"):  # errors that matter are raised
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -1,6 +1,7 @@
 """What stages and runs report: frozen, printable, JSON out."""
 
 import json
+import math
 import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,11 +21,35 @@ SOURCES = {  # how a summary calls where focal lengths are from; others by their
 }  # fmt: skip
 
 OF_LARGEST = (  # what ``report.json`` has of the largest model under its own name
-    "registered_names", "probabilities", "doubtful", "mean_track_length",
+    "registered_names", "probabilities", "unsure", "doubtful", "mean_track_length",
     "mean_reprojection_error_px", "moves", "one_view",
 )  # fmt: skip
 
 SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
+MOST_CERTAIN = 0.999  # nothing is more probable than that
+
+
+def kept_probability(probability: float) -> float:
+    """Return a probability as it is kept: rounded down, so that it stays on its side of a limit.
+
+    >>> kept_probability(0.89999), kept_probability(0.49999), kept_probability(1.0)
+    (0.899, 0.499, 0.999)
+    """
+    return min(math.floor(1000.0 * probability + 1e-9) / 1000.0, MOST_CERTAIN)
+
+
+def probability_text(probability: float) -> str:
+    """Return a probability in percent: rounded down, and never 0 or 100.
+
+    >>> probability_text(0.499), probability_text(0.9), probability_text(0.998)
+    ('49%', '90%', '>99%')
+    """
+    percent = math.floor(100.0 * probability + 1e-9)
+    if percent < 1:
+        return "<1%"
+    return ">99%" if percent >= 99 and probability > 0.99 else f"{percent}%"
+
+
 MAX_EXIF_ERROR = 1.27  # of a focal length: three standard deviations of what EXIF usually has
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
@@ -69,6 +94,12 @@ def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
             f"in the model{more}; --ignore-exif leaves it out"
         )
     lenses_mm = sorted({camera["lens_mm"] for camera in cameras if camera.get("lens_mm")})
+    shared = [camera for camera in cameras if _is_found(camera)]
+    num_found = len({camera["refined_px"] for camera in shared})
+    if num_found < len(shared):
+        notes.append(
+            f"of those not known mapping makes {num_found}: photographs of one size share one"
+        )
     if lenses_mm:
         notes.append(
             f"EXIF has {', '.join(f'{mm:g}' for mm in lenses_mm[:3])} mm, and not the size of the "
@@ -76,6 +107,27 @@ def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
             "the focal length"
         )
     return notes
+
+
+def as_mapped(cameras: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return cameras, with those that mapping has made one as one, with all their photographs.
+
+    Args:
+        cameras: entries of ``report.json``.
+    """
+    found: dict[object, Mapping[str, Any]] = {}
+    for number, camera in enumerate(cameras):
+        key: object = number
+        if _is_found(camera):
+            key = camera["refined_px"], camera["focal_px"], camera["why"]
+        names = [*found[key]["names"], *camera["names"]] if key in found else camera["names"]
+        found[key] = {**camera, "names": names}
+    return list(found.values())
+
+
+def _is_found(camera: Mapping[str, Any]) -> bool:
+    """Return whether nothing but the model tells the focal length of a camera."""
+    return camera["source"] == "guess" and bool(camera.get("refined_px"))
 
 
 def _contradicts_exif(camera: Mapping[str, Any]) -> bool:
@@ -216,6 +268,8 @@ class ModelSummary:
     """What more matches may add to these probabilities."""
     doubtful: dict[str, str] = field(default_factory=dict)
     """Why images are rather wrong than right."""
+    unsure: dict[str, str] = field(default_factory=dict)
+    """Why images are neither sure nor doubtful."""
     bridges: dict[str, Bridge] = field(default_factory=dict)
     """How images came in that are in no track through three images."""
     taken_out: dict[str, str] = field(default_factory=dict)
@@ -242,6 +296,7 @@ class ModelSummary:
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
         lines = _some(f"joined      {name} {one.text()}" for name, one in self.bridges.items())
+        lines += _some(f"unsure      {line}" for line in by_story(self.unsure))
         lines += _some(f"doubtful    {line}" for line in by_story(self.doubtful))
         alike = (f"one view    {a} and {b}: no depth between them" for a, b in self.one_view)
         lines += _some(alike)

@@ -11,7 +11,7 @@ from typing import Any, Self
 from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
-from colmap_affrect.errors import OptionError, StoreError, WorkspaceError
+from colmap_affrect.errors import ConflictError, OptionError, WorkspaceError
 from colmap_affrect.project import outputs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 from colmap_affrect.project.record import (
@@ -250,7 +250,7 @@ class Workspace:
         ``plan`` has options of later stages, those of stages that have begun stay as they are;
         ``recipe`` is a name for the record only. ``overwrite`` discards the results of this stage
         and the later ones first; with the first stage their options are forgotten, too. Raises
-        StoreError when other options made the results that are there.
+        ConflictError when other options made the results that are there.
         """
         self._refuse_foreign_results(stage)
         outputs.remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
@@ -261,7 +261,7 @@ class Workspace:
             begun = self._begun_before(stage)
             record = record if begun else {}
         if stage in begun and (why := first_difference(record[stage], options)):
-            raise StoreError(
+            raise ConflictError(
                 f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
             )
         begun = [name for name in STAGES if name in begun or name == stage]
@@ -273,10 +273,10 @@ class Workspace:
         """Remove the database and what was made from it, for inputs that have changed.
 
         The options of these stages stay on record, and models until others take their place.
-        Raises StoreError for a database of the user.
+        Raises ConflictError for a database of the user.
         """
         if self.users_database:
-            raise StoreError(f"{self.users_database}: {why}; {self._remedy}")
+            raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
         self.record_made_from(map="")
         outputs.remove_own(path for path in self._results("verify") if path != self.sparse)
         self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
@@ -290,25 +290,25 @@ class Workspace:
     def _refuse_foreign_results(self, stage: str) -> None:
         first = {"copy": "extract", "extract": "copy"}.get(stage)
         if first in self.begun:
-            raise StoreError(
+            raise ConflictError(
                 f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
                 "use another --output-path"
             )
         for path in () if self.begun else self._results("extract"):
             if path.exists() and path != self.users_database:
-                raise StoreError(
+                raise ConflictError(
                     f"{path}: exists and was not made here; it is left as it is, use "
                     "another --output-path"
                 )
 
     def refuse_foreign_models(self) -> None:
-        """Refuse to remove models beside which others have put something; StoreError."""
+        """Refuse to remove models beside which others have put something; ConflictError."""
         files = list(self.sparse.glob("*"))
         for folder in [path for path in files if path.is_dir() and path.name.isdecimal()]:
             files.remove(folder)
             files += [path for path in folder.iterdir() if path.name not in FILES_OF_MODEL]
         if foreign := [path for path in files if not path.name.startswith(".")]:
-            raise StoreError(
+            raise ConflictError(
                 f"{foreign[0]}: was not made by this run and would be removed with its models; "
                 "move it elsewhere, and run the same command again"
             )

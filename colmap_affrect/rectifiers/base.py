@@ -1,6 +1,8 @@
-"""What a rectifier is: it decides which warps of a photograph to look at.
+"""The protocol of rectifiers, their common options, and their registry.
 
-Entry points are in the group ``colmap_affrect.rectifiers``. Several threads may call an object.
+A rectifier decides which warps of a photograph features are extracted from. Rectifiers of other
+packages are entry points of the group ``colmap_affrect.rectifiers``. Several threads may call one
+object.
 """
 
 from dataclasses import dataclass
@@ -32,7 +34,7 @@ class RectifierInputs:
     """What a rectifier may read beside the photograph."""
 
     shapes: ShapeSource | None = None  # the source that its options name, if any
-    depth: DepthMaps | None = None  # None when the recipe needs no depth
+    depth: DepthMaps | None = None  # None if the recipe needs no depth
 
 
 Warps = Literal["none", "some", "all tilts"]
@@ -57,10 +59,22 @@ class AffineWarpOptions(RectifierOptions):
     never magnifies (the paper)."""
 
     def warp(self, region: Region, tilt: float, angle_rad: float, segment_id: int) -> Rectification:
-        """Show a region by the affine map of the class (tilt, angle)."""
+        """Plan the warp of a region by the rectifying map of a tilt class.
+
+        Args:
+            region: part of the photograph.
+            tilt: of the class.
+            angle_rad: of the class.
+            segment_id: number of the region, for reports.
+
+        Returns:
+            The warp, on a canvas that just holds the region.
+        """
         linear = rectifying_affine(tilt, angle_rad, area_preserving=self.area_preserving)
-        canvas = fit_canvas(linear, region.outline(), MARGIN_PX)
-        return Rectification(*canvas, region.mask, tilt, angle_rad, region.origin, segment_id)
+        matrix, canvas_size = fit_canvas(linear, region.outline(), MARGIN_PX)
+        return Rectification(
+            matrix, canvas_size, region.mask, tilt, angle_rad, region.origin, segment_id
+        )
 
 
 class CoverOptions(AffineWarpOptions):
@@ -80,10 +94,20 @@ class CoverOptions(AffineWarpOptions):
     """Upper bound on the covering maps."""
 
     def cover(self, metrics: Floats, votes: Floats | None = None) -> Cover:
-        """Cover (N, 3) metrics, each with one vote unless (N,) votes are given."""
+        """Cover shapes, each with one vote by default.
+
+        Args:
+            metrics: (N, 3) unit metrics of the shapes.
+            votes: (N,) numbers >= 0.
+
+        Returns:
+            The centres, and to which of them each shape belongs.
+        """
+        if votes is None:
+            votes = np.ones(len(metrics))
         return cover_shapes(
             metrics,
-            np.ones(len(metrics)) if votes is None else votes,
+            votes,
             radius=self.tilt_radius,
             max_tilt=self.max_tilt,
             covered_frac=self.covered_frac,
@@ -92,7 +116,7 @@ class CoverOptions(AffineWarpOptions):
 
 
 class WithInputs:
-    """Base of our rectifiers: what their options ask for is there, as ``shapes`` and ``depth``."""
+    """Base of our rectifiers. ``shapes`` and ``depth`` are there if the options ask for them."""
 
     def __init__(self, options: Any, inputs: RectifierInputs) -> None:
         self.options = options

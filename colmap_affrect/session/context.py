@@ -84,7 +84,7 @@ class Inputs(Options):
         names = list_images(folder, listed)
         unknown = sorted(set(names) - set(known))
         if unknown:
-            raise ImageError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
+            raise OptionError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
         return names
 
     def contents(
@@ -116,11 +116,14 @@ class Inputs(Options):
                 "parameters, and other options of cameras"
             )
 
-    def check_names(self, names: Sequence[str]) -> None:
-        """Refuse photographs with the same key in hloc's files, or that cannot share cameras."""
+    def check_names(self, names: Sequence[str]) -> dict[str, str]:
+        """Refuse photographs with the same key in hloc's files, or whose cameras cannot be.
+
+        Returns what becomes of cameras otherwise than asked for, as a warning.
+        """
         refuse_colliding_keys(names)
-        if not self.from_database:
-            self.initial_cameras.check(names)
+        note = "" if self.from_database else self.initial_cameras.check(names)
+        return {"cameras": note} if note else {}
 
     @property
     def may_share(self) -> bool:

@@ -27,7 +27,6 @@ from colmap_affrect.progress import SILENT, Progress
 
 SIFT_SIZE = 128  # values of the one kind of descriptors that whole numbers stand for
 IMAGES_IN_MEMORY = 60
-USUAL_FEATURES = 8000  # of an image, to tell how much there is to compare
 
 Arrays = tuple[Floats, Any]
 """(N, 2) keypoints in px, and the (N, D) descriptors of an image."""
@@ -103,8 +102,7 @@ def matched(
         read: returns (N, 2) keypoints and (N, D) descriptors of an image.
         options: of the matcher.
     """
-    context = MatcherContext(num_similarities=len(pairs) * USUAL_FEATURES**2)
-    matcher = NearestNeighbors(options or NearestOptions(), context)
+    matcher = NearestNeighbors(options or NearestOptions(), MatcherContext())
     sizes = dict[int, str]()
 
     @lru_cache(maxsize=IMAGES_IN_MEMORY)

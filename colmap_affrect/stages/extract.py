@@ -8,7 +8,14 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
-from colmap_affrect.errors import DatabaseError, ImageError, StoreError, one_line, such_as
+from colmap_affrect.errors import (
+    ConflictError,
+    DatabaseError,
+    ImageError,
+    StoreError,
+    one_line,
+    such_as,
+)
 from colmap_affrect.features.weights import digests
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
@@ -52,8 +59,8 @@ def extract(
     names = checked_names(folder, image_names, "image_names") if image_names else names
     options, known = recipe.extraction, {} if overwrite else context.features.contents()
     contents = inputs.contents(names, options, known)
-    if contents != known:  # else they were seen to be good
-        inputs.check_names(names)
+    # Those that were there before were seen to be good.
+    notes = inputs.check_names(names) if contents != known else {}
     whole = inputs.photographs.without_mask(names)
     extractor = one_image.prepare(options, context.resources, names, context.progress)
     if not overwrite:
@@ -66,7 +73,7 @@ def extract(
         recipe=recipe.name,
         overwrite=overwrite,
     )
-    warnings = _forget_changed(context, inputs, contents, are_all=not image_names)
+    warnings = notes | _forget_changed(context, inputs, contents, are_all=not image_names)
     start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
     missing = [name for name in names if name not in done]
@@ -199,7 +206,7 @@ def _refuse_other_photographs(
     before = (workspace.planned("extract") or {}).get("image_path", image_path)
     known = {} if before == image_path else FeatureStore(workspace.features).contents()
     if known and len(_changed(known, contents)) == len(known.keys() & contents.keys()):
-        raise StoreError(
+        raise ConflictError(
             f"{workspace.path}: the extract stage was run there with image_path={before!r}, and "
             f"none of the photographs in {image_path} is one of them; use --overwrite to discard "
             "the results, or another --output-path"

@@ -9,7 +9,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.model_files import model_folder
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import ConflictError
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, model_folders, read_summaries
@@ -52,7 +52,7 @@ def map_images(
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
     known = workspace.made_from("map") if workspace.sparse.exists() else ""
     if known != inputs and " " in known and not extend:
-        raise StoreError(
+        raise ConflictError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
         )

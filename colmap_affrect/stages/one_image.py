@@ -14,7 +14,7 @@ from colmap_affrect.data import LocalFeatures, Mask, Photograph, RectificationPl
 from colmap_affrect.errors import MEMORY_HINT, DepthError, ImageError, lacks_memory
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import digests, resolve
-from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import camera_matrix, is_inside, resized_from_original
 from colmap_affrect.images import reading
@@ -111,7 +111,7 @@ class ImageExtractor:
             features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
             resized = resized_from_original(original_size, photograph.size)
-            frames = transform_frames(np.linalg.inv(resized), features.lafs)
+            frames = transform_lafs(np.linalg.inv(resized), features.lafs)
             features = replace(features, lafs=frames)
         keep = is_inside(features.keypoints, original_size)
         if mask is not None:

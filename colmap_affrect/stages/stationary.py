@@ -3,7 +3,7 @@
 Such a thing is at the same place of many photographs, whatever they show. Its matches fit a
 camera that does not move, and may be more than those of the scene. So may those of the background
 where an object turns before a camera that stands still. What a camera turns about is also at the
-same place, but not to the pixel: see :mod:`colmap_affrect.geometry.stillness`.
+same place, but not to the pixel: see :mod:`colmap_affrect.geometry.stationary`.
 """
 
 import logging
@@ -16,7 +16,11 @@ import numpy as np
 
 from colmap_affrect.data import Mask
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
-from colmap_affrect.geometry.stillness import exactness, means_of_regions, num_moving_together
+from colmap_affrect.geometry.stationary import (
+    means_of_regions,
+    num_moving_together,
+    stationary_log_ratios,
+)
 from colmap_affrect.images.reading import grown
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.stores import STATIONARY, FeatureStore, MatchStore, PairMatches
@@ -175,7 +179,7 @@ class StationaryFilter:
             if not _at(likely, cells).any():
                 continue
             points, others = self._ends(found.names, found.indices[are_still])
-            ratios = exactness(points, others - points, tolerance_px, limit_px)
+            ratios = stationary_log_ratios(points, others - points, tolerance_px, limit_px)
             own += _means(cells, ratios)
             connected += _means(cells, means_of_regions(cells, ratios, NUM_CELLS, CONNECTED))
         return np.minimum(own, connected)

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.verification import (
     verified_pairs,
     verify,
 )
-from colmap_affrect.geometry.affine import project, rotation, transform_frames
+from colmap_affrect.geometry.affine import project, rotation, transform_lafs
 
 Array = NDArray[np.float64]
 Frames = tuple[Array, Array]
@@ -55,7 +55,7 @@ def frames_of(homographies: list[Array], num: int, seed: int) -> Frames:
     lafs[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, num)) * stretch
     lafs[:, :, 2] = rng.uniform((60, 50), (580, 430), (num, 2))
     parts = np.array_split(lafs, len(homographies))
-    seen = [transform_frames(h, part) for h, part in zip(homographies, parts, strict=True)]
+    seen = [transform_lafs(h, part) for h, part in zip(homographies, parts, strict=True)]
     return lafs, np.concatenate(seen)
 
 
@@ -225,7 +225,7 @@ def with_caption(frames: Frames) -> Frames:
     """Add forty matches of print below, which is a little larger and elsewhere in image 2."""
     lafs, _ = frames_of([np.eye(3)], 40, 11)
     lafs[:, :, 2] = np.random.default_rng(12).uniform((200, 440), (350, 446), (40, 2))
-    moved = transform_frames(np.array([[1.05, 0.02, 60.0], [-0.02, 1.05, -390.0], [0, 0, 1]]), lafs)
+    moved = transform_lafs(np.array([[1.05, 0.02, 60.0], [-0.02, 1.05, -390.0], [0, 0, 1]]), lafs)
     return np.concatenate([frames[0], lafs]), np.concatenate([frames[1], moved])
 
 

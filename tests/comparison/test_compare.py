@@ -20,7 +20,7 @@ from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.comparison import compare as module
 from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.compare import CompareOptions, compare
-from colmap_affrect.comparison.method_run import MethodRun, _masks_for_colmap
+from colmap_affrect.comparison.method_run import MethodRun, masks_for_colmap
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.tables import to_json, verdict
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
@@ -111,7 +111,7 @@ def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> N
     for method in finished:
         assert method.failed == ""
         assert method.registered.min == method.registered.max == NUM_IMAGES
-        assert method.right.mean == NUM_IMAGES
+        assert method.trusted.mean == NUM_IMAGES
         assert list(method.failures) == ["broken.png"]
         assert method.peak_memory_bytes > 50e6
         assert {*method.stage_seconds} == {"extract", "match", "verify", "map"}
@@ -323,12 +323,12 @@ def test_colmaps_sift_has_the_masks_of_alpha_channels(tmp_path: Path) -> None:
     (tmp_path / "photos" / "side").mkdir(parents=True)
     image = np.full((40, 60, 4), 255, np.uint8)
     write_image(tmp_path / "photos" / "whole.png", image)
-    with _masks_for_colmap(photographs, ["whole.png"]) as folder:
+    with masks_for_colmap(photographs, ["whole.png"]) as folder:
         assert folder == str(tmp_path / "masks")
     image[:10, :, 3] = 0
     write_image(tmp_path / "photos" / "side" / "cut.png", image)
     write_image(tmp_path / "masks" / "whole.png", image[:, :, 0])
-    with _masks_for_colmap(photographs, ["side/cut.png", "whole.png"]) as folder:
+    with masks_for_colmap(photographs, ["side/cut.png", "whole.png"]) as folder:
         assert read_mask(Path(folder) / "side" / "cut.png.png").mean() == 0.75
         assert read_mask(Path(folder) / "whole.png.png").all()
 

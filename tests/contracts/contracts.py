@@ -22,7 +22,7 @@ from colmap_affrect.data import (
 )
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.features.sift import RootSift, SiftOptions
-from colmap_affrect.geometry.affine import lafs_from_keypoints, project, transform_frames
+from colmap_affrect.geometry.affine import lafs_from_keypoints, project, transform_lafs
 from colmap_affrect.geometry.conventions import camera_matrix, is_inside
 from colmap_affrect.matchers.base import ImageFeatures, Matcher
 from colmap_affrect.recipes import ExtractionOptions
@@ -209,7 +209,7 @@ def check_rectification(item: Rectification, size: tuple[int, int]) -> None:
     assert (mapped >= -ROUNDING_PX).all()
     assert (mapped <= np.array(item.canvas_size) - 1 + ROUNDING_PX).all()
     frames = np.concatenate([np.tile(np.eye(2), (len(points), 1, 1)), points[:, :, None]], axis=2)
-    assert (np.linalg.det(transform_frames(matrix, frames)[:, :, :2]) > 0).all()
+    assert (np.linalg.det(transform_lafs(matrix, frames)[:, :, :2]) > 0).all()
 
 
 def assert_same_plan(first: RectificationPlan, second: RectificationPlan) -> None:

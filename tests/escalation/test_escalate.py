@@ -121,7 +121,7 @@ def test_device_that_is_not_there_discards_nothing(
     workspace = copy_of(escalated, tmp_path)
     before = database_content(workspace.database)
     ended = call("match", "--output-path", tmp_path, "--device", "cuda:99", "--overwrite")
-    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert (ended.code, len(ended.errors)) == (2, 1)
     assert "--device cuda:99" in ended.errors[0]
     with pytest.raises(AffrectError, match="--device cuda:99"):
         escalation.escalate(Context(workspace, Resources(device="cuda:99")))

@@ -195,7 +195,7 @@ def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: s
     touch(folder, "a.png")
     listed = tmp_path / "list.txt"
     listed.write_text(line.format(folder=folder))
-    with pytest.raises(ImageError, match=r"list\.txt: (lists .* not in|is empty)"):
+    with pytest.raises(OptionError, match=r"list\.txt: (lists .* not in|is empty)"):
         list_images(folder, listed)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -23,11 +25,13 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
+from colmap_affrect.mappers import mapping
+from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.reliability import Judgement
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import map_and_report
@@ -157,6 +161,46 @@ def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
     (model,), _ = reconstruct(path, mapper_of("incremental"))
     assert len(model.registered_names) == 3
+
+
+def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [0.49996, 0.89996, 0.99996]
+
+    def judged(mapped: MappedModel, *_: object) -> dict[str, Judgement]:
+        names = sorted(image.name for image in mapped.reconstruction.images.values())
+        return {n: Judgement(p, "a reason") for n, p in zip(names, given, strict=True)}
+
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=3, num_points3D=150)
+    monkeypatch.setattr(mapping, "judge", judged)
+    (model,), _ = reconstruct(path, mapper_of("incremental"))
+    first, second, third = model.registered_names
+    assert list(model.probabilities.values()) == [0.499, 0.899, 0.999]
+    assert (model.doubtful, model.unsure) == ({first: "a reason"}, {second: "a reason"})
+    assert model.sure == (third,)
+
+
+def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A call that does not look whether it is cancelled is left, and goes on for a moment."""
+    path, removed = tmp_path / "database.db", shutil.rmtree
+    synthesize(path, num_rigs=2, num_points3D=50)
+
+    def remove_while_a_file_is_made(folder: Path) -> None:
+        monkeypatch.setattr(shutil, "rmtree", removed)
+        raise OSError(errno.ENOTEMPTY, "Directory not empty", folder)
+
+    def stop(*_: object, **__: object) -> None:
+        monkeypatch.setattr(shutil, "rmtree", remove_while_a_file_is_made)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", stop)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(path, mapper_of("incremental"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
 
 
 @pytest.fixture(scope="module")

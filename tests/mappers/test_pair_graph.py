@@ -1,7 +1,10 @@
 """Graphs of verified pairs, of which mapping takes a part."""
 
+import copy
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
+from colmap_affrect.mappers import pair_graph
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
 from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS
@@ -92,3 +96,32 @@ def test_most_connected_is_the_largest_part(path: Path) -> None:
     apart = graph.without([p.ids for p in graph.pairs if len(part.intersection(p.ids)) == 1])
     assert apart.most_connected == set(graph.keypoints) - part
     assert not graph.without([pair.ids for pair in graph.pairs]).most_connected
+
+
+def test_agreement_of_a_pair_is_computed_anew_where_a_pose_or_a_camera_is_another(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = PairGraph.read(path)
+    pair = graph.pairs[0]
+    cameras = {key: copy.copy(camera) for key, camera in graph.cameras.items()}
+    poses = {key: (np.eye(3), np.array([0.1 * key, 0.0, 1.0])) for key in cameras}
+    computed = list[str]()
+    compute = pair_graph._agrees
+
+    def counting(*given: Any) -> Any:
+        computed.append("")
+        return compute(*given)
+
+    monkeypatch.setattr(pair_graph, "_agrees", counting)
+    share = graph.agreement(pair, poses, cameras)
+    assert graph.agreement(pair, dict(poses), cameras) == share
+    assert len(computed) == 1
+    first = pair.ids[0]
+    poses[first] = poses[first][0], poses[first][1] + 1e-12
+    graph.agreement(pair, poses, cameras)
+    assert len(computed) == 2
+    cameras[first].params *= 1.5
+    graph.agreement(pair, poses, cameras)
+    assert len(computed) == 3
+    graph.agreement(replace(pair, matches=pair.matches[:50]), poses, cameras)
+    assert len(computed) == 4

@@ -59,7 +59,7 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
     bad = {
         "evidence": (replace(good, evidence=-20.0), "speak against"),
         "agreement": (replace(good, agreement=0.1), "only 10% of the matches"),
-        "points of three": (replace(good, num_three=0), "only 0 of its points"),
+        "points of three": (replace(good, num_three=0), "none of its points is seen by two other"),
         "focal length": (replace(good, focal_growth=0.001), "any focal length fits"),
         "given focal length": (
             replace(good, focal_px=720.4, fitting_px=910.2),

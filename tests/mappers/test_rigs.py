@@ -14,8 +14,10 @@ import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.model_files import all_see_long_tracks, num_long_tracks
+from colmap_affrect.mappers import reliability
 from colmap_affrect.mappers.adjustment import Settled
-from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import MAX_NUM_OBSERVATIONS, _with_fewer_points
@@ -36,6 +38,36 @@ def unknown_cameras(path: Path) -> dict[int, CameraRecord]:
         cameras = database.read_all_cameras()
     record = CameraRecord(("a",), "guess", 1280.0, size=SIZE)
     return {camera.camera_id: replace(record) for camera in cameras}
+
+
+def test_pairs_of_a_rig_with_itself_tell_no_rotation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    model = synthesize_rig(path)
+    measured = list[Any]()
+
+    def share(*given: Any) -> float:
+        measured.append(given)
+        return 0.25
+
+    monkeypatch.setattr(reliability, "rotation_share", share)
+    found = reliability.measure(MappedModel(model), MappingTask(path, None))
+    assert len(found) == 12
+    assert {measures.turned for measures in found.values()} == {0.25}
+    num_frames = 4
+    assert num_frames <= len(measured) <= reliability.NUM_TURNED * num_frames
+
+
+def test_models_with_enough_long_tracks_are_told_from_others(tmp_path: Path) -> None:
+    model = synthesize_rig(tmp_path / "database.db")
+    images = sorted(model.reg_image_ids())
+    counts = num_long_tracks(model, {})
+    least = min(counts[image_id] for image_id in images)
+    assert least > 50
+    assert all_see_long_tracks(model, images, least)
+    assert not all_see_long_tracks(model, images, least + 1)
+    assert all_see_long_tracks(model, [], least + 1)
 
 
 @pytest.mark.parametrize(("mapper", "most"), [("incremental", 1.6e5), ("sparse", 4e5)])

@@ -214,7 +214,8 @@ def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
 
     with monkeypatch.context() as patch:
         patch.setattr(f"colmap_affrect.project.stores.{step}", Mock(side_effect=KeyboardInterrupt))
-        assert stage("extract")[-1].startswith("interrupted")
+        with pytest.raises(KeyboardInterrupt):  # of which the process makes one line
+            stage("extract")
     assert stage("extract")[0] == "extract: 1 done, 1 already there, 1 with a warning"
     folders = tmp_path / "out", tmp_path / "fresh"
     for out in folders:

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -122,6 +122,38 @@ def end_after(delay_s: float, number: signal.Signals, arguments: Sequence[str], 
     ended = -number if number == signal.SIGKILL else 128 + number
     assert process.returncode in (0, ended), stderr
     return process.returncode != 0
+
+
+def wait_until_signals_are_put_off(pid: int) -> None:
+    """Wait until the first function of the command runs; before that Python starts."""
+    blocked = 0
+    while not blocked & 1 << signal.SIGINT - 1:
+        status = Path(f"/proc/{pid}/status").read_text()
+        blocked = int(re.search(r"^SigBlk:\t(\w+)", status, re.MULTILINE)[1], 16)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell what is put off")
+@pytest.mark.parametrize("send", [os.kill, os.killpg])
+@pytest.mark.parametrize("times", [1, 2])
+def test_interrupt_while_a_command_starts_ends_it_at_once_with_one_line(
+    photos: Path, tmp_path: Path, send: Callable[[int, int], None], times: int
+) -> None:
+    """After delays up to 0.6 s, most of them while packages are loaded."""
+    for number in range(30 * TIMES):
+        out = tmp_path / str(number)
+        arguments = ["run", "--image-path", photos, "--output-path", out, *FAST]
+        with start(*arguments, start_new_session=True) as process:
+            wait_until_signals_are_put_off(process.pid)
+            time.sleep(0.6 * number / (30 * TIMES - 1))
+            sent = time.monotonic()
+            for _ in range(times):
+                send(process.pid, signal.SIGINT)
+                time.sleep(0.03)
+            _, stderr = process.communicate(timeout=60)
+        assert time.monotonic() - sent < 3.0
+        assert process.returncode == 130, stderr
+        lines = [line for line in stderr.splitlines() if not line.startswith("extract: ")]
+        assert lines == ["interrupted; run the same command again to go on"], number
 
 
 def run_traced(options: Sequence[object], arguments: Sequence[str]) -> int:

@@ -18,7 +18,7 @@ from synthetic import blobs, write_image
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.errors import AffrectError, DepthError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.base import FeatureOptions
 from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.photographs import CameraOptions
@@ -126,7 +126,7 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
     photos, depth = courtyard(tmp_path, 0)
     for settings, error, message in [
         ([], OptionError, "rectifier depth-planes needs depth maps: give --depth-path"),
-        ([f"depth.path='{depth}'"], DepthError, str(depth)),
+        ([f"depth.path='{depth}'"], OptionError, str(depth)),
         ([f"depth.path='{tmp_path / 'nowhere'}'"], OptionError, "nowhere"),
     ]:
         recipe = load_recipe("depth-planes-recommended", [*DEPTH, *settings])

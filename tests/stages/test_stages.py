@@ -249,7 +249,7 @@ def test_other_options_than_before_are_named(copy: Workspace, photos: Path, call
     ]  # fmt: skip
     for command, named in cases:
         code, stdout, stderr = call(*command, *out)
-        assert (code, stdout, len(stderr)) == (1, "", 1), stderr
+        assert (code, stdout, len(stderr)) == (2, "", 1), stderr
         assert named in stderr[0]
         assert "--overwrite" in stderr[0]
     assert {path: path.read_bytes() for path in before} == before
