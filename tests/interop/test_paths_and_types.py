@@ -100,7 +100,9 @@ def test_type_checkers_see_the_types(tmp_path: Path) -> None:
         env={**os.environ, "MYPYPATH": str(Path(colmap_affrect.__file__).parents[1])},
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
-    *lines, name, keyword, field, _ = done.stdout.splitlines()
+    said = done.stdout.splitlines()
+    lines = [line for line in said if "Revealed type" in line]
+    name, keyword, field = (line for line in said if " error: " in line)
     report = "colmap_affrect.project.report"
     assert [line.partition("Revealed type is ")[2] for line in lines] == [
         '"colmap_affrect.report.run_report.RunReport"',
