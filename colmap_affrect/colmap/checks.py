@@ -104,6 +104,7 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
             check_links(connection, tables, found)
             _check_matrices(connection, found)
             _check_keypoints(connection, tables, found)
+            _check_descriptors(connection, tables, found)
             _check_pairs(connection, tables, found)
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
             raise DatabaseError(f"{path}: damaged ({error})") from error
@@ -171,7 +172,8 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
     rows = rows_of(connection, "image_id rows cols data", "keypoints")
     extents: dict[str, float] = {}
     for image_id, count, width, blob in rows:
-        if not (name := tables.names.get(image_id)):
+        name = tables.names.get(image_id)
+        if not name:
             continue
         if count and width not in KEYPOINT_COLUMNS:
             found["keypoint-data"].append(f"{name} has {width}")
@@ -188,9 +190,11 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
                 extents[name] = extent(keypoints, size)
     if are_in_a_corner(extents.values()):
         found["keypoints-in-a-corner"] += sorted(extents)
-    for image_id, count, width, blob in rows_of(
-        connection, "image_id rows cols data", "descriptors"
-    ):
+
+
+def _check_descriptors(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
+    rows = rows_of(connection, "image_id rows cols data", "descriptors")
+    for image_id, count, width, blob in rows:
         if _array(blob, count, width, np.dtype("u1")) is None:
             found["descriptor-data"].append(tables.names.get(image_id, f"image {image_id}"))
 
