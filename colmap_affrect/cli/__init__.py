@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename:
             return _fail(str(cannot_write(Path(error.filename), error)))
         return _fail(
-            f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
+            f"{error.filename or _place()}: {error.strerror or error}; when that is mended, "
             "run the same command again: what was done before is kept"
         )
     except Exception as error:
@@ -51,9 +51,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return errors.EXIT_INTERRUPTED
 
 
+def _place() -> str:
+    """Name what an error of the system without a name is about."""
+    try:
+        Path.cwd()
+    except OSError:
+        return "the folder in which the command was started"
+    return "input/output"
+
+
 def _fail(message: str, code: int = 1) -> int:
     """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
-    errors.say(f"error: {errors.one_line(message)}")
+    errors.say(f"error: {errors.clipped(errors.one_line(message))}")
     return code
 
 
@@ -77,7 +86,7 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     except OSError:  # it is closed, and whoever closed it wants to see nothing
         shown_on = os.open(os.devnull, os.O_WRONLY)
     encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
-    terminal = os.fdopen(shown_on, "w", buffering=1, encoding=encoding, errors=errors.ESCAPED)
+    terminal = errors.heedless_stream(shown_on, encoding, closes=True)
     log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
     with terminal, closing(log), redirect_stderr(terminal):
         shown = logging.StreamHandler(terminal)
@@ -108,7 +117,7 @@ class _OneLine(logging.Formatter):
     """Shows a message in one line, whatever names are in it; a traceback keeps its lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        return errors.one_line(super().formatMessage(record))
+        return errors.clipped(errors.one_line(super().formatMessage(record)))
 
 
 class _Log(logging.StreamHandler[TextIO]):
