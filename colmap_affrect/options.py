@@ -8,24 +8,46 @@ of range, in one line. A part is a class with its options class as attribute ``O
 import difflib
 import hashlib
 import json
+import sys
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache, partial
 from importlib import metadata
 from os import PathLike
-from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, get_args
+from typing import (
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    Self,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from colmap_affrect.errors import OptionError, such_as
+from colmap_affrect.errors import (
+    AffrectError,
+    OptionError,
+    PartError,
+    clipped,
+    lacks_memory,
+    reason,
+    such_as,
+)
 
 EffortName = Literal["low", "normal", "high"]  # how much is tried for photographs in need
 EFFORT_NAMES: tuple[EffortName, ...] = get_args(EffortName)
 PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
 MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
 MAX_KNOWN = 40  # names in a message
+MAX_VALUE = 200  # characters of a value in a message
 MAX_COMMENT = 96  # width of comments in printed options
 CUSTOM = "custom"  # name of options that are no preset
 
@@ -81,7 +103,15 @@ class Options(BaseModel):
             case "value_error":
                 said = error["ctx"]["error"]
                 return f"{place}: {said}" if place else str(said)
-        return f"{place}={error['input']!r}: {error['msg'].removeprefix('Input ')}"
+        return f"{place}={_given(error['input'])}: {error['msg'].removeprefix('Input ')}"
+
+
+def _given(value: Any) -> str:
+    """Return a value as it is shown in a message: not all of a long one."""
+    try:
+        return clipped(repr(value), MAX_VALUE)
+    except ValueError:  # Python writes no number of so many digits
+        return f"a number of more than {sys.get_int_max_str_digits()} digits"
 
 
 class PresetOptions(Options):
@@ -114,6 +144,77 @@ class PartOptions(Options):
 Part = TypeVar("Part")
 
 
+class PartOfOthers:
+    """A part of another package: what is wrong with it is told in one line that names it.
+
+    To all who use it, it is the part that it wraps.
+    """
+
+    def __init__(self, part: Any, name: str, protocol: type) -> None:
+        """Take a part, how it is called in messages, and what it has to do.
+
+        Raises:
+            PartError: a method or an attribute of the protocol is missing.
+        """
+        self._part = part
+        self._name = name
+        self._protocol = protocol
+        for method in _methods(protocol):
+            if not callable(getattr(part, method, None)):
+                raise PartError(f"{name} has no method '{method}'")
+        for value in vars(protocol).get("__annotations__", {}):
+            if not hasattr(part, value):
+                raise PartError(f"{name} has no attribute '{value}'")
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._part, name)
+        if name in _methods(self._protocol):
+            return partial(self._called, name, value)
+        return value
+
+    def _called(self, method: str, function: Callable[..., Any], *given: Any) -> Any:
+        with _told_of(f"{self._name}: {method}"):
+            found: Any = function(*given)
+        expected, inner = _result(self._protocol, method)
+        items: list[Any] = found if isinstance(found, list) else []
+        if not isinstance(found, expected):
+            wanted = expected.__name__
+            raise PartError(f"{self._name}: {method} returned {type(found).__name__}, not {wanted}")
+        if inner and not all(isinstance(item, inner) for item in items):
+            raise PartError(f"{self._name}: {method} returned no list of {inner.__name__} alone")
+        return found
+
+
+@contextmanager
+def _told_of(name: str) -> Iterator[None]:
+    """Make one line of anything that the code of another package raises."""
+    try:
+        yield
+    except AffrectError:
+        raise
+    except (Exception, SystemExit) as error:
+        if lacks_memory(error):
+            raise
+        said = f"{type(error).__name__}: {reason(error)}"
+        raise PartError(f"{name} failed ({said})") from error
+
+
+@cache
+def _methods(protocol: type) -> tuple[str, ...]:
+    """Return the names of the methods of a protocol."""
+    return tuple(k for k, value in vars(protocol).items() if callable(value) and k[0] != "_")
+
+
+@cache
+def _result(protocol: type, method: str) -> tuple[type, type | None]:
+    """Return the type of what a method has to return, and that of what is in it if it is a list."""
+    hint = get_type_hints(getattr(protocol, method)).get("return")
+    if hint is Any or hint is None:
+        return object, None
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    return kind, inner[0] if kind is list else None
+
+
 @dataclass(frozen=True)
 class Registry(Generic[Part]):
     """The exchangeable parts of one kind, by name."""
@@ -122,6 +223,7 @@ class Registry(Generic[Part]):
     group: str  # of the entry points by which other packages add theirs
     built_in: Mapping[str, str]  # ``module:Class`` of ours; imported when needed
     default: str  # name of the part where none is given
+    protocol: type  # what a part has to do
 
     def names(self) -> list[str]:
         """Return the names of all parts, those of this package first."""
@@ -139,7 +241,22 @@ class Registry(Generic[Part]):
         known = self._entry_points()
         if name not in known:
             raise OptionError(f"unknown {self.kind} '{name}'{suggestion(name, known)}")
-        return known[name].load()
+        return self._loaded(known[name])
+
+    def _loaded(self, point: metadata.EntryPoint) -> Any:
+        """Return the class of a part of another package; PartError if there is none."""
+        where = self._named(point.name)
+        with _told_of(f"{where}: loading {point.value}"):
+            part = point.load()
+        known = getattr(part, "Options", None)
+        if not (
+            isinstance(part, type) and isinstance(known, type) and issubclass(known, PartOptions)
+        ):
+            raise PartError(f"{where}: {point.value} is no class with Options that are PartOptions")
+        return part
+
+    def _named(self, name: str) -> str:
+        return f"{self.kind} '{name}' of another package"
 
     def options(self, given: Any, where: str = "") -> Any:
         """Return the options of a part: as they are, by its name, or from a mapping with ``name``.
@@ -158,8 +275,16 @@ class Registry(Generic[Part]):
 
     def make(self, options: PartOptions, *given: Any) -> Part:
         """Build the part that options belong to; ``given`` is what else parts of this kind take."""
-        part: Part = self.part(options.name)(options, *given)
-        return part
+        part = self.part(options.name)
+        made: Part
+        if options.name in self.built_in:
+            made = part(options, *given)
+            return made
+        where = self._named(options.name)
+        with _told_of(where):
+            made = part(options, *given)
+        watched: Any = PartOfOthers(made, where, self.protocol)
+        return watched  # type: ignore[no-any-return]
 
 
 def described_toml(options: Options, path: str = "") -> str:

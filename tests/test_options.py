@@ -44,4 +44,4 @@ def test_nested_options_are_built_and_their_mistakes_named_by_their_path() -> No
 def test_parts_of_this_package_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
     others = [metadata.EntryPoint(name, "module:Class", "group") for name in ("theirs", "ours")]
     monkeypatch.setattr(metadata, "entry_points", lambda **_: others)
-    assert Registry("thing", "group", {"ours": "a:B"}, "ours").names() == ["ours", "theirs"]
+    assert Registry("thing", "group", {"ours": "a:B"}, "ours", object).names() == ["ours", "theirs"]

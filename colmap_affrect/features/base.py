@@ -78,6 +78,7 @@ EXTRACTORS: Registry[FeatureExtractor] = Registry(
         "aliked": "colmap_affrect.features.learned:Aliked",
     },
     default="rootsift",
+    protocol=FeatureExtractor,
 )
 
 
@@ -107,4 +108,5 @@ SHAPES: Registry[ShapeSource] = Registry(
         "affnet": "colmap_affrect.features.affnet_shapes:AffNet",
     },
     default="second-moment",
+    protocol=ShapeSource,
 )

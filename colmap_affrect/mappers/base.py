@@ -118,4 +118,5 @@ MAPPERS: Registry[Mapper] = Registry(
         "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },
     default="sparse",
+    protocol=Mapper,
 )

@@ -105,4 +105,5 @@ RECTIFIERS: Registry[Rectifier] = Registry(
         "dense-shapes": "colmap_affrect.rectifiers.affine_warps:DenseShapes",
     },
     default="dense-shapes",
+    protocol=Rectifier,
 )

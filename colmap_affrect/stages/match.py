@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, PartError
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
@@ -279,6 +279,9 @@ class CachedMatcher:
         """Match the stored features of two images."""
         first, second = map(self.prepared, names)
         found = self.matcher.match(first.content, second.content)
+        if why := found.fault(len(first.indices), len(second.indices)):
+            name = self._matching.options.name
+            raise PartError(f"matcher '{name}': returned {why}")
         rows, columns = found.indices.T
         indices = np.stack([first.indices[rows], second.indices[columns]], axis=1)
         is_of_some = first.is_part or second.is_part
