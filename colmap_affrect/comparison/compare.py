@@ -24,7 +24,7 @@ from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
@@ -58,7 +58,7 @@ def compare(
     truth = _ground_truth(options.ground_truth_path, names)
     options = replace(options, mapping=MAPPERS.make(options.mapping).options)
     same = _same_for_all(inputs, names, pairs, options)
-    given = output_path.resolve(), image_path.resolve(), options, same
+    given = resolved(output_path), resolved(image_path), options, same
     runs = [MethodRun(method, *given) for method in methods]
     recipes = [run.method.recipe for run in runs if overwrite or not run.finished()]
     keys = {key for recipe in recipes if recipe for key in recipe.required_weights}
@@ -83,7 +83,7 @@ def compare(
             results = [_measured(result, output_path, truth, names) for result in results]
         comparison = Comparison(
             image_names=tuple(names),
-            image_path=str(image_path.resolve()),
+            image_path=str(resolved(image_path)),
             methods=tuple(results),
             seeds=tuple(options.seeds),
             num_pairs=len(pairs),

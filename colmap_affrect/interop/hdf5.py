@@ -61,7 +61,7 @@ from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.given_h5 import GivenFile, opened
 from colmap_affrect.project.outputs import leads_outside, new_results
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.stores import PairMatches, frame_datasets, hloc_matches, pair_key
 from colmap_affrect.stages.descriptors import Arrays, matched, unit_rows, write_given_matches
 
@@ -378,7 +378,7 @@ def export_h5(
     """
     paths = database_path, features_path, matches_path
     database_path, features_path, matches_path = map(as_path, paths)
-    if features_path.resolve() == matches_path.resolve():
+    if resolved(features_path) == resolved(matches_path):
         raise OptionError(f"{features_path}: features and matches need a file each")
     with open_copy(database_path) as database:
         images = sorted(database.read_all_images(), key=lambda image: image.name)

@@ -12,6 +12,7 @@ import jinja2
 from colmap_affrect.errors import shown
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.report.pictures import base64_text, thumbnails
 from colmap_affrect.report.scene import View3D
 
@@ -40,7 +41,7 @@ def write_page(
     folder of this machine is in the page, since pages are sent to others. Raises WorkspaceError
     when it cannot be written.
     """
-    folders = [folder.resolve() for folder in (path.parent, image_path) if folder]
+    folders = [resolved(folder) for folder in (path.parent, image_path) if folder]
     known = [f"{place}{os.sep}" for folder in folders for place in (folder, folder.parent)]
     hidden = sorted(known, key=len, reverse=True)
 
