@@ -236,8 +236,8 @@ def read_given_model(
                 raise ValueError("its images and points are not of one model")
     else:
         model = _read_text(folder, option, wanted)
-    if fault := "" if is_ours else _fault(model, needs_poses=needs_poses):
-        raise errors.StoreError(f"{option}{folder}: {fault}; {_mend(folder)}")
+    if why := "" if is_ours else fault(model, needs_poses=needs_poses):
+        raise errors.StoreError(f"{option}{folder}: {why}; {_mend(folder)}")
     return model
 
 
@@ -251,7 +251,7 @@ def _read_text(folder: Path, option: str, wanted: str) -> pycolmap.Reconstructio
         raise errors.OptionError(f"{option}{folder}: {why}") from error
 
 
-def _fault(model: pycolmap.Reconstruction, *, needs_poses: bool) -> str:
+def fault(model: pycolmap.Reconstruction, *, needs_poses: bool = True) -> str:
     """Return why nothing can be computed with a model, empty where there is no reason."""
     names = Counter(image.name for image in model.images.values())
     if twice := sorted(name for name, count in names.items() if count > 1):

@@ -17,7 +17,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MatcherOptions
 from colmap_affrect.options import CUSTOM, flat
-from colmap_affrect.project.paths import PathLike
+from colmap_affrect.project.paths import PathLike, resolved
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 
 Native = TypeVar("Native")  # an option class of pycolmap
@@ -150,7 +150,7 @@ def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, M
 
 def given_path(path: PathLike) -> str:
     """Return an absolute path, or nothing for pycolmap's '.', which stands for none."""
-    return "" if Path(path) == Path() else str(Path(path).resolve())
+    return "" if Path(path) == Path() else str(resolved(Path(path)))
 
 
 def mapper_options(asked: object) -> MapperOptions:
