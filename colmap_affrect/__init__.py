@@ -69,6 +69,7 @@ _NAMES_OF_MODULES = {
         "ImageError",
         "NoModelError",
         "OptionError",
+        "PartError",
         "StoreError",
         "WorkspaceError",
     ),

@@ -16,6 +16,7 @@ from colmap_affrect.errors import DepthError as DepthError
 from colmap_affrect.errors import ImageError as ImageError
 from colmap_affrect.errors import NoModelError as NoModelError
 from colmap_affrect.errors import OptionError as OptionError
+from colmap_affrect.errors import PartError as PartError
 from colmap_affrect.errors import StoreError as StoreError
 from colmap_affrect.errors import WorkspaceError as WorkspaceError
 from colmap_affrect.evaluation.evaluate import EvaluateOptions as EvaluateOptions

@@ -246,6 +246,8 @@ def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
     advice = remake if done and not workspace.users_database else ""
     if examine_database(diagnosis, workspace.database, advice) and "map" in done:
         models = [read(f, read_summary, f) for f in model_folders(workspace.sparse)]
+        if workspace.lacks_models() and workspace.made_from("map"):
+            diagnosis.add("error", workspace.sparse, "models are gone", f"{SAME_RUN}: maps again")
         listed = ", ".join(str(len(model.registered_names)) for model in models if model) or "no"
         diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
 

@@ -10,6 +10,7 @@ import difflib
 import hashlib
 import inspect
 import json
+import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -18,19 +19,37 @@ from html import escape
 from importlib import metadata
 from itertools import pairwise
 from os import PathLike
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, get_args
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    Self,
+    TypeVar,
+    get_args,
+)
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from colmap_affrect.errors import OptionError, shown, such_as
+from colmap_affrect.errors import (
+    OptionError,
+    clipped,
+    lacks_memory,
+    reason,
+    shown,
+    such_as,
+)
+from colmap_affrect.parts_of_others import PartOfOthers, methods_of, told_of
 
 EffortName = Literal["low", "normal", "high"]  # how much is tried for photographs in need
 EFFORT_NAMES: tuple[EffortName, ...] = get_args(EffortName)
 PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
 MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
 MAX_KNOWN = 40  # names in a message
+MAX_VALUE = 200  # characters of a value in a message
 MAX_COMMENT = 96  # width of comments in printed options
 MAX_DOCSTRING = 88  # width of what docstrings say of fields
 CUSTOM = "custom"  # name of options that are no preset
@@ -213,7 +232,15 @@ class Options(BaseModel):
             case "value_error":
                 said = error["ctx"]["error"]
                 return f"{place}: {said}" if place else str(said)
-        return f"{place}={error['input']!r}: {error['msg'].removeprefix('Input ')}"
+        return f"{place}={_given(error['input'])}: {error['msg'].removeprefix('Input ')}"
+
+
+def _given(value: Any) -> str:
+    """Return a value as it is shown in a message: not all of a long one."""
+    try:
+        return clipped(repr(value), MAX_VALUE)
+    except ValueError:  # Python writes no number of so many digits
+        return f"a number of more than {sys.get_int_max_str_digits()} digits"
 
 
 class PresetOptions(Options):
@@ -274,20 +301,30 @@ class Registry(Generic[Part]):
         """
         if name in self.built_in:  # do not ask for the entry points of all installed packages
             return metadata.EntryPoint(name, self.built_in[name], self.group).load()
-        points = [point for point in self._entry_points() if point.name == name]
-        if not points:
-            raise OptionError(f"unknown {self.kind} '{name}'{suggestion(name, self.names())}")
-        where = f"{self.kind} '{name}' of {', '.join(map(_package_of, points))}"
+        points = self._points(name)
+        where = self._named(points)
         if len(points) > 1:
             raise OptionError(f"{where}: several packages have that name; uninstall all but one")
         try:
             part = points[0].load()
-        except Exception as error:  # of any kind: it is the code of others
-            problem = f"cannot be loaded ({type(error).__name__}: {error})"
+        except (Exception, SystemExit) as error:  # of any kind: it is the code of others
+            if lacks_memory(error):
+                raise
+            problem = f"cannot be loaded ({type(error).__name__}: {reason(error)})"
             raise OptionError(f"{where}: {problem}; mend or uninstall that package") from error
         if problem := self.problem(part, name):
             raise OptionError(f"{where}: {problem}; mend or uninstall that package")
         return part
+
+    def _points(self, name: str) -> list[metadata.EntryPoint]:
+        """Return the entry points of a part of other packages; OptionError if there is none."""
+        points = [point for point in self._entry_points() if point.name == name]
+        if not points:
+            raise OptionError(f"unknown {self.kind} '{name}'{suggestion(name, self.names())}")
+        return points
+
+    def _named(self, points: list[metadata.EntryPoint]) -> str:
+        return f"{self.kind} '{points[0].name}' of {', '.join(map(_package_of, points))}"
 
     def problem(self, part: Any, name: str) -> str:
         """Say what a class lacks to be a part of this kind; empty if it lacks nothing."""
@@ -299,9 +336,8 @@ class Registry(Generic[Part]):
         undeclared = [each for each in options.__class_vars__ if not hasattr(options, each)]
         if undeclared:
             return f"{options.__name__} must say what its '{min(undeclared)}' are"
-        methods = [key for key, value in vars(self.protocol).items() if inspect.isfunction(value)]
-        for method in methods:
-            if not method.startswith("_") and not callable(getattr(part, method, None)):
+        for method in methods_of(self.protocol):
+            if not callable(getattr(part, method, None)):
                 return f"has no method '{method}'"
         return ""
 
@@ -322,8 +358,16 @@ class Registry(Generic[Part]):
 
     def make(self, options: PartOptions, *given: Any) -> Part:
         """Build the part that options belong to; ``given`` is what else parts of this kind take."""
-        part: Part = self.part(options.name)(options, *given)
-        return part
+        part = self.part(options.name)
+        made: Part
+        if options.name in self.built_in:
+            made = part(options, *given)
+            return made
+        where = self._named(self._points(options.name))
+        with told_of(where):
+            made = part(options, *given)
+        watched: Any = PartOfOthers(made, where, self.protocol)
+        return watched  # type: ignore[no-any-return]
 
 
 def _package_of(point: metadata.EntryPoint) -> str:

@@ -18,6 +18,7 @@ from colmap_affrect.errors import (
     INTERRUPTED,
     MEMORY_HINT,
     escape_what_lacks,
+    heedless_stream,
     lacks_memory,
     say,
 )
@@ -37,6 +38,7 @@ BEGUN, ENDED = b"b", b"e"
 def run_command() -> NoReturn:
     """Run the command line in a process of its own, where the system can do that, and end."""
     _open_standard_streams()
+    os.umask(os.umask(0) & 0o077)  # of one that takes rights from the owner, results are lost
     if sys.platform != "linux":  # elsewhere libraries of the system do not survive a fork
         _work()
     signals: list[int] = []
@@ -101,6 +103,8 @@ def _open_standard_streams() -> None:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, flags)  # the lowest number that is free: this one
+    if sys.stderr:  # it may have been closed
+        sys.stderr = heedless_stream(2, sys.stderr.encoding, closes=False)
 
 
 def _handle(handler: Callable[[int, object], None]) -> None:
@@ -197,6 +201,9 @@ def _end(code: int | str | None) -> NoReturn:
     try:
         if sys.stdout:  # it may have been closed
             sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it again
+        if not code and not isinstance(error, BrokenPipeError):
+            say(f"error: what the command prints cannot be written ({error.strerror})")
+            code = 1
     sys.exit(code)

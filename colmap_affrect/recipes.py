@@ -23,6 +23,7 @@ from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.options import Options, suggestion, within
 from colmap_affrect.project.paths import as_path
+from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions, IdentityOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
 
@@ -259,7 +260,7 @@ def load_recipe(name: str | PathLike[str], settings: str | Sequence[str] = ()) -
     if path.exists() and not path.is_file():  # a pipe would be read only once
         raise OptionError(f"recipe {path}: is not a file; give the path of a TOML file")
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        values = tomllib.loads(read_regular_text(path, "utf-8-sig"))
     except FileNotFoundError as error:
         raise OptionError(f"recipe {name}: no such file") from error
     except (OSError, ValueError, RecursionError) as error:  # what tomllib raises on odd files

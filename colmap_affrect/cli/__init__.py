@@ -46,7 +46,7 @@ def main(
         if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename:
             return _fail(str(cannot_write(Path(error.filename), error)))
         return _fail(
-            f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
+            f"{error.filename or _place()}: {error.strerror or error}; when that is mended, "
             "run the same command again: what was done before is kept"
         )
     except Exception as error:
@@ -55,9 +55,18 @@ def main(
         return _fail(f"{errors.MEMORY_HINT}: what was done before is kept")
 
 
+def _place() -> str:
+    """Name what an error of the system without a name is about."""
+    try:
+        Path.cwd()
+    except OSError:
+        return "the folder in which the command was started"
+    return "input/output"
+
+
 def _fail(message: str, code: int = 1) -> int:
     """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
-    errors.say(f"error: {errors.one_line(message)}")
+    errors.say(f"error: {errors.clipped(errors.one_line(message))}")
     return code
 
 
@@ -81,7 +90,7 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     except OSError:  # it is closed, and whoever closed it wants to see nothing
         shown_on = os.open(os.devnull, os.O_WRONLY)
     encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
-    terminal = os.fdopen(shown_on, "w", buffering=1, encoding=encoding, errors=errors.ESCAPED)
+    terminal = errors.heedless_stream(shown_on, encoding, closes=True)
     log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
     with terminal, closing(log), redirect_stderr(terminal):
         shown = logging.StreamHandler(terminal)
@@ -112,7 +121,7 @@ class _OneLine(logging.Formatter):
     """Shows a message in one line, whatever names are in it; a traceback keeps its lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        return errors.one_line(super().formatMessage(record))
+        return errors.clipped(errors.one_line(super().formatMessage(record)))
 
 
 class _Log(logging.StreamHandler[TextIO]):

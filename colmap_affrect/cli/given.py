@@ -91,7 +91,7 @@ def recipe(options: argparse.Namespace) -> Recipe:
 def depth_settings(options: argparse.Namespace) -> list[str]:
     """Return the change of a recipe that --depth-path asks for."""
     path = folder("--depth-path", options.depth_path)
-    return [f"depth.path={json.dumps(str(path.resolve()))}"] if path else []
+    return [f"depth.path={json.dumps(str(resolved(path)))}"] if path else []
 
 
 def matching(known: MatcherOptions, options: argparse.Namespace) -> MatcherOptions:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.regular_files import NotAFileError, read_regular, require_regular
 
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
@@ -39,7 +40,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     if not path.is_file():
         raise OptionError(f"{path}: no such file; give a COLMAP database")
     mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
-    address = f"{path.resolve().as_uri()}?{mode}"
+    address = f"{resolved(path).as_uri()}?{mode}"
     try:
         with closing(sqlite3.connect(address, uri=True)) as connection:
             connection.execute("PRAGMA trusted_schema = OFF")  # no code of the file

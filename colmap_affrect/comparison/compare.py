@@ -24,7 +24,7 @@ from colmap_affrect.options import digest_of, require_bools, takes_fields_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import GivenProgress, Progress, show
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
@@ -85,7 +85,7 @@ def _compare(
     truth = _ground_truth(options.ground_truth_path, names)
     options = options.changed(mapping=MAPPERS.make(options.mapping).options)
     common = _common_record(inputs, names, pairs, options)
-    folders = (output_path.resolve(), image_path.resolve())
+    folders = (resolved(output_path), resolved(image_path))
     runs = [MethodRun(method, *folders, options, common) for method in methods]
     _resolve_weights(runs, options, progress, overwrite=again)
     with workspace.locked():
@@ -95,7 +95,7 @@ def _compare(
             results = [_scored(result, output_path, truth, names) for result in results]
         comparison = Comparison(
             image_names=tuple(names),
-            image_path=str(image_path.resolve()),
+            image_path=str(resolved(image_path)),
             methods=tuple(results),
             seeds=tuple(options.seeds),
             num_pairs=len(pairs),

@@ -28,7 +28,7 @@ from colmap_affrect.colmap.verification import VerificationOptions, verified_pai
 from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, GivenMethods, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
-from colmap_affrect.errors import AffrectError, ConflictError
+from colmap_affrect.errors import AffrectError, ConflictError, damage
 from colmap_affrect.escalation.climb import climb
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
@@ -229,9 +229,10 @@ class MethodRun:
         if self.method.escalates:  # verification with this seed decides what is matched again
             asked["seed"] = self.options.seeds[0]
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
-        known = json.loads(read_regular(record)) if record.exists() else {}
-        difference = first_difference(known, asked) if folder.exists() else ""
-        if difference:
+        with damage(record, "use --overwrite to redo the methods that are named"):
+            known = json.loads(read_regular(record)) if record.exists() else {}
+            difference = first_difference(known, asked)
+        if folder.exists() and difference:
             raise ConflictError(
                 f"{folder}: {self.method.label} was run there with {difference}; use "
                 "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "

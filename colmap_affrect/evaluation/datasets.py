@@ -24,7 +24,7 @@ from colmap_affrect.images.reading import IMAGE_SUFFIXES
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.project.outputs import leads_outside
-from colmap_affrect.project.regular_files import require_regular
+from colmap_affrect.project.regular_files import read_regular_text, require_regular
 
 logger = logging.getLogger(__name__)
 
@@ -240,7 +240,7 @@ def _damaged(path: Path) -> Iterator[None]:
 def _lines(path: Path) -> list[str]:
     """Return the lines of a text file that are neither empty nor comments."""
     with _damaged(path):
-        lines = map(str.strip, path.read_text(encoding="utf-8-sig").splitlines())
+        lines = map(str.strip, read_regular_text(path, "utf-8-sig").splitlines())
         return [line for line in lines if line and not line.startswith("#")]
 
 
@@ -330,7 +330,7 @@ def load_pairs(folder: Path) -> Pairs:
     path = folder / "pairs.json"
     entries = []
     with _damaged(path):
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = json.loads(read_regular_text(path, "utf-8-sig"))
         for number, values in enumerate(content["pairs"]):
             entries.append(_entry(values, f"{path}: pairs[{number}]"))
         offset_px = ORIGIN_PX[content.get("pixel_origin", "center")]

@@ -34,7 +34,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import GivenProgress, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
@@ -290,7 +290,7 @@ def evaluate(
     methods = parse_methods(options.recipes)
     _check(options, dataset_path)
     Workspace(output_path).require_own(dataset_path)
-    inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
+    inputs = {"protocol": protocol, "dataset_path": str(resolved(dataset_path))}
     with Workspace(output_path).locked():
         pairs = PROTOCOLS[protocol](dataset_path)
         runs = [RecipeRun(method, pairs, output_path, inputs, options) for method in methods]

@@ -18,7 +18,7 @@ from colmap_affrect.images import reading
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.outputs import is_output_folder
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.stores import pair_key
 
@@ -144,13 +144,13 @@ class Photographs:
         given = {"--mask-path": self.masks.path, "--camera-mask-path": self.masks.camera_path}
         if not any(given.values()):
             return
-        photographs = {(self.folder / name).resolve() for name in names}
+        photographs = {resolved(self.folder / name) for name in names}
         for option, where in given.items():
             paths = [Path(where)] if where else []
             if option == "--mask-path":
                 paths = [path for name in names for path in self._mask_paths(name)]
             for path in paths:
-                if path.resolve() in photographs:
+                if resolved(path) in photographs:
                     raise OptionError(
                         f"{option} {where}: {path.name} is one of the photographs in "
                         f"{self.folder}; give the masks a folder of their own, outside of that"
@@ -273,7 +273,7 @@ class _Walk:
         self.left_out: defaultdict[str, list[str]] = defaultdict(list)
         self.ahead = deque([folder])
         self.linked = deque[Path]()
-        self.seen = {_identity(path) for path in folder.resolve().parents}
+        self.seen = {_identity(path) for path in resolved(folder).parents}
 
     def enter(self, path: Path) -> None:
         """Look through a folder, but not through those in it, if nobody has done that."""
@@ -336,11 +336,12 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
         raise OptionError(f"{image_list_path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise OptionError(f"{image_list_path}: cannot be read ({error})") from error
-    listed = [
-        line if _is_below(image_path, line) else line.strip()  # a name may begin with a space or #
-        for line in lines
-        if _is_below(image_path, line) or (line.strip() and not line.startswith("#"))
-    ]
+    listed = []
+    for line in dict.fromkeys(lines):
+        if _is_below(image_path, line):  # a name may begin with a space or #
+            listed.append(line)
+        elif line.strip() and not line.startswith("#"):
+            listed.append(line.strip())
     if not listed:
         raise OptionError(f"{image_list_path}: is empty")
     return checked_names(image_path, listed, str(image_list_path))

@@ -248,24 +248,26 @@ def range_of_floats(image: NDArray[Any]) -> tuple[float, float] | None:
     """Return what is black and white of floats that are not from 0 to 1; None for all else.
 
     Programs of measurement write floats of any range, and an image that is clipped to 0 to 1 would
-    be black or white all over.
+    be black or white all over. So do they with integers that are signed, or of 32 bits.
     """
-    if not np.issubdtype(image.dtype, np.floating):
+    if image.dtype in (np.uint8, np.uint16):
         return None
     sample = _sample(image)
     values = sample[np.isfinite(sample)]
     if not values.size:
         return None
     low, high = np.percentile(values, TONE_PERCENTILES)
-    if low >= FLOAT_RANGE[0] and high <= FLOAT_RANGE[1]:
+    is_float = np.issubdtype(image.dtype, np.floating)
+    if is_float and low >= FLOAT_RANGE[0] and high <= FLOAT_RANGE[1]:
         return None
     return float(low), float(max(high, low + np.finfo(np.float32).eps * max(abs(low), 1.0)))
 
 
 def in_eight_bits(image: NDArray[Any], black_and_white: tuple[float, float] | None = None) -> Bytes:
-    """Return an image of 8 or 16 bits or of floats in 8 bits.
+    """Return an image of integers or of floats in 8 bits.
 
-    Floats are from 0 to 1; those of another range are stretched (:func:`range_of_floats`).
+    Floats are from 0 to 1; those of another range are stretched (:func:`range_of_floats`), and so
+    are integers that are signed or of 32 bits.
     """
     black_and_white = black_and_white or range_of_floats(image)
     if black_and_white:

@@ -15,7 +15,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import require_inside, triangulated
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, FATAL_FOR_MAPPING
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.colmap.model_files import why_unusable, write_model
+from colmap_affrect.colmap.model_files import FAR, why_unusable, write_model
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.earth import why_not_on_earth
@@ -146,8 +146,11 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
         right = _without(true, left_out)
         new_from_old, residuals, origin = _similarity(old, right, is_on_earth=is_on_earth)
     model.transform(new_from_old)
-    if fault := why_unusable(model):
-        raise OptionError(f"a scale of {new_from_old.scale:.3g} cannot be right: {fault}")
+    why = why_unusable(model)
+    if not why and new_from_old.scale <= 1.0 / FAR:
+        why = "it has no extent"
+    if why:
+        raise OptionError(f"a scale of {new_from_old.scale:.3g} cannot be right: {why}")
     with new_results(output_path, names=images) as (folder,):
         write_model(model, folder)
         if origin:

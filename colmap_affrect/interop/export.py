@@ -22,13 +22,14 @@ from colmap_affrect.colmap.model_files import (
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
 from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
 from colmap_affrect.images.orientation import forget_orientation
+from colmap_affrect.images.reading import header_size
 from colmap_affrect.interop.camera_models import with_camera_model
 from colmap_affrect.interop.finished_models import read_finished_model
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
-from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -88,7 +89,7 @@ def export(
     formats = _checked_formats(formats)
     if image_path is not None and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
-    photographs = image_path or Workspace(model_path.resolve().parent.parent).photographs()
+    photographs = image_path or Workspace(resolved(model_path).parent.parent).photographs()
     source = Source(model_path, read_finished_model(model_path), photographs)
     if not formats:
         formats = _usual(source)
@@ -189,6 +190,7 @@ def _undistorted(source: Source, folder: Path) -> Path:
             )
         if not (photographs / image.name).is_file():
             raise ImageError(f"{photographs / image.name}: no such photograph; give --image-path")
+        _require_size(photographs / image.name, source.model.cameras[image.camera_id])
     given = folder.parent / "model"  # a run may remove that of its folder meanwhile
     if not given.exists():
         write_model(source.model, given)
@@ -198,6 +200,16 @@ def _undistorted(source: Source, folder: Path) -> Path:
             raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
         forget_orientation(picture)  # COLMAP takes over EXIF, by which others would turn it
     return path
+
+
+def _require_size(path: Path, camera: pycolmap.Camera) -> None:
+    """Refuse a photograph of another size than its camera has; ImageError."""
+    size, expected = header_size(path), (camera.width, camera.height)
+    if size not in (None, expected):
+        raise ImageError(
+            f"{path}: is {size[0]} x {size[1]} px, and its camera {expected[0]} x {expected[1]}; "
+            "give the photographs that the model was made of as --image-path"
+        )
 
 
 def _nerfstudio(source: Source, folder: Path) -> Path:

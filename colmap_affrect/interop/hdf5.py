@@ -64,7 +64,7 @@ from colmap_affrect.progress import Advance, GivenProgress, Progress
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.given_h5 import GivenFile, opened
 from colmap_affrect.project.outputs import leads_outside, new_results
-from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
 from colmap_affrect.project.stores import PairMatches, frame_datasets, hloc_matches, pair_key
 from colmap_affrect.stages.descriptors import Arrays, matched, unit_rows, write_given_matches
 
@@ -399,7 +399,7 @@ def export_h5(
     features_path = as_path(features_path, "features_path")
     matches_path = as_path(matches_path, "matches_path")
     progress = Progress.given(progress)
-    if features_path.resolve() == matches_path.resolve():
+    if resolved(features_path) == resolved(matches_path):
         raise OptionError(f"{features_path}: features and matches need a file each")
     with open_copy(database_path) as database:
         images = sorted(database.read_all_images(), key=lambda image: image.name)

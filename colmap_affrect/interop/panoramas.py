@@ -18,7 +18,7 @@ from colmap_affrect.images.photographs import list_images
 from colmap_affrect.interop import pycolmap_api as ours
 from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.outputs import refuse_link
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.workspace import Workspace
 
 MATCHING = ("extract_features", "match_exhaustive", "match_sequential", "match_spatial")
@@ -147,7 +147,7 @@ def _check(image_path: Path, names: Sequence[str]) -> None:
 
 def _check_output(image_path: Path, output_path: Path) -> None:
     """Refuse to write among panoramas, or into a folder of something else."""
-    if output_path.resolve().is_relative_to(image_path.resolve()):
+    if resolved(output_path).is_relative_to(resolved(image_path)):
         raise OptionError(f"{output_path}: is in the folder of the panoramas; give another one")
     for name in ("", "images", "masks", "sparse", "sparse_equirectangular", "database.db"):
         refuse_link(output_path / name)

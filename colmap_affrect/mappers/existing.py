@@ -19,7 +19,7 @@ from colmap_affrect.colmap.model_files import model_folder, read_given_model, re
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options
-from colmap_affrect.project.paths import GivenPath
+from colmap_affrect.project.paths import GivenPath, resolved
 from colmap_affrect.project.regular_files import read_regular
 
 SAME_POSE = 1e-6
@@ -37,7 +37,7 @@ class Extension(Options):
 
     def refuse_discarding(self, output_path: Path) -> None:
         """Raise OptionError for a model in a folder whose results are to be discarded first."""
-        if self.model_path.resolve().is_relative_to(output_path.resolve()):
+        if resolved(self.model_path).is_relative_to(resolved(output_path)):
             raise OptionError(
                 f"--extend {self.model_path}: --overwrite would discard it; leave that out, or use "
                 "another --output-path"

@@ -63,6 +63,20 @@ class Matches:
         """Return the matches of images that have nothing in common."""
         return cls(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
 
+    def fault(self, num_first: int, num_second: int) -> str:
+        """Say what is wrong for images with so many features; empty if nothing is."""
+        indices, scores = np.asarray(self.indices), np.asarray(self.scores)
+        if not np.issubdtype(indices.dtype, np.integer):
+            return "indices that are no integers"
+        if indices.shape != (len(scores), 2) or scores.ndim != 1:
+            return f"indices of shape {indices.shape} and scores of shape {scores.shape}"
+        if (indices < 0).any() or (indices >= (num_first, num_second)).any():
+            return "indices of features that there are not"
+        rows, columns = indices.T
+        if (np.diff(rows) <= 0).any() or len(np.unique(columns)) < len(columns):
+            return "features that are matched twice, or not in order"
+        return "" if ((scores >= 0.0) & (scores <= 1.0)).all() else "scores that are not in [0, 1]"
+
 
 class Matcher(Protocol):
     """Matches pairs of images; called with its ``Options`` and a :class:`MatcherContext`."""

@@ -16,11 +16,15 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Bools
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.regular_files import open_regular
 
 Pair = tuple[str, str]  # names of two photographs, in order
 
-SCORE = re.compile(r"[\s,]+[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?$")  # at the end of a line
+# At the end of a line; in the time of its length, however many blanks or digits it has.
+SCORE = re.compile(r"(?<![\s,])[\s,]+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?$")
+MAX_SUGGESTIONS = 8  # words of a line for which names that are like them are looked for
+LONGEST_LINE = 1 << 13  # characters: systems have no longer paths than half of it
 AT_ONCE = 1 << 16  # pairs that are given names together
 
 
@@ -216,6 +220,8 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
 
 def split_line(line: str, known: Collection[str]) -> Pair | None:
     """Return the two names of a line, either of which may hold separators."""
+    if len(line) > LONGEST_LINE:
+        return None
     for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
         for match in re.finditer(separator, line):
             first, second = line[: match.start()], line[match.end() :]
@@ -226,6 +232,8 @@ def split_line(line: str, known: Collection[str]) -> Pair | None:
 
 def _split_of_others(line: str, known: Collection[str], folders: Sequence[str]) -> Pair | None:
     """Return the two names of a line that has a score, backslashes, or paths into a folder."""
+    if len(line) > LONGEST_LINE:
+        return None
     text = line.strip().replace("\\", "/")
     for folder in folders:
         text = re.sub(rf"(^|[\s,]){re.escape(folder)}/+", r"\1", text)
@@ -235,12 +243,13 @@ def _split_of_others(line: str, known: Collection[str], folders: Sequence[str]) 
 
 def _spellings(folder: Path) -> tuple[str, ...]:
     """Return how the path of a folder may begin those of the files in it, the longest first."""
-    paths = {folder, folder.absolute(), folder.resolve()}
+    paths = {folder, folder.absolute(), resolved(folder)}
     found = {path.as_posix() for path in paths} - {".", "/"}
     return tuple(sorted(found, key=len, reverse=True))
 
 
 def _suggestion(line: str, names: Sequence[str]) -> str:
-    unknown = [word for word in line.replace(",", " ").split() if word not in set(names)]
+    known, words = set(names), line[:LONGEST_LINE].replace(",", " ").split()
+    unknown = [word for word in words if word not in known][:MAX_SUGGESTIONS]
     close = [match for word in unknown for match in difflib.get_close_matches(word, names, n=1)]
     return f" (did you mean {', '.join(close)}?)" if close else ""

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from colmap_affrect.errors import OptionError, StoreError, damage
 
 MAX_VALUES = 1 << 28  # an array of more values is taken for damage, and not read
+LARGE_BYTES = 1 << 26  # an array of so many may have been declared and never written
+MOST_COMPRESSED = 1100  # deflate makes no array smaller than by this factor
 MEND = "make it again with the program that wrote it"
 
 
@@ -45,6 +47,10 @@ class GivenFile:
         if np.prod([float(size) for size in stored]) > MAX_VALUES:
             raise StoreError(f"{self.path}: {key} of shape {stored} is too large to be true")
         with damage(self.path, MEND):
+            num_bytes = self.file[key].nbytes
+            stored_bytes = self.file[key].id.get_storage_size()
+            if num_bytes > max(LARGE_BYTES, MOST_COMPRESSED * stored_bytes):
+                raise ValueError(f"{key} of shape {stored} was never written, but for a small part")
             if self.file[key].dtype.kind not in kinds:
                 raise ValueError(f"{key} does not hold numbers, or no whole ones")
             return np.asarray(self.file[key][()])

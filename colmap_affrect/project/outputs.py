@@ -14,13 +14,14 @@ from tempfile import mkdtemp
 
 from filelock import FileLock, Timeout
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.project.atomic_files import (
     TEMPORARY_PREFIX,
     cannot_write,
     require_space,
     uninterrupted,
 )
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.regular_files import NotAFileError, open_regular, require_regular
 
 RESULTS = "results"  # folder of these in such a folder, whose names are the user's
@@ -67,7 +68,7 @@ def refuse_photographs(target: Path, names: Collection[str]) -> None:
     Work folders of ours are allowed: the search for photographs skips them. Raises OptionError.
     """
     inner = [name for name in names if not leads_outside(name)]
-    for folder in target.parent.resolve(), *target.parent.resolve().parents:
+    for folder in resolved(target.parent), *resolved(target.parent).parents:
         if not inner or is_output_folder(folder):
             return
         with suppress(OSError):  # a name that is too long, for one
@@ -170,12 +171,21 @@ def database_files(path: Path) -> list[Path]:
 
 
 def remove_own(paths: Iterable[Path]) -> None:
-    """Remove what is ours in a work folder; of a link itself, not what it leads to."""
+    """Remove what is ours in a work folder; of a link itself, not what it leads to.
+
+    Raises WorkspaceError, which names it, where the system does not permit that.
+    """
     for path in paths:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        try:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        except OSError as error:  # of a file in it the name alone
+            why = error.strerror or error
+            raise WorkspaceError(
+                f"{path}: cannot be removed ({why}); permit that, and run the same command again"
+            ) from error
 
 
 def fitting_name(stem: str, suffix: str, most: int = MAX_NAME_BYTES) -> str:

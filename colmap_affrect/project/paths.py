@@ -44,6 +44,14 @@ GivenPath = Annotated[Path, BeforeValidator(as_path)]
 
 
 def resolved(path: Path) -> Path:
-    """Return a path without links; that of a pipe, which has no other name, as it is."""
-    whole = path.resolve()
+    """Return a path without links; that of a pipe, which has no other name, as it is.
+
+    Raises OptionError where links lead in a circle.
+    """
+    try:
+        whole = path.resolve()
+    except RuntimeError as error:  # so Python says it
+        raise OptionError(
+            f"{path}: links lead in a circle; give the path of a file or folder itself"
+        ) from error
     return path.absolute() if path.exists() and not whole.exists() else whole

@@ -14,6 +14,7 @@ from colmap_affrect import __version__
 from colmap_affrect.errors import ConflictError, OptionError, WorkspaceError
 from colmap_affrect.project import outputs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.record import (
     MADE_FROM,
     STAGES,
@@ -101,7 +102,7 @@ class Workspace:
 
         That of the photographs is refused, too; one inside it is allowed. Raises OptionError.
         """
-        if photographs and self.path.resolve() == photographs.resolve():
+        if photographs and resolved(self.path) == resolved(photographs):
             raise OptionError(
                 f"{self.path}: is the folder of the photographs; give another one as --output-path"
             )
@@ -237,6 +238,21 @@ class Workspace:
         known = {**record.get(MADE_FROM, {}), **digests}
         if any(self.made_from(what) != digest for what, digest in digests.items()):
             self._write_record({**record, MADE_FROM: known})
+
+    def record_mapped(self, inputs: str) -> None:
+        """Put on record what the models that are there were made from, and how many they are."""
+        self.record_made_from(map=inputs, models=str(self.num_models()))
+
+    def num_models(self) -> int:
+        """Return how many models there are, 0, 1, ..."""
+        with suppress(OSError):
+            return sum(path.name.isdecimal() for path in self.sparse.iterdir())
+        return 0
+
+    def lacks_models(self) -> bool:
+        """Return whether models that were made are gone, removed by somebody or half removed."""
+        made = self.made_from("models")
+        return not self.sparse.exists() or (made.isdecimal() and self.num_models() < int(made))
 
     def record_options(
         self,

@@ -13,6 +13,7 @@ import jinja2
 from colmap_affrect.errors import shown
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.report.pictures import base64_text, thumbnails
 from colmap_affrect.report.scene import View3D
 
@@ -58,7 +59,7 @@ def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
     folders = []
     for folder in (path.parent, page.image_path):
         if folder:
-            whole = folder.resolve()
+            whole = resolved(folder)
             folders += [f"{whole}{os.sep}", f"{whole.parent}{os.sep}"]
     folders.sort(key=len, reverse=True)
 

@@ -15,6 +15,7 @@ from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, model_folders, read_summaries
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 
@@ -50,7 +51,7 @@ def map_images(
     workspace.require("verify")
     inputs = _inputs(context, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    known = workspace.made_from("map") if workspace.sparse.exists() else ""
+    known = "" if workspace.lacks_models() else workspace.made_from("map")
     if known != inputs and " " in known and not extend:
         raise ConflictError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
@@ -69,7 +70,7 @@ def map_images(
     workspace.record_made_from(map="")  # a run that is killed begins anew
     with context.progress.stage("map", len(context.graph.ids), "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
-    workspace.record_made_from(map=inputs)
+    workspace.record_mapped(inputs)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models)), models
 
@@ -132,8 +133,8 @@ def _inputs(context: Context, extend: Extension | None) -> str:
     verified = context.verified_digest()
     if not extend:
         return verified
-    folder = model_folder(extend.model_path).resolve()
-    own = folder.is_relative_to(context.workspace.sparse.resolve())
+    folder = resolved(model_folder(extend.model_path))
+    own = folder.is_relative_to(resolved(context.workspace.sparse))
     return f"{verified} {'own' if own else extend.digest()}"
 
 

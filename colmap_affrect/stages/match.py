@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, PartError
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
@@ -328,6 +328,9 @@ class CachedMatcher:
         first = self.prepared(names[0])
         second = self.prepared(names[1])
         found = self.matcher.match(first.content, second.content)
+        if why := found.fault(len(first.indices), len(second.indices)):
+            name = self._matching.options.name
+            raise PartError(f"matcher '{name}': returned {why}")
         rows = first.indices[found.indices[:, 0]]
         columns = second.indices[found.indices[:, 1]]
         indices = np.stack([rows, columns], axis=1)
