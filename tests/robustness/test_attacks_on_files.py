@@ -234,6 +234,18 @@ def test_array_that_was_never_written_is_not_read(tmp_path: Path) -> None:
             given.read("a/keypoints", (None, 2))
 
 
+def test_groups_of_any_depth_are_one_line(tmp_path: Path) -> None:
+    """HDF5 takes the square of the depth for them."""
+    path = tmp_path / "features.h5"
+    with h5py.File(path, "w") as file:
+        group = file
+        for _ in range(1500):
+            group = group.create_group("d")
+        group["keypoints"] = np.ones((5, 2))
+    with pytest.raises(AffrectError, match="more than 100 deep"), opened(path):
+        pass
+
+
 @pytest.mark.parametrize("metres", ["1e300", "1e-320"])
 def test_model_is_given_no_scale_that_is_none(tmp_path: Path, call: Call, metres: str) -> None:
     write_model(tmp_path / "model")
