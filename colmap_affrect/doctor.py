@@ -7,7 +7,7 @@ Files are read as runs read them, and what their readers say is what is found.
 import dataclasses
 import json
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
-from colmap_affrect.project.report import installed_versions
+from colmap_affrect.project.report import ModelSummary, installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
 
@@ -245,11 +245,18 @@ def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
     remake = f"remove it and {SAME_RUN}: it is made anew"
     advice = remake if done and not workspace.users_database else ""
     if examine_database(diagnosis, workspace.database, advice) and "map" in done:
-        models = [read(f, read_summary, f) for f in model_folders(workspace.sparse)]
-        if workspace.lacks_models() and workspace.made_from("map"):
-            diagnosis.add("error", workspace.sparse, "models are gone", f"{SAME_RUN}: maps again")
-        listed = ", ".join(str(len(model.registered_names)) for model in models if model) or "no"
-        diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
+        found = [read(folder, read_summary, folder) for folder in model_folders(workspace.sparse)]
+        _examine_models(diagnosis, workspace, [model for model in found if model])
+
+
+def _examine_models(
+    diagnosis: Diagnosis, workspace: Workspace, models: Sequence[ModelSummary]
+) -> None:
+    """Say what models there are, and whether some are gone."""
+    if workspace.lacks_models() and workspace.made_from("map"):
+        diagnosis.add("error", workspace.sparse, "models are gone", f"{SAME_RUN}: maps again")
+    listed = ", ".join(str(len(model.registered_names)) for model in models) or "no"
+    diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
 
 
 def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:

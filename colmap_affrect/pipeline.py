@@ -341,7 +341,7 @@ def map_images(
         return map_and_report(context, mapper, extension, overwrite=overwrite, page=page)
 
 
-def map_database(
+def map_database(  # noqa: PLR0913 (all but two are keywords)
     database_path: PathLike,
     output_path: PathLike,
     *,

@@ -149,6 +149,22 @@ def _leave(*_: object) -> NoReturn:
     os._exit(EXIT_INTERRUPTED)
 
 
+class _Interrupts:
+    """Raises the first signal as an exception; another Ctrl-C ends the process."""
+
+    def __init__(self) -> None:
+        self.signals: list[int] = []
+
+    def take(self, number: int, _: object) -> None:
+        """Handle a signal."""
+        if number == signal.SIGTERM and self.signals:
+            return  # of the first process, for a Ctrl-C that came here, too
+        if self.signals:
+            _leave()
+        self.signals.append(number)
+        raise KeyboardInterrupt
+
+
 def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
     """Run the command in this process.
 
@@ -156,21 +172,13 @@ def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
     Ctrl-C ends it at once. Both are put off while packages are loaded, where a parent is told when
     that has come to an end; else they end the process at once.
     """
-    signals: list[int] = []
+    interrupts = _Interrupts()
     code: int | str | None
-
-    def interrupt(number: int, _: object) -> None:
-        if number == signal.SIGTERM and signals:
-            return  # of the first process, for a Ctrl-C that came here, too
-        if signals:
-            _leave()
-        signals.append(number)
-        raise KeyboardInterrupt
 
     def begin() -> None:
         if tell_begin:
             tell_begin()
-        _handle(interrupt)
+        _handle(interrupts.take)
 
     for stream in (sys.stdout, sys.stderr):
         escape_what_lacks(stream)
@@ -184,7 +192,7 @@ def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
         code = end.code
     except (KeyboardInterrupt, Exception) as error:
         # Libraries turn a KeyboardInterrupt in their callbacks into errors of their own.
-        if signals or isinstance(error, KeyboardInterrupt):
+        if interrupts.signals or isinstance(error, KeyboardInterrupt):
             _leave()  # at once: threads may be in the middle of something long
         elif lacks_memory(error):  # already for loading what is needed
             say(f"error: {MEMORY_HINT}")

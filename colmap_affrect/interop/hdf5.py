@@ -118,7 +118,7 @@ class _Wanted:
 
 
 @checks_arguments
-def import_h5(
+def import_h5(  # noqa: PLR0913 (all but three are keywords)
     image_path: PathLike,
     features_path: PathLike,
     matches_path: PathLike | None,

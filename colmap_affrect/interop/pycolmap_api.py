@@ -66,7 +66,7 @@ ARGUMENTS = """
 """
 
 
-def extract_features(
+def extract_features(  # noqa: PLR0913 (arguments are those of pycolmap)
     database_path: PathLike,
     image_path: PathLike,
     image_names: Iterable[PathLike] = (),
