@@ -18,7 +18,7 @@ PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
     "lines of the longest file": 500,
     "lines of the longest function": 60,
-    "imports between folders": 215,
+    "imports between folders": 220,
     "words of ARCHITECTURE.md": 3_100,
     "words of BENCHMARKS.md": 2_600,
 }

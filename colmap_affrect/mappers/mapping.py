@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
-from colmap_affrect.errors import damage, made_again
+from colmap_affrect.errors import WorkspaceError, damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.focal_observability import focal_growths
 from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, PairGraph, graph_of
@@ -181,7 +181,7 @@ def _remove_unfinished(partial: Path) -> None:
         try:
             remove_own([partial])
             return
-        except OSError:
+        except WorkspaceError:
             time.sleep(REMOVAL_INTERVAL_S)
 
 
