@@ -41,6 +41,8 @@ from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.verify import verify_matches
 
 SCORE = "score.json"  # in the folder of the best models
+NOTHING_TO_GO_ON_FROM = 1.0
+"""Score of models below which not one relative pose is expected to be right."""
 
 
 def score(models: Sequence[ModelSummary]) -> float:
@@ -88,9 +90,9 @@ class LookedAt:
 
     @property
     def is_enough(self) -> bool:
-        """Whether nothing is left to try with them, or nothing is registered without."""
+        """Whether nothing is left to try with them, or nothing is there to go on from without."""
         is_better = self.score > self.score_without
-        return is_better and (self.is_sure or not self.score_without)
+        return is_better and (self.is_sure or self.score_without < NOTHING_TO_GO_ON_FROM)
 
 
 @dataclass(frozen=True)
