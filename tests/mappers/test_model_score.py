@@ -28,10 +28,10 @@ def test_one_pair_in_twenty_may_be_wrong_itself() -> None:
 
 
 @pytest.mark.parametrize("num", [10, 40])
-def test_a_pair_speaks_for_poses_when_three_quarters_of_it_agree_and_not_when_half_does(
+def test_a_pair_speaks_for_poses_when_four_fifths_of_it_agree_and_not_when_two_thirds_do(
     num: int,
 ) -> None:
-    assert pair_log_ratio(0.8 * num, num) > 0.0 > pair_log_ratio(0.5 * num, num)
+    assert pair_log_ratio(0.8 * num, num) > 0.0 > pair_log_ratio(0.65 * num, num)
     assert pair_log_ratio(num, num) > 3.0
 
 
