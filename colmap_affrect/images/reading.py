@@ -1,5 +1,6 @@
 """Reading of image files, by header before pixels, and encoding of pictures, through OpenCV."""
 
+import io
 import math
 import re
 import struct
@@ -33,13 +34,15 @@ MAX_NUM_PX = 1 << 29  # of a photograph; those of the largest cameras have 400 m
 MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
 ONE_AT_A_TIME = Lock()  # filters of warnings are of the process: threads would mix them up
 PNG = b"\x89PNG\r\n\x1a\n"
+PNM = b"P"
+MAX_PNM_HEADER = 1 << 16  # bytes, with comments; the pixels follow
 READERS = {
     b"\xff\xd8": jpeg_factory,
     PNG: PngImageFile,
     b"II": TiffImageFile,
     b"MM": TiffImageFile,
     b"BM": BmpImageFile,
-    b"P": PpmImageFile,
+    PNM: PpmImageFile,
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
 NEW_SUBFILE_TYPE, REDUCED = 254, 1  # TIFF's tag, and its bit of a smaller copy of another page
@@ -61,6 +64,8 @@ def opened(file: BinaryIO) -> Image.Image:
     """Open an image by its header; what is damaged raises nearly anything."""
     start = file.read(len(PNG))
     file.seek(0)
+    if start.startswith(PNM):  # whose header Pillow reads byte by byte
+        file = io.BytesIO(file.read(MAX_PNM_HEADER))
     return next(read for magic, read in READERS.items() if start.startswith(magic))(file, "")
 
 
