@@ -131,9 +131,11 @@ def fitting_focals(
     free_priors = {**priors}
     for key in given:
         free_priors[key] = FocalPrior(priors[key].focal_px, FREE_SIGMA)
-    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=False)
+    # A wrong focal length is made up for by distortion, where that was free.
+    constant = frozenset(key for key in given if task.cameras[key].is_fixed)
+    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
     fixed = with_fewer_points(model)
-    fixed_cost = Adjuster(priors, NOISE_PX, refining, frozenset(given)).adjust(fixed, FINAL)
+    fixed_cost = Adjuster(priors, NOISE_PX, refining, constant).adjust(fixed, FINAL)
     free = with_fewer_points(model)
     free_cost = Adjuster(free_priors, NOISE_PX, refining).adjust(free, FINAL)
     num = _num_occupied_cells(fixed)
