@@ -350,9 +350,11 @@ def _fitting_focals(
     if not (given and _is_tried(model)):
         return {}
     free = {**priors} | {key: FocalPrior(priors[key].focal_px, FREE_SIGMA) for key in given}
-    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=False)
+    # A wrong focal length is made up for by distortion, where that was free.
+    fixed = frozenset(key for key in given if task.cameras[key].is_fixed)
+    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not fixed)
     held, freed = _with_fewer_points(model), _with_fewer_points(model)
-    before = Adjuster(priors, NOISE_PX, refining, frozenset(given)).adjust(held, FINAL)
+    before = Adjuster(priors, NOISE_PX, refining, fixed).adjust(held, FINAL)
     gain = before - Adjuster(free, NOISE_PX, refining).adjust(freed, FINAL)
     num = 0  # of cells of all images that hold observations
     for image_id, camera in cameras_of(held).items():

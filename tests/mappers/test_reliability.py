@@ -14,6 +14,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.parallax import mirrored_share
+from colmap_affrect.mappers.adjustment import Adjuster, FocalPrior
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.reliability import TERMS, judge, judged, measure
 from colmap_affrect.project.report import DOUBTFUL, SURE
@@ -232,3 +233,17 @@ def test_given_focal_lengths_are_doubted_where_the_points_say_others(
     fitting = {one.fitting_px for one in found.values()}
     assert len(fitting) == 1
     assert fitting == {0.0} if factor == 1.0 else min(fitting) == pytest.approx(1500.0, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_distortion_does_not_hide_that_a_given_focal_length_is_wrong(
+    tmp_path: Path, factor: float
+) -> None:
+    mapped, task = ring(tmp_path, 5)
+    focal_px = factor * 1500.0
+    mapped.reconstruction.cameras[1].params = [focal_px, 320, 240, 0]
+    refining = pycolmap.BundleAdjustmentOptions()
+    Adjuster({1: FocalPrior(focal_px, 0.0)}, 0.7, refining).adjust(mapped.reconstruction, 300)
+    record = replace(task.cameras[1], source="given", focal_px=focal_px, given=("focal",))
+    found = measure(mapped, replace(task, cameras={1: record}))["2.jpg"].fitting_px
+    assert found == 0.0 if factor == 1.0 else found == pytest.approx(1500.0, rel=0.05)
