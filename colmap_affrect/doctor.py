@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
@@ -22,6 +21,7 @@ from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, Work
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks, SizeOf
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
@@ -25,6 +24,7 @@ from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, TakesPaths, as_path
 from colmap_affrect.project.report import (

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import EXTRACTORS, FeatureOptions, NetworkOptions
 from colmap_affrect.features.sift import SiftOptions
@@ -21,6 +20,7 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.options import Options, suggestion, within
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions, IdentityOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap.model_files import Poses, read_poses
 from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import parse_methods
@@ -24,6 +23,7 @@ from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import SILENT, Progress, show
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.record import content_of

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
@@ -32,6 +31,7 @@ from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.options import digest_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress, Stopwatch
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.paths import PathLike, TakesPaths, as_path

@@ -9,7 +9,6 @@ from statistics import median
 
 import numpy as np
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import require_inside, triangulated
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, FATAL_FOR_MAPPING
@@ -21,6 +20,7 @@ from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.interop.consensus import agreeing
 from colmap_affrect.interop.consensus import residuals as residuals_of
 from colmap_affrect.interop.finished_models import read_finished_model
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.paths import PathLike, TakesPaths, as_path

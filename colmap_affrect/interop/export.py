@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import (
     model_folder,
@@ -26,6 +25,7 @@ from colmap_affrect.interop.camera_models import with_camera_model
 from colmap_affrect.interop.finished_models import read_finished_model
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path

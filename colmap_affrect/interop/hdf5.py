@@ -19,7 +19,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import (
     CHECKS,
@@ -59,6 +58,7 @@ from colmap_affrect.pairs.given_matches import (
 )
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.given_h5 import GivenFile, opened
 from colmap_affrect.project.outputs import leads_outside, new_results

@@ -9,7 +9,6 @@ from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 from typing import Any, Literal
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.errors import ImageError, NoModelError, OptionError
@@ -17,6 +16,7 @@ from colmap_affrect.images.exif import read_camera_tags
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.interop import pycolmap_api as ours
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.outputs import refuse_link
 from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.workspace import Workspace

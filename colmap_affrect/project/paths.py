@@ -4,8 +4,8 @@ import os
 from dataclasses import fields
 from pathlib import Path
 
-from colmap_affrect.argument_types import require_type, types_of_fields
 from colmap_affrect.errors import OptionError
+from colmap_affrect.project.argument_types import require_type, types_of_fields
 
 PathLike = str | os.PathLike[str]
 

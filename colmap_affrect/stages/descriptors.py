@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.argument_types import checks_arguments
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import CHECKS, keypoint_problems
@@ -27,6 +26,7 @@ from colmap_affrect.pairs.given_matches import GivenMatches, MatchType
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, ordered_for_reuse
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.argument_types import checks_arguments
 
 SIFT_SIZE = 128  # values of the one kind of descriptors that whole numbers stand for
 IMAGES_IN_MEMORY = 60
