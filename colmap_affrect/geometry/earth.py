@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from colmap_affrect.geometry.arrays import Array
 
 NO_FIX = 1e-6  # degrees: receivers without a fix write 0, 0, which is in the sea
@@ -26,3 +28,19 @@ def why_not_on_earth(position: Array) -> str:
     if abs(altitude) > MAX_ALTITUDE_M:
         return f"altitude {altitude:g} is no place on earth"
     return ""
+
+
+def beside_each_other(longitudes: Array) -> Array:
+    """Return (N,) longitudes of which no two are apart by the date line between them.
+
+    >>> beside_each_other(np.array([179.5, -179.5])).tolist()
+    [179.5, 180.5]
+    """
+    if np.ptp(longitudes) <= 180.0:
+        return longitudes
+    return np.where(longitudes < 0.0, longitudes + 360.0, longitudes)
+
+
+def usual_longitude(longitude: float) -> float:
+    """Return the same longitude between -180 and 180."""
+    return longitude - 360.0 if longitude > 180.0 else longitude

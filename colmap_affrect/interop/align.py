@@ -16,7 +16,11 @@ from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.model_files import why_unusable, write_model
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.earth import why_not_on_earth
+from colmap_affrect.geometry.earth import (
+    beside_each_other,
+    usual_longitude,
+    why_not_on_earth,
+)
 from colmap_affrect.interop.consensus import agreeing
 from colmap_affrect.interop.consensus import residuals as residuals_of
 from colmap_affrect.interop.finished_models import read_finished_model
@@ -100,22 +104,38 @@ def align(model_path: PathLike, output_path: PathLike, reference: Reference) -> 
         else:
             raise OptionError("give --gps, --positions, --points or --distance")
         left_out = _not_on_earth(true) if is_on_earth else {}
-        left_out |= _not_fitting(old, _without(true, left_out), is_on_earth=is_on_earth)
         right = _without(true, left_out)
+        if is_on_earth and right:
+            right = _beside_each_other(right)
+        left_out |= _not_fitting(old, right, is_on_earth=is_on_earth)
+        right = _without(right, left_out)
         new_from_old, residuals, origin = _similarity(old, right, is_on_earth=is_on_earth)
     model.transform(new_from_old)
     if fault := why_unusable(model):
-        raise OptionError(f"a scale of {new_from_old.scale:.3g} cannot be right: {fault}")
+        raise OptionError(
+            f"nothing could be computed with the new model, of scale {new_from_old.scale:.3g} and "
+            f"where it would lie: {fault}"
+        )
     with new_results(output_path, names=images) as (folder,):
         write_model(model, folder)
         if origin:
-            content = dict(zip(ON_EARTH, origin, strict=True))
+            latitude, longitude, altitude = origin
+            content = dict(
+                zip(ON_EARTH, (latitude, usual_longitude(longitude), altitude), strict=True)
+            )
             replace_text(folder / GEOREFERENCE, json.dumps(content, indent=1) + "\n")
     return Alignment(float(new_from_old.scale), residuals, left_out)
 
 
 def _without(places: Places, names: Collection[str]) -> Places:
     return {name: place for name, place in places.items() if name not in names}
+
+
+def _beside_each_other(true: Places) -> Places:
+    """Return places on earth whose mean and median are among them, at the date line, too."""
+    places = np.array(list(true.values()))
+    places[:, 1] = beside_each_other(places[:, 1])
+    return dict(zip(true, places, strict=True))
 
 
 def _not_on_earth(true: Places) -> dict[str, str]:

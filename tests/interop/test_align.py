@@ -78,6 +78,27 @@ def test_positions_on_earth_become_metres_east_north_and_up(tmp_path: Path) -> N
         np.testing.assert_allclose(found[:2], expected[:2], atol=1e-8)
 
 
+@pytest.mark.parametrize("longitude", [180.0, -179.999995, 0.0])
+def test_origin_is_among_positions_on_both_sides_of_a_meridian(
+    tmp_path: Path, longitude: float
+) -> None:
+    true = true_centers(write_model(tmp_path / "model"))
+    middle = np.mean(list(true.values()), axis=0)
+    table = tmp_path / "positions.csv"
+    lines = ["name,latitude,longitude,altitude"]
+    for name, place in true.items():
+        latitude, found, altitude = on_earth(place - middle, (-17.0, longitude, 300.0))
+        usual = (found + 180.0) % 360.0 - 180.0
+        lines.append(f"{name},{latitude!r},{usual!r},{altitude!r}")
+    table.write_text("\n".join(lines))
+    align(tmp_path / "model", tmp_path / "new", Reference(positions_path=table))
+    origin = json.loads((tmp_path / "new" / "georeference.json").read_text())
+    assert abs((origin["longitude"] - longitude + 180.0) % 360.0 - 180.0) < 1e-6
+    assert -180.0 <= origin["longitude"] <= 180.0
+    found = np.array(list(centers(pycolmap.Reconstruction(tmp_path / "new")).values()))
+    assert np.abs(found.mean(axis=0)).max() < 1.0  # x, y and z are east, north and up of it
+
+
 def test_positions_of_a_database_are_taken_from_its_priors(tmp_path: Path) -> None:
     model = write_model(tmp_path / "model")
     with pycolmap.Database.open(tmp_path / "gps.db") as database:
