@@ -140,22 +140,29 @@ def _refuse_existing(target: Path) -> None:
 def temporary_folder(parent: Path) -> Iterator[Path]:
     """Yield a new folder in a folder, in which those that killed processes left are removed."""
     missing = [path for path in (parent, *parent.parents) if not path.exists()]
-    try:
-        parent.mkdir(parents=True, exist_ok=True)
-        name = mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent)
-    except OSError as error:
-        _remove_empty(missing)
-        raise cannot_write(parent, error) from error
-    for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
-        if (left / LOCK).is_file() and not left.is_symlink():
-            with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
-                shutil.rmtree(left)  # its process has ended
     with ExitStack() as stack:
         stack.push(lambda failure, *_: _remove_empty(missing if failure else ()))
-        stack.callback(shutil.rmtree, name, ignore_errors=True)
-        with suppress(OSError):  # of file systems without locks leftovers are not tidied up
-            stack.enter_context(FileLock(Path(name) / LOCK))
-        yield Path(name)
+        folder = _new_folder(parent, stack)
+        while not folder.is_dir():  # a process that tidies up was faster than the lock
+            folder = _new_folder(parent, stack)
+        for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
+            if left != folder and (left / LOCK).is_file() and not left.is_symlink():
+                with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
+                    shutil.rmtree(left)  # its process has ended
+        yield folder
+
+
+def _new_folder(parent: Path, stack: ExitStack) -> Path:
+    """Make a folder that is locked, and removed in the end."""
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent))
+    except OSError as error:
+        raise cannot_write(parent, error) from error
+    stack.callback(shutil.rmtree, folder, ignore_errors=True)
+    with suppress(OSError):  # of file systems without locks leftovers are not tidied up
+        stack.enter_context(FileLock(folder / LOCK))
+    return folder
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
