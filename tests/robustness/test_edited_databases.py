@@ -87,6 +87,7 @@ def again(finished: Path, out: Path, call: Call) -> Callable[[str], list[str]]:
 Again = Callable[[str], list[str]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CHANGES)
 def test_what_the_stores_hold_is_made_again(
     finished: Path, out: Path, again: Again, case: str
@@ -190,6 +191,7 @@ def test_map_maps_a_changed_database_as_it_is(out: Path, again: Again, call: Cal
     assert (ended.code, len(ended.stderr)) == (1, 1)
 
 
+@pytest.mark.long
 def test_copies_are_made_again_from_the_original(
     finished: Path, tmp_path: Path, call: Call
 ) -> None:
