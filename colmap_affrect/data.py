@@ -185,7 +185,8 @@ def in_mask(mask: Mask, points: Floats, origin: tuple[int, int] = (0, 0)) -> Mas
     height, width = mask.shape
     columns, rows = (np.rint(points).astype(int) - origin).T
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
+    columns = np.where(inside, columns, 0)
+    rows = np.where(inside, rows, 0)
     return np.asarray(inside & mask[rows, columns])
 
 

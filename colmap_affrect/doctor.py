@@ -133,7 +133,8 @@ def _examine_installation(diagnosis: Diagnosis, weights_path: Path | None) -> No
     diagnosis.checked.append(f"weights: {files or 'none found'}")
     for key, path in found.items():
         if is_published(key, path) is False:
-            what, advice = f"not the published file of {key}", remedy(path)
+            what = f"not the published file of {key}"
+            advice = remedy(path)
             diagnosis.add("warning", path, what, f"unless it is your own, {advice}")
 
 
@@ -143,7 +144,8 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
     ``advice`` is what to do about problems, where it is not what ``CHECKS`` says.
     """
     try:
-        version, newest = refuse_newer(path), newest_schema_version()
+        version = refuse_newer(path)
+        newest = newest_schema_version()
         tables, problems = check_database(path)
     except DatabaseError as error:
         recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
@@ -160,7 +162,8 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         diagnosis.add("note", path, older, f"keep a copy: {copy}")
     diagnosis.checked.append(f"{path}: {tables.summary()}")
     for kind in sorted(problems, key=list(CHECKS).index):
-        what, usual = CHECKS[kind]["what"], CHECKS[kind]["advice"]
+        what = CHECKS[kind]["what"]
+        usual = CHECKS[kind]["advice"]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
         severity: Severity = "warning" if kind in HARMLESS else "error"
         diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
@@ -207,13 +210,15 @@ def _examine_model(diagnosis: Diagnosis, path: Path) -> None:
         what, _, advice = _without_path(path, error).partition("; ")
         diagnosis.add("error", path, what, advice or "make the model again")
         return
-    registered, points = model.num_reg_images(), model.num_points3D()
+    registered = model.num_reg_images()
+    points = model.num_points3D()
     diagnosis.checked.append(f"{path}: a model of {registered} images and {points} points")
 
 
 def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
     """Read every file of an output folder, that of one stage after the other."""
-    context, quoted = Context(workspace), shlex.quote(str(workspace.path))
+    context = Context(workspace)
+    quoted = shlex.quote(str(workspace.path))
 
     def read(path: Path, reader: Callable[..., Read], *given: Any, advice: str = "") -> Read | None:
         try:
@@ -261,7 +266,8 @@ def _examine_models(
 
 def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:
     """Return the stages that have begun, after all options on record have been read."""
-    workspace, done = context.workspace, context.workspace.begun
+    workspace = context.workspace
+    done = context.workspace.begun
     if "extract" in done:
         _ = context.inputs, context.extraction
     _ = context.pairing, context.matching, context.verification, context.escalation

@@ -418,7 +418,8 @@ class _Shown(str):
 
 def described_toml(options: Options, path: str = "") -> str:
     """Return options as TOML, under each what the text below it in its class says, as a comment."""
-    lines, sections = [], []
+    lines = []
+    sections = []
     for name, value in options.to_mapping().items():
         inner = getattr(options, name)
         at = f"{path}.{name}".lstrip(".")

@@ -75,5 +75,6 @@ def _result(protocol: type, method: str) -> tuple[type, type | None]:
     hint = get_type_hints(getattr(protocol, method)).get("return")
     if hint is Any or hint is None:
         return object, None
-    kind, inner = get_origin(hint) or hint, get_args(hint)
+    kind = get_origin(hint) or hint
+    inner = get_args(hint)
     return kind, inner[0] if kind is list else None

@@ -435,7 +435,8 @@ def map_and_report(
     page: bool = True,
 ) -> RunReport:
     """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
-    workspace, options = context.workspace, mapper.options
+    workspace = context.workspace
+    options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
     sizes = read_sizes(workspace.database)

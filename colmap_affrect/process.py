@@ -31,7 +31,8 @@ KEPT = (
     "'colmap-affrect doctor'"
 )
 SIGNALS = {signal.SIGINT, signal.SIGTERM}
-BEGUN, ENDED = b"b", b"e"
+BEGUN = b"b"
+ENDED = b"e"
 """What the worker tells: all is loaded and the command works; Python, not native code, ends it."""
 
 

@@ -37,7 +37,8 @@ class Forecast:
     def begin(self, name: str, total: int) -> None:
         """A stage begins with so many units."""
         is_known = self._costs.pop(name, None) is not None
-        self._cost, self._start_s = is_known * COSTS.get(name, 0.0) * total, self._clock()
+        self._cost = is_known * COSTS.get(name, 0.0) * total
+        self._start_s = self._clock()
 
     def text(self, frac: float) -> str:
         """Say how long the first model takes, when a fraction of the stage is done.
@@ -105,7 +106,9 @@ class Progress:
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
         """Show one stage of ``total`` units for as long as the context lasts."""
-        forecast, stream, title = self.forecast, self.stream, self.title + name
+        forecast = self.forecast
+        stream = self.stream
+        title = self.title + name
         done = num_lines = 0
         if forecast:
             forecast.begin(name, total)

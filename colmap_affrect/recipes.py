@@ -62,7 +62,8 @@ class Level:
     @property
     def name(self) -> str:
         """Name in reports."""
-        warps, own = self.rectifier.name, self.features.name if self.base else ""
+        warps = self.rectifier.name
+        own = self.features.name if self.base else ""
         adds_nothing = self.rectifier.warps == "none"
         return own if own and adds_nothing else f"{warps} {own}".rstrip()
 
@@ -106,9 +107,11 @@ class ExtractionOptions(Options):
     @property
     def levels(self) -> tuple[Level, ...]:
         """All levels, that of every image first."""
-        size, found = self.max_image_size_px, list[Level]()
+        size = self.max_image_size_px
+        found = list[Level]()
         for item in (LevelOptions(rectifier=self.rectifier), *self.escalation):
-            features, limit = item.features or self.features, item.max_image_size_px or size
+            features = item.features or self.features
+            limit = item.max_image_size_px or size
             alike = (k for k, level in enumerate(found)
                      if (level.features, level.max_image_size_px) == (features, limit))  # fmt: skip
             base = next(alike, len(found))

@@ -43,18 +43,18 @@ class Figures:
 
 LIMITS = {
     "colmap_affrect": Figures(
-        characters=43.0,
+        characters=42.8,
         statements=83.0,
-        comprehensions=43.0,
-        packed_assignments=7.0,
-        walruses=2.2,
-        undocumented=44.0,
+        comprehensions=41.5,
+        packed_assignments=0.6,
+        walruses=2.1,
+        undocumented=43.5,
     ),
     "tests": Figures(
-        characters=46.5,
+        characters=46.0,
         statements=80.0,
-        comprehensions=38.0,
-        packed_assignments=9.0,
+        comprehensions=37.0,
+        packed_assignments=0.4,
         walruses=0.6,
         undocumented=100.0,
     ),
@@ -151,11 +151,15 @@ def main() -> int:
         for path in sorted((ROOT / folder).rglob("*.py")):
             counts.add_file(path)
         found = counts.figures()
+        print(f"{folder}: {counts.code_lines:,} code lines")
         for field in fields(Figures):
             value = getattr(found, field.name)
             limit = getattr(limits, field.name)
+            mark = ""
             if value > limit:
+                mark = " <- too many"
                 num_failures += 1
+            print(f"{value:7.1f}  {field.name} (at most {limit:.1f}){mark}")
     return min(1, num_failures)
 
 

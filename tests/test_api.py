@@ -237,7 +237,9 @@ class Terminal(io.StringIO):
 
 
 def test_progress_is_shown_where_somebody_looks_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    own, file, terminal = Progress(), io.StringIO(), Terminal()
+    own = Progress()
+    file = io.StringIO()
+    terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", file)
     assert Progress.given(own) is own
     assert Progress.given(None) is Progress.given(False) is SILENT

@@ -36,7 +36,8 @@ def test_imports_go_down_only() -> None:
 
 
 def test_pycolmap_is_imported_and_half_pixels_are_added_at_one_place() -> None:
-    importing, adding = set(), set()
+    importing = set()
+    adding = set()
     for path, node in nodes():
         if isinstance(node, ast.Import) and any(item.name == "pycolmap" for item in node.names):
             importing.add(path)

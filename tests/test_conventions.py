@@ -29,7 +29,8 @@ UPSCALE_BIAS_PX = 0.05
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_colmap_counts_from_the_corner_half_a_pixel_further_in_x_and_y(dtype: type) -> None:
     points = np.array([[0.0, 7.0]], dtype=dtype)
-    colmap, pixel = colmap_from_pixel(points), pixel_from_colmap(points)
+    colmap = colmap_from_pixel(points)
+    pixel = pixel_from_colmap(points)
     assert (colmap.dtype, colmap.tolist()) == (dtype, [[0.5, 7.5]])
     assert (pixel.dtype, pixel.tolist()) == (dtype, [[-0.5, 6.5]])
     assert points.tolist() == [[0.0, 7.0]], "the argument stays"

@@ -14,7 +14,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Poses
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 
-WIDTH, HEIGHT = 1000, 700
+WIDTH = 1000
+HEIGHT = 700
 MATRIX = np.array([[900.0, 0.0, 480.0], [0.0, 910.0, 360.0], [0.0, 0.0, 1.0]])
 NOISE_PX = 0.3
 
@@ -37,7 +38,8 @@ def views(count: int) -> Poses:
 
 def wall(random: np.random.Generator, count: int) -> NDArray[np.float64]:
     """Points of two slanted planes that meet in an edge."""
-    x, y = random.uniform(-3, 9, count), random.uniform(-3, 3, count)
+    x = random.uniform(-3, 9, count)
+    y = random.uniform(-3, 3, count)
     return np.stack([x, y, 7.0 + 0.35 * np.abs(x - 3.0) + 0.1 * y], axis=1)
 
 

@@ -78,7 +78,8 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     command runs, and Python's ``sys.stderr`` to the terminal. A new output folder goes when the
     command fails before it has more than its log.
     """
-    log_path, new = Path(os.devnull), None
+    log_path = Path(os.devnull)
+    new = None
     if options.output_path:
         workspace = Workspace(options.output_path)
         new = None if workspace.path.exists() else workspace.path

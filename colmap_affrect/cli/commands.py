@@ -269,7 +269,8 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
 
 def _next_steps(report: ReconstructionReport, workspace: Workspace) -> list[str]:
     """Say where the results are, and with which commands to go on."""
-    photos, model = workspace.photographs(), workspace.path / "sparse" / "0"
+    photos = workspace.photographs()
+    model = workspace.path / "sparse" / "0"
     page = f", to look at: {workspace.page}" if workspace.page.exists() else ""
     lines = [f"results     {workspace.path}{page}"]
     if report.status not in ("ok", "partial"):
@@ -347,7 +348,8 @@ def weights(options: argparse.Namespace) -> None:
         return
     folder = given.folder("--weights", options.weights)
     for key in keys or files.WEIGHT_FILES:
-        path, file = files.find(key, folder), files.WEIGHT_FILES[key]
+        path = files.find(key, folder)
+        file = files.WEIGHT_FILES[key]
         if not path:
             where = f"not found: {files.install_hint([file])}colmap-affrect weights fetch {key}"
         elif files.is_published(key, path) is False:

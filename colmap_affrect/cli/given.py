@@ -31,7 +31,8 @@ AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 def over(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOptions:
     """Return options with what is given of a section, as ``cameras.mode`` of ``cameras``."""
-    given, flags = known.to_mapping(), []
+    given = known.to_mapping()
+    flags = []
     for flag, settings in FLAGS.items():
         place, _, field = settings.get("dest", "").rpartition(".")
         value = getattr(options, f"{place}.{field}", None)

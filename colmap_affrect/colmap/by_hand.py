@@ -204,7 +204,8 @@ def triangulated(model: pycolmap.Reconstruction, marks: Mapping[int, Array]) -> 
 
     None where their rays do not meet in front of the cameras.
     """
-    flat, poses = [], []
+    flat = []
+    poses = []
     for image_id, mark in marks.items():
         image = model.images[image_id]
         flat.append(model.cameras[image.camera_id].cam_from_img(mark))

@@ -83,7 +83,8 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL, *, warns: bool =
     """
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
-        what, advice = CHECKS[kind]["what"], CHECKS[kind]["advice"].format(path=path)
+        what = CHECKS[kind]["what"]
+        advice = CHECKS[kind]["advice"].format(path=path)
         raise DatabaseError(f"{path}: {what} ({such_as(problems[kind])}); {advice}")
     for kind in sorted(WARNED & problems.keys()) if warns else ():
         check = CHECKS[kind]
@@ -220,7 +221,8 @@ def keypoint_problems(keypoints: Floats, size: tuple[int, int] | None) -> list[s
         size: (width, height) of the image in px, None where it is not known.
     """
     finite = np.asarray((np.abs(keypoints) <= MAX_SIDE_PX).all(axis=1))
-    points, found = keypoints[finite, :2], list[str]()
+    points = keypoints[finite, :2]
+    found = list[str]()
     if not finite.all():
         found.append("keypoints-not-finite")
     is_larger = size is None or max(size) > MAX_NORMALISED

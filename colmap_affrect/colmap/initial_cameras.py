@@ -137,7 +137,8 @@ class InitialCameras:
         sizes: defaultdict[Group, set[Size]] = defaultdict(set)
         note = ""
         for name in names:
-            size, together = self.size(name), self._together(name)
+            size = self.size(name)
+            together = self._together(name)
             if not (size and together):
                 continue
             sizes[together].add(size)
@@ -185,7 +186,8 @@ class InitialCameras:
             names[image.camera_id].append(image.name)
         records = {}
         for camera_id, same in sorted(names.items()):
-            given, before = self._given_of(same), database.read_camera(camera_id)
+            given = self._given_of(same)
+            before = database.read_camera(camera_id)
             size = (before.width, before.height)
             if not (given.params or given.focal_px or given.focal_mm or self.options.focal_mm):
                 continue
@@ -215,7 +217,8 @@ class InitialCameras:
 
     def camera(self, names: Sequence[str], size: Size) -> tuple[pycolmap.Camera, CameraRecord]:
         """Return the camera that images of one size share, and what is known of it."""
-        given, longer = self._given_of(names), max(size)
+        given = self._given_of(names)
+        longer = max(size)
         camera = pycolmap.Camera.create_from_model_name(
             1, given.model, self.options.default_focal_length_factor * longer, *size
         )
@@ -224,7 +227,8 @@ class InitialCameras:
         if given.params:
             camera.params = list(given.params)
         elif given.cx is not None and given.cy is not None and len(camera.principal_point_idxs()):
-            camera.principal_point_x, camera.principal_point_y = given.cx, given.cy
+            camera.principal_point_x = given.cx
+            camera.principal_point_y = given.cy
         if given.params or given.cx is not None:
             parts.append("principal-point")
         if given.params or (parts and not len(camera.extra_params_idxs())):
@@ -247,15 +251,19 @@ class InitialCameras:
         if given.params:
             return "given", ""
         source: Source = "given"
-        focal, why = given.focal_px, ""
+        focal = given.focal_px
+        why = ""
         if given.focal_mm and given.plate_width_mm:
             focal = given.focal_mm / given.plate_width_mm * camera.width
         if not focal:
             found = self._exif_focal(names)
             source = "exif-rescaled" if found.is_rescaled else "exif"
-            focal, why = found.focal_px, found.why
+            focal = found.focal_px
+            why = found.why
         if not focal and self.options.focal_mm:
-            source, why, longer = "given", "", max(camera.width, camera.height)
+            source = "given"
+            why = ""
+            longer = max(camera.width, camera.height)
             focal = self.options.focal_mm / self.options.film_width_mm * longer
         if not focal:
             return "guess", why
@@ -347,7 +355,8 @@ def import_images(
     if is_new:
         remove_own(database_files(path))  # what is beside it, of one that was removed
     with temporary_folder(path.parent) as folder:
-        new, read = folder / "new.db" if is_new else path, folder / "read.db"
+        new = folder / "new.db" if is_new else path
+        read = folder / "read.db"
         known = set[str]() if is_new else set(image_ids(new))
         missing = sorted(set(names) - known)
         missing = [name for name in missing if not why_unusable(image_path / name)]
@@ -438,7 +447,8 @@ def record_cameras(
         names[camera.camera_id].append(name)
     records = {}
     for camera_id, of_camera in names.items():
-        record, same = known.get(camera_id), tuple(sorted(of_camera))
+        record = known.get(camera_id)
+        same = tuple(sorted(of_camera))
         if record and set(record.names) <= set(same):
             records[camera_id] = replace(record, names=same)
         else:

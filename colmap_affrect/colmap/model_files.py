@@ -117,7 +117,8 @@ OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")  # of COLMAP before 
 def _read_records(path: Path) -> list[Any]:
     """Read all records of a file; StoreError unless they end where it ends."""
     with errors.damage(path, _mend(path.parent)):
-        reader, record = _Reader(read_regular(path)), RECORDS[path.name]
+        reader = _Reader(read_regular(path))
+        record = RECORDS[path.name]
         try:
             records = [record(reader) for _ in range(reader.take("Q")[0])]
         except EOFError:
@@ -141,7 +142,8 @@ def registered_names(model_path: Path) -> list[str]:
 
 def require_intact(folder: Path) -> None:
     """Refuse a model of ours that is not as it was written, or a binary one that is damaged."""
-    known, now = kept_digests(folder), file_digests(folder)
+    known = kept_digests(folder)
+    now = file_digests(folder)
     for name in RECORDS if not known and _is_binary(folder) else ():
         if name in OLD_RECORDS or (folder / name).exists():
             _read_records(folder / name)
@@ -294,7 +296,8 @@ def refuse_panoramas(model: pycolmap.Reconstruction, what: str) -> None:
 
 def _is_usable(camera: pycolmap.Camera) -> bool:
     """Return whether a camera has a size, finite parameters and a focal length, if it has one."""
-    params, sides = np.asarray(camera.params, np.float64), (camera.width, camera.height)
+    params = np.asarray(camera.params, np.float64)
+    sides = (camera.width, camera.height)
     has_size = all(0 < side <= MAX_SIDE_PX for side in sides)
     focals = params[list(camera.focal_length_idxs())]
     return bool(has_size and (np.abs(params) < FAR).all() and (focals > 0.0).all())

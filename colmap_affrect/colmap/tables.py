@@ -85,7 +85,8 @@ class Tables:
     def summary(self) -> str:
         """Return the numbers of what there is."""
         features = sum(rows for rows, _ in self.keypoints.values())
-        images, cameras = len(self.names), len(self.cameras)
+        images = len(self.names)
+        cameras = len(self.cameras)
         return (
             f"{images} image{'s' * (images != 1)}, {cameras} camera{'s' * (cameras != 1)}, "
             f"{features} keypoints, {self.num_matched} matched and {self.num_verified} verified "

@@ -49,7 +49,8 @@ def pair_model(
         return HomographyModel(np.asarray(geometry.H, np.float64), (points1, points2))
     if geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
         return None
-    essential, fundamental = geometry.E, geometry.F
+    essential = geometry.E
+    fundamental = geometry.F
     is_calibrated = geometry.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
     if is_calibrated and essential is not None and np.any(essential):
         matrices = [camera.calibration_matrix() for camera in cameras]

@@ -50,7 +50,8 @@ class DepthMaps:
     """Depth maps in a folder; values that are not finite or not positive are unknown."""
 
     def __init__(self, options: DepthOptions) -> None:
-        self._options, self._path = options, Path(options.path)
+        self._options = options
+        self._path = Path(options.path)
 
     def require_some(self, names: Sequence[str]) -> None:
         """Refuse a folder that is not there, or has no map of any image; OptionError."""
@@ -88,7 +89,8 @@ class DepthMaps:
             raise DepthError(
                 f"{what}: 8 bits are a preview, too coarse for depth; give 16 bits, or .npy"
             )
-        (height, width), size = values.shape, photograph.size
+        (height, width) = values.shape
+        size = photograph.size
         if abs(log(width / height) - log(size[0] / size[1])) > log(MAX_ASPECT_RATIO):
             raise DepthError(
                 f"{what}: is {width} x {height} px, the photograph {size[0]} x {size[1]} (width x "

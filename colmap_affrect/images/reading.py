@@ -83,7 +83,8 @@ def pages(path: Path) -> list[int]:
 
 
 def _tiff_pages(file: BinaryIO) -> list[int]:
-    image, found = opened(file), []
+    image = opened(file)
+    found = []
     if isinstance(image, TiffImageFile):
         for page in range(image.n_frames):
             image.seek(page)
@@ -243,7 +244,8 @@ def tones(image: NDArray[Any]) -> tuple[float, float] | None:
 def _sample(image: NDArray[Any]) -> NDArray[Any]:
     """Return some pixels of an (H, W[, 3]) image, from all over it but its frame."""
     height, width = image.shape[:2]
-    y, x = int(FRAME_FRAC * height), int(FRAME_FRAC * width)
+    y = int(FRAME_FRAC * height)
+    x = int(FRAME_FRAC * width)
     inner = image[y : height - y, x : width - x]
     step = max(1, round(math.sqrt(inner.size / NUM_TONES)))
     return inner[::step, ::step]

@@ -84,13 +84,15 @@ def _warp_tile(source: Singles, image_from_tile: Array, size: tuple[int, int]) -
     compressions = _compressions(image_from_tile, size, source.shape[1::-1])
     density_x, density_y = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY).astype(int)
     sigma_x, sigma_y = map(_anti_aliasing_sigma, compressions, (density_x, density_y))
-    reach_x, reach_y = ceil(3 * sigma_x), ceil(3 * sigma_y)
+    reach_x = ceil(3 * sigma_x)
+    reach_y = ceil(3 * sigma_y)
     columns = np.arange(-reach_x, (size[0] - 1) * density_x + reach_x + 1) / density_x
     rows = np.arange(-reach_y, (size[1] - 1) * density_y + reach_y + 1) / density_y
     x, y, _ = _source_points(image_from_tile, columns, rows, source.shape[1::-1])
     dense = cv2.remap(source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     dense = cv2.GaussianBlur(dense, (2 * reach_x + 1, 2 * reach_y + 1), sigma_x, sigmaY=sigma_y)
-    rows_end, columns_end = dense.shape[0] - reach_y, dense.shape[1] - reach_x
+    rows_end = dense.shape[0] - reach_y
+    columns_end = dense.shape[1] - reach_x
     return np.asarray(dense[reach_y:rows_end:density_y, reach_x:columns_end:density_x])
 
 
@@ -123,7 +125,8 @@ def _source_points(
     ahead = third > 0.0
     third = np.where(ahead, third, 1.0)
     width, height = image_size
-    x, y = np.clip(x / third, -width, 2 * width), np.clip(y / third, -height, 2 * height)
+    x = np.clip(x / third, -width, 2 * width)
+    y = np.clip(y / third, -height, 2 * height)
     return x.astype(np.float32), y.astype(np.float32), ahead
 
 

@@ -30,7 +30,8 @@ from colmap_affrect.project.tables import read_table
 
 GEOREFERENCE = "georeference.json"  # beside a model: what COLMAP's files have no place for
 MIN_WIDTH = 0.01  # of known places across the line that fits them best, in units of its length
-METRIC, ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "altitude")
+METRIC = ("x", "y", "z")
+ON_EARTH = ("latitude", "longitude", "altitude")
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 GPS_ERROR_M = 10.0  # a position on earth that is no further off is not left out
 TABLE_ERROR = 0.02  # the same of other positions, of how far they spread
@@ -123,10 +124,13 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
     """Align with checked arguments."""
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
-    model, origin = read_finished_model(model_path), tuple[float, ...]()
+    model = read_finished_model(model_path)
+    origin = tuple[float, ...]()
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     old = {name: image.projection_center() for name, image in images.items()}
-    true, is_on_earth, marked = Places(), False, Places()
+    true = Places()
+    is_on_earth = False
+    marked = Places()
     left_out: dict[str, str] = {}
     if reference.points_path:
         marked, true = _marked_points(model, images, reference.points_path)
@@ -306,7 +310,8 @@ def _marked_points(
             true[name] = _numbers(row, METRIC, place)
         if row.get("image", "") in images:
             image = images[row["image"]]
-            camera, mark = model.cameras[image.camera_id], _numbers(row, ("px", "py"), place)
+            camera = model.cameras[image.camera_id]
+            mark = _numbers(row, ("px", "py"), place)
             require_inside(place, mark, image.name, (camera.width, camera.height))
             marks[name][image.image_id] = mark
     views = {name: marked for name, marked in marks.items() if len(marked) > 1}

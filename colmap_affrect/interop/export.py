@@ -178,7 +178,8 @@ def _not_in_text(name: str) -> str:
 
 def _undistorted(source: Source, folder: Path) -> Path:
     """Write undistorted photographs with their model, ready for COLMAP's patch_match_stereo."""
-    path, photographs = folder / DENSE, source.image_path
+    path = folder / DENSE
+    photographs = source.image_path
     refuse_panoramas(source.model, "undistorted photographs")
     if photographs is None:
         raise OptionError("--image-path: give the folder of the photographs, to undistort them")
@@ -204,7 +205,8 @@ def _undistorted(source: Source, folder: Path) -> Path:
 
 def _require_size(path: Path, camera: pycolmap.Camera) -> None:
     """Refuse a photograph of another size than its camera has; ImageError."""
-    size, expected = header_size(path), (camera.width, camera.height)
+    size = header_size(path)
+    expected = (camera.width, camera.height)
     if size not in (None, expected):
         raise ImageError(
             f"{path}: is {size[0]} x {size[1]} px, and its camera {expected[0]} x {expected[1]}; "
@@ -221,7 +223,8 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
         raise why_not_written(path / "sparse", error) from error
     frames = []
     for image in flat.images():
-        camera, pose = flat.model.cameras[image.camera_id], np.eye(4)
+        camera = flat.model.cameras[image.camera_id]
+        pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
         pose[:3, :3] = pose[:3, :3] @ FLIP_Y_Z
         frames.append({
@@ -258,7 +261,8 @@ def _place(source: Source) -> dict[str, Any]:
     points = [point.xyz for point in source.model.points3D.values()]
     middle = np.median(points or poses[:, :, 3], axis=0)
     half = np.linalg.norm(poses[:, :, 3] - middle, axis=1).mean() / 2.64 or 1.0
-    box, up = [(middle - half).tolist(), (middle + half).tolist()], -poses[:, :, 1].mean(axis=0)
+    box = [(middle - half).tolist(), (middle + half).tolist()]
+    up = -poses[:, :, 1].mean(axis=0)
     return {"aabb_scale": 32, "aabb": box, "up": (up / np.linalg.norm(up)).tolist()}
 
 
@@ -267,7 +271,8 @@ def _cameras(source: Source, folder: Path) -> Path:
     path = folder / "cameras.csv"
     rows: list[dict[str, Any]] = []
     for image in source.images():
-        camera, center = source.model.cameras[image.camera_id], image.projection_center()
+        camera = source.model.cameras[image.camera_id]
+        center = image.projection_center()
         qx, qy, qz, qw = image.cam_from_world().rotation.inverse().quat.tolist()
         rows.append({
             "name": _no_formula(image.name), **dict(zip("xyz", center, strict=True)),

@@ -224,7 +224,9 @@ def _keys_of(features: GivenFile, names: Sequence[str], image_path: Path) -> dic
     full_names = defaultdict[str, list[str]](list)
     for name in names:
         full_names[PurePosixPath(name).name].append(name)
-    known, found, unknown = set(names), dict[str, str](), []
+    known = set(names)
+    found = dict[str, str]()
+    unknown = []
     for key in features.groups_with("keypoints"):
         alike = [key] if key in known else full_names.get(key, [])
         if len(alike) == 1:
@@ -345,7 +347,8 @@ def _write_keypoints(
     database: pycolmap.Database, image: pycolmap.Image, source: GivenFile, key: str
 ) -> None:
     """Write the keypoints of an image, if it is as large as the features were found in."""
-    name, camera = image.name, database.read_camera(image.camera_id)
+    name = image.name
+    camera = database.read_camera(image.camera_id)
     expected = (camera.width, camera.height)
     if f"{key}/image_size" in source.shapes:
         size = tuple(source.read(f"{key}/image_size", (2,)).tolist())
@@ -428,7 +431,8 @@ def _match_groups(
     for id1, id2 in pairs:
         indices = np.asarray(database.read_matches(id1, id2), np.int64)
         _, one_each = np.unique(indices[:, 0], return_index=True)
-        scores, count = np.ones(len(one_each), np.float32), database.num_keypoints_for_image(id1)
+        scores = np.ones(len(one_each), np.float32)
+        count = database.num_keypoints_for_image(id1)
         pair = PairMatches((names[id1], names[id2]), indices[one_each], scores, count)
         yield pair_key(*pair.names), hloc_matches(pair)
 

@@ -215,7 +215,8 @@ def _match_descriptors(
         raise OptionError("matching_options: descriptors of a database take NearestOptions alone")
     if refused := sorted(asked.keys() & {"guided_matching", "rig_verification"}):
         raise OptionError(f"{refused[0]}: not for descriptors of another program")
-    path, begun = context.workspace.database, time.perf_counter()
+    path = context.workspace.database
+    begun = time.perf_counter()
     refuse_unusable(path)
     listed = list(pairs)
     if asked.get("skip_image_pairs_in_same_frame"):
@@ -252,7 +253,8 @@ def _match(
         reports.append(escalate(context))
     if asked.get("rig_verification"):
         rigs = pycolmap.GeometricVerifierOptions(rig_verification=True)
-        path, native = context.workspace.database, two_view_options(verification)
+        path = context.workspace.database
+        native = two_view_options(verification)
         run_cancellable(
             lambda token: pycolmap.geometric_verification(
                 path, rigs, two_view_geometry_options=native, cancellation_token=token
@@ -276,7 +278,8 @@ def verify_matches(
     counterpart, in any database; DatabaseError where a match points at no keypoint. ``pairs_path``
     has two names per line; None stands for all pairs.
     """
-    path, pairs = as_path(database_path, "database_path"), None
+    path = as_path(database_path, "database_path")
+    pairs = None
     verification = translate.verification_options(options, None)
     refuse_unusable(path, FATAL_BEFORE_MAPPING, warns=True)
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
@@ -316,7 +319,8 @@ def incremental_mapping(
     """
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
     mapper = MAPPERS.make(translate.mapper_options(options))
-    database, output = as_path(database_path, "database_path"), as_path(output_path, "output_path")
+    database = as_path(database_path, "database_path")
+    output = as_path(output_path, "output_path")
     refuse_unusable(database, FATAL_AS_IT_IS)
     with temporary_folder(output) as folder:
         existing = None
@@ -380,7 +384,8 @@ class _Cancellable(Progress):
 
     def __init__(self, shown: Progress, token: Token) -> None:
         super().__init__()
-        self._shown, self._token = shown, token
+        self._shown = shown
+        self._token = token
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:

@@ -243,7 +243,8 @@ class Adjuster:
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
         prior = self.priors[camera.camera_id]
-        focal, extra = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())
+        focal = list(camera.focal_length_idxs())
+        extra = list(camera.extra_params_idxs())
         if not prior.sigma:  # distortion alone is refined
             fixed = [*focal, *camera.principal_point_idxs()]
             if len(fixed) == len(camera.params):
@@ -251,7 +252,8 @@ class Adjuster:
             manifold = pyceres.SubsetManifold(len(camera.params), fixed)
             problem.set_manifold(camera.params, manifold)
             return
-        mean, sigma = camera.params.copy(), np.full(len(camera.params), UNKNOWN_SIGMA)
+        mean = camera.params.copy()
+        sigma = np.full(len(camera.params), UNKNOWN_SIGMA)
         mean[focal], sigma[focal] = prior.focal_px, prior.sigma * prior.focal_px
         mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
         # Reprojection errors are in px, priors in units of their deviation times the noise.

@@ -115,7 +115,8 @@ class BridgeFinder:
 
     def _hypotheses(self, posed: _PosedModel, open_pair: _OpenPair) -> Iterator[BridgeHypothesis]:
         """Yield the bridges that the relative poses of a pair allow."""
-        inside, outside = open_pair.inside, open_pair.outside
+        inside = open_pair.inside
+        outside = open_pair.outside
         camera = open_pair.camera
         cameras = {inside: posed.cameras[inside], outside: camera}
         for relative in self._poses_of_pair(open_pair.pair, cameras):
@@ -134,7 +135,8 @@ class BridgeFinder:
         self, posed: _PosedModel, open_pair: _OpenPair, relative: RelativePose
     ) -> ScaleEstimate | None:
         """Compare the depths of a pair in the image of the model with those of the model."""
-        image_id, side = open_pair.inside, open_pair.side
+        image_id = open_pair.inside
+        side = open_pair.side
         camera = posed.cameras[image_id]
         known = posed.known_depths(image_id)
         keypoints = self.graph.keypoints[image_id]

@@ -39,7 +39,8 @@ def complete_points(
     correspondences = _correspondences(model, graph)
     manager = pycolmap.ObservationManager(model, correspondences)
     triangulator = pycolmap.IncrementalTriangulator(correspondences, model, manager)
-    mapping, finding = native.get_mapper(), native.get_triangulation()
+    mapping = native.get_mapper()
+    finding = native.get_triangulation()
     for image_id in sorted(model.reg_image_ids()):
         triangulator.triangulate_image(finding, image_id)
     triangulator.complete_all_tracks(finding)
@@ -59,7 +60,8 @@ def _correspondences(
     model: pycolmap.Reconstruction, graph: PairGraph
 ) -> pycolmap.CorrespondenceGraph:
     """Return the inliers of the pairs among a model's images, but for those it contradicts."""
-    inside, against = set(model.reg_image_ids()), graph.contradicted(model)
+    inside = set(model.reg_image_ids())
+    against = graph.contradicted(model)
     found = pycolmap.CorrespondenceGraph()
     for image_id in sorted(inside):
         found.add_image(image_id, model.images[image_id].num_points2D())

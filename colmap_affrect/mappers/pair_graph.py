@@ -192,7 +192,8 @@ class PairGraph:
 
     def sizes(self, ids: Ids) -> tuple[Size, Size]:
         """Return the sizes of the images of a pair."""
-        first, second = self.cameras[ids[0]], self.cameras[ids[1]]
+        first = self.cameras[ids[0]]
+        second = self.cameras[ids[1]]
         return (first.width, first.height), (second.width, second.height)
 
     def pairs_inside(self, image_ids: Collection[int]) -> list[VerifiedPair]:

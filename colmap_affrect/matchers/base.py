@@ -65,7 +65,8 @@ class Matches:
 
     def fault(self, num_first: int, num_second: int) -> str:
         """Say what is wrong for images with so many features; empty if nothing is."""
-        indices, scores = np.asarray(self.indices), np.asarray(self.scores)
+        indices = np.asarray(self.indices)
+        scores = np.asarray(self.scores)
         if not np.issubdtype(indices.dtype, np.integer):
             return "indices that are no integers"
         if indices.shape != (len(scores), 2) or scores.ndim != 1:

@@ -32,7 +32,8 @@ class PairList(Sequence[Pair]):
     """Pairs as (N, 2) int32 ``numbers`` of their images in the sorted ``names``."""
 
     def __init__(self, names: Sequence[str], numbers: NDArray[np.integer]) -> None:
-        self.names, self.numbers = names, numbers.astype(np.int32, copy=False).reshape(-1, 2)
+        self.names = names
+        self.numbers = numbers.astype(np.int32, copy=False).reshape(-1, 2)
 
     @classmethod
     def of(cls, pairs: Iterable[Pair]) -> "PairList":
@@ -117,7 +118,8 @@ def most_similar_pairs(
     Each image is paired with half as many that are most similar to it; the rest goes to the most
     similar pairs of all. ``similarities`` has for each of N images its (N,) similarities with all.
     """
-    half, count = -(-num_neighbors // 2), len(names)
+    half = -(-num_neighbors // 2)
+    count = len(names)
     candidates = []
     for index, row in enumerate(similarities):
         values = row.astype(np.float32)
@@ -195,7 +197,8 @@ def read_pairs(path: Path, names: Sequence[str], image_path: Path | None = None)
     except UnicodeDecodeError as error:
         raise OptionError(f"{path}: cannot be read ({error})") from error
     if problems:
-        (count, line), more = problems[0], len(problems) - 1
+        (count, line) = problems[0]
+        more = len(problems) - 1
         raise OptionError(
             f"{path}: line {count}: {line!r} is not two names of images"
             f"{_suggestion(line, ordered)}" + f", nor are {more} more lines" * (more > 0)
@@ -224,7 +227,8 @@ def split_line(line: str, known: Collection[str]) -> Pair | None:
         return None
     for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
         for match in re.finditer(separator, line):
-            first, second = line[: match.start()], line[match.end() :]
+            first = line[: match.start()]
+            second = line[match.end() :]
             if first in known and second in known:
                 return first, second
     return None
@@ -249,7 +253,8 @@ def _spellings(folder: Path) -> tuple[str, ...]:
 
 
 def _suggestion(line: str, names: Sequence[str]) -> str:
-    known, words = set(names), line[:LONGEST_LINE].replace(",", " ").split()
+    known = set(names)
+    words = line[:LONGEST_LINE].replace(",", " ").split()
     unknown = [word for word in words if word not in known][:MAX_SUGGESTIONS]
     close = [match for word in unknown for match in difflib.get_close_matches(word, names, n=1)]
     return f" (did you mean {', '.join(close)}?)" if close else ""

@@ -167,7 +167,8 @@ class Cluster:
     """An :class:`~colmap_affrect.parallel.executor.Executor` on the workers of a cluster."""
 
     def __init__(self, client: Client, address: str) -> None:
-        self._client, self._address = client, address
+        self._client = client
+        self._address = address
         self._watch = ClusterWatch(client, address)
 
     def _result(self, future: Future) -> Any:
@@ -203,7 +204,8 @@ class Cluster:
 
         expected = environment(str(path) for path in files)
         job = pickle.dumps(function), tuple(expected.items())
-        name, numbers = f"{type(function).__name__}-{uuid.uuid4().hex}", count()
+        name = f"{type(function).__name__}-{uuid.uuid4().hex}"
+        numbers = count()
 
         def submit(task: Task) -> Future:
             key = f"{name}-{next(numbers)}"

@@ -54,7 +54,8 @@ def _shown(value: Any) -> str:
 
 def _fits(value: Any, kind: Any) -> bool:
     """Return whether a value is of a type; True where that cannot be told."""
-    origin, inner = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    inner = get_args(kind)
     if origin in (Union, types.UnionType):
         return any(_fits(value, one) for one in inner)
     if origin is Literal:
@@ -106,7 +107,8 @@ def _holds(value: Any, origin: type, inner: tuple[Any, ...]) -> bool:
 
 def _name_of(kind: Any) -> str:
     """Return how a type is called in Python, without the modules."""
-    origin, inner = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    inner = get_args(kind)
     if origin in (Union, types.UnionType):
         return " or ".join(_name_of(one) for one in inner)
     if kind is type(None):

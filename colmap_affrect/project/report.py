@@ -211,7 +211,8 @@ def summed(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
     found = dict[str, StageReport]()
     for report in reports:
         before = found.get(report.name, replace(report, wall_s=0.0, num_done=0))
-        wall_s, num_done = before.wall_s + report.wall_s, before.num_done + report.num_done
+        wall_s = before.wall_s + report.wall_s
+        num_done = before.num_done + report.num_done
         found[report.name] = replace(report, wall_s=wall_s, num_done=num_done)
     return tuple(found.values())
 
@@ -445,7 +446,8 @@ class ReconstructionReport(Summarized):
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
         lines += _some(f"by hand     {text}" for text in self.by_hand)
         if self.guided:
-            before, after = self.guided["matches_before"], self.guided["matches_after"]
+            before = self.guided["matches_before"]
+            after = self.guided["matches_after"]
             pairs = f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"
             lines += [f"guided      {pairs} matched again: {after} inliers, {before} before"]
         if self.matched_again:

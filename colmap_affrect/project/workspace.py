@@ -48,7 +48,8 @@ class Workspace:
 
     def __init__(self, path: Path, users_database: Path | None = None) -> None:
         """Name the folder, and a database of the user in the place of one there; never removed."""
-        self.path, self.users_database = path, users_database
+        self.path = path
+        self.users_database = users_database
         self.database = users_database or path / "database.db"
         self.mapped_database = path / "mapped.db"  # a copy with what is done by hand
         self.seal = path / "database.db.seal"  # what the last command left in it
@@ -272,7 +273,8 @@ class Workspace:
         """
         self._refuse_foreign_results(stage)
         outputs.remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
-        record, begun = self.recorded(), self.begun
+        record = self.recorded()
+        begun = self.begun
         if overwrite:
             self.refuse_foreign_models()
             outputs.remove_own(self._results(stage))

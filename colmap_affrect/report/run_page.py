@@ -162,7 +162,8 @@ def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
     if name in model.probabilities:
         text += f", right with a probability of {probability_text(model.probabilities[name])}"
     if name in model.unsure:
-        why, reasons = model.unsure[name], list(model.unsure.values())
+        why = model.unsure[name]
+        reasons = list(model.unsure.values())
         text += "; not sure" + f": {why}" * (reasons.count(why) == 1)
     if name in model.doubtful:
         kind = "doubtful"

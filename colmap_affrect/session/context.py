@@ -73,7 +73,8 @@ class Inputs(Options):
 
     def names(self) -> list[str]:
         """Return the images of the list, else of the database, else of the folder."""
-        folder, listed = Path(self.image_path), Path(self.image_list_path)
+        folder = Path(self.image_path)
+        listed = Path(self.image_list_path)
         if not self.from_database:
             return list_images(folder, listed if self.image_list_path else None)
         known = read_names(Path(self.from_database))
@@ -188,7 +189,8 @@ class OnRecord(Generic[Built]):
         self, stage: str, build: Callable[[Any, str], Built], beside: type[Options] | None = None
     ) -> None:
         """Take what builds them of values and of where these are; not of others ``beside`` them."""
-        self._stage, self._build = stage, build
+        self._stage = stage
+        self._build = build
         self._others = beside.model_fields if beside else {}
 
     def __get__(self, context: "Context", owner: object) -> Built:

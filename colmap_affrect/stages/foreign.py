@@ -115,7 +115,8 @@ def copy_verified(
     DatabaseError when it cannot be used, or has neither matches nor descriptors.
     """
     start = time.perf_counter()
-    workspace, source = context.workspace, foreign.path
+    workspace = context.workspace
+    source = foreign.path
     foreign.check()
     workspace.require_own(foreign.image_path)
     digest = foreign.digest()

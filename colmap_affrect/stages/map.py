@@ -86,8 +86,10 @@ def _models_before(sparse_path: Path, summaries: Sequence[ModelSummary]) -> list
 
 def _task(context: Context, extend: Extension | None, before: Sequence[MappedModel]) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
-    workspace, by_hand = context.workspace, context.by_hand
-    copied, path = workspace.is_foreign, workspace.database
+    workspace = context.workspace
+    by_hand = context.by_hand
+    copied = workspace.is_foreign
+    path = workspace.database
     workspace.mapped_database.unlink(missing_ok=True)
     tie_points: Mapping[str, Mapping[str, int]] = {}
     if by_hand != NOTHING:

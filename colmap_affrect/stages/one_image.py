@@ -83,7 +83,8 @@ class ImageExtractor:
             if not lacks_memory(error):
                 raise
             return ImageError(f"{path}: {MEMORY_HINT}")
-        size, expected = found.image_size, task.camera_size
+        size = found.image_size
+        expected = task.camera_size
         if expected and expected != size:
             return ImageError(
                 f"{path}: is {size[0]} x {size[1]} px, and its camera in the database "
@@ -206,7 +207,8 @@ def prepare(
     weights = resolve(keys, resources.weights_path, progress=progress)
     uses_network = any(level.uses_networks for level in options.levels)
     device = resources.require_device(uses_network=uses_network)
-    network, depth = NetworkContext(weights, device), None
+    network = NetworkContext(weights, device)
+    depth = None
     extractor = cache(lambda features: EXTRACTORS.make(features, network))
     extractors = {k: extractor(level.features) for k, level in levels.items()}
     if options.uses_depth:
@@ -216,7 +218,8 @@ def prepare(
     shapes = cache(lambda source, features: SHAPES.make(source, network, features))
 
     def rectifier(level: Level) -> Rectifier:
-        item, source = level.rectifier, None
+        item = level.rectifier
+        source = None
         if isinstance(item, CoverOptions):
             source = shapes(item.shape_source, level.features)
         return RECTIFIERS.make(item, RectifierInputs(source, depth if item.uses_depth else None))

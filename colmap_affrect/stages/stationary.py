@@ -33,7 +33,8 @@ MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
 MIN_SHARE = 0.5  # of the pairs that have a match in a cell
-MIN_PX, MIN_FRAC = 1.0, 0.001
+MIN_PX = 1.0
+MIN_FRAC = 0.001
 """Error of what stands still, px, or part of the longer side if that is more: large photographs are
 shrunk before features are found in them."""
 CONNECTED = 1  # cells by which those are grown that are looked at together
@@ -71,7 +72,8 @@ class StationaryFilter:
 
     def __init__(self, features: FeatureStore, matches: MatchStore) -> None:
         """Name the files; what is known of places is read now."""
-        self._features, self._matches = features, matches
+        self._features = features
+        self._matches = matches
         self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
         kept = matches.note(STATIONARY) or []  # the (N, 2) cells, column and row, by size
         self._places: dict[Size, Mask] = {
@@ -109,7 +111,8 @@ class StationaryFilter:
 
         A call that was killed may have dropped some: what it found is on record and counts too.
         """
-        found, idle = self._find(pairs), ""
+        found = self._find(pairs)
+        idle = ""
         for size, places in found.items():
             if not places.still.any():
                 continue
@@ -158,7 +161,8 @@ class StationaryFilter:
             likely &= images[size].sum(2) >= MIN_NUM_IMAGES
             if likely.any():
                 exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
-                num_likely, num_matched = likely.sum(), (counts >= MIN_NUM_PAIRS).sum()
+                num_likely = likely.sum()
+                num_matched = (counts >= MIN_NUM_PAIRS).sum()
                 is_most = bool(num_likely > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
                 places[size] = _Places(likely & exact, is_most)
         return places
@@ -186,7 +190,8 @@ class StationaryFilter:
 
     def _moves_elsewhere(self, pairs: Sequence[Pair], size: Size, places: Mask) -> bool:
         """Tell whether enough matches of some pairs move together outside of places."""
-        num_pairs, names = 0, set[str]()
+        num_pairs = 0
+        names = set[str]()
         for found in self._matches.read([p for p in pairs if self._common_size(p) == size]):
             are_still, first, second = self._still(found.names, found.indices, size)
             are_moving = ~(are_still | _at(places, first) | _at(places, second))

@@ -112,7 +112,8 @@ def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
     assert (done.code, done.stderr) == (0, [])
     path = tmp_path / "copy.toml"
     path.write_text(done.stdout)
-    copy, original = load_recipe(str(path)), load_recipe("on-demand")
+    copy = load_recipe(str(path))
+    original = load_recipe("on-demand")
     assert (copy.extraction, copy.matching) == (original.extraction, original.matching)
     assert "# Radius r of a covering ball as a tilt ratio. Paper: 1.7.\ntilt_radius" in done.stdout
 
@@ -387,7 +388,8 @@ def test_what_is_printed_may_end_early() -> None:
 def test_finished_model_is_extended_and_another_database_mapped(
     photos: Path, tmp_path: Path, call: Call
 ) -> None:
-    first, out = tmp_path / "first", tmp_path / "out"
+    first = tmp_path / "first"
+    out = tmp_path / "out"
     listed = tmp_path / "names.txt"
     names = sorted(str(p.relative_to(photos)) for p in photos.rglob("*.png"))
     listed.write_text("\n".join(names[:2]))

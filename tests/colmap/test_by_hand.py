@@ -145,7 +145,8 @@ def test_the_copy_lacks_rejected_pairs_and_those_of_images_left_out(
 
 
 def test_marks_are_triangulated_where_they_are_in_space() -> None:
-    place, model = np.array([0.4, -0.3, 5.0]), pycolmap.Reconstruction()
+    place = np.array([0.4, -0.3, 5.0])
+    model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
     camera.params = [500.0, 300.0, 250.0, 0.1]
     model.add_camera_with_trivial_rig(camera)

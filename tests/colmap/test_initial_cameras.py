@@ -19,7 +19,8 @@ from colmap_affrect.images.photographs import CameraOptions
 WIDE = {**BODY, "FocalLengthIn35mmFilm": 28}
 LONG = {**BODY, "FocalLengthIn35mmFilm": 80}
 DIAGONAL = (90**2 + 60**2) ** 0.5
-WIDE_PX, LONG_PX = 28 / 43.27 * DIAGONAL, 80 / 43.27 * DIAGONAL
+WIDE_PX = 28 / 43.27 * DIAGONAL
+LONG_PX = 80 / 43.27 * DIAGONAL
 
 
 @pytest.fixture
@@ -266,7 +267,8 @@ def test_intrinsics_before_the_import_are_those_of_the_database(
 def test_records_are_kept_and_follow_the_images_that_come_later(
     photos: Path, tmp_path: Path
 ) -> None:
-    path, records_path = tmp_path / "a.db", tmp_path / "cameras.json"
+    path = tmp_path / "a.db"
+    records_path = tmp_path / "cameras.json"
     initial = InitialCameras(photos, CameraOptions())
     imported(path, photos, NAMES[:1])
     record_cameras(read_cameras(path), records_path, initial)
@@ -303,7 +305,8 @@ def test_lens_in_mm_is_on_record_where_nothing_tells_the_size_of_the_sensor(tmp_
 def test_cameras_of_another_program_are_given_where_they_are_flagged(
     photos: Path, tmp_path: Path
 ) -> None:
-    path, records_path = tmp_path / "a.db", tmp_path / "cameras.json"
+    path = tmp_path / "a.db"
+    records_path = tmp_path / "cameras.json"
     options = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params="71,72,44,31")
     with open_database(path):
         pass

@@ -131,7 +131,8 @@ def patched(folder: Path) -> list[Path]:
             shutil.copy(source, paths[-1])
         elif not line.startswith(("---", "+", "@@")) and after.startswith("+"):
             text = paths[-1].read_text(encoding="utf-8")
-            old, new = line[1:], after[1:]
+            old = line[1:]
+            new = after[1:]
             assert text.count(old) == 1, old
             kept = f"{old}\n" if line.startswith(" ") else ""
             paths[-1].write_text(text.replace(old, kept + new), encoding="utf-8")

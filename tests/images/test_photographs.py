@@ -88,7 +88,8 @@ def test_masks_are_found_as_colmap_finds_them(tmp_path: Path, mask_name: str) ->
 
 
 def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
-    one, other = diagonal_mask((60, 50)), diagonal_mask((60, 50))[:, ::-1]
+    one = diagonal_mask((60, 50))
+    other = diagonal_mask((60, 50))[:, ::-1]
     write_mask(tmp_path / "masks" / "x.png", one)
     write_mask(tmp_path / "camera.png", other)
     masks = MaskOptions(path=str(tmp_path / "masks"), camera_path=str(tmp_path / "camera.png"))
@@ -207,7 +208,8 @@ def test_videos_are_named_with_what_to_do(photo_path: Path) -> None:
 
 
 def test_linked_folders_are_followed_and_each_folder_is_taken_once(tmp_path: Path) -> None:
-    photos, other = tmp_path / "photos", tmp_path / "other"
+    photos = tmp_path / "photos"
+    other = tmp_path / "other"
     touch(photos, "a.png", "side/b.png")
     touch(other, "c.png", "deep/d.png")
     (photos / "0 side again").symlink_to(photos / "side")

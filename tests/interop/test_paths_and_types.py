@@ -37,7 +37,8 @@ TAKING_PATHS: dict[str, Callable[[Any, Any], object]] = {
 
 @pytest.mark.parametrize("name", TAKING_PATHS)
 def test_paths_are_text_too_and_bytes_are_refused_in_words(name: str, tmp_path: Path) -> None:
-    missing, out = str(tmp_path / "missing"), str(tmp_path / "out")
+    missing = str(tmp_path / "missing")
+    out = str(tmp_path / "out")
     with pytest.raises(AffrectError, match="missing"):
         TAKING_PATHS[name](missing, out)
     with pytest.raises(

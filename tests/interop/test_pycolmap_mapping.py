@@ -62,7 +62,8 @@ def test_models_are_written_as_by_pycolmap_and_callbacks_called(
     assert list(models) == [0]
     assert len(registered(models[0])) == NUM_IMAGES
     assert registered(pycolmap.Reconstruction(tmp_path / "0")) == registered(models[0])
-    token, other = pycolmap.CancellationToken(), tmp_path / "other"
+    token = pycolmap.CancellationToken()
+    other = tmp_path / "other"
     with pytest.raises(InterruptedError):
         colmap_affrect.incremental_mapping(
             database, "", other, next_image_callback=token.cancel, cancellation_token=token
@@ -129,7 +130,8 @@ def test_verify_and_mapping_take_keypoints_of_any_columns(tmp_path: Path, num_co
 
 
 def test_verify_takes_a_list_of_pairs(tmp_path: Path) -> None:
-    path, listed = tmp_path / "database.db", tmp_path / "pairs.txt"
+    path = tmp_path / "database.db"
+    listed = tmp_path / "pairs.txt"
     names = synthesize(path, verified=False)
     listed.write_text(f"{names[2]} {names[0]}\n{names[1]} {names[3]}\n")
     colmap_affrect.verify_matches(path, listed)
@@ -160,7 +162,8 @@ def content(folder: Path) -> dict[str, bytes]:
 def test_database_of_any_program_is_mapped_in_a_copy(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    source, out = tmp_path / "source", tmp_path / "out"
+    source = tmp_path / "source"
+    out = tmp_path / "out"
     source.mkdir()
     names = synthesize(source / "any.db", 4)
     before = content(source)

@@ -186,7 +186,8 @@ def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_le
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A call that does not look whether it is cancelled is left, and goes on for a moment."""
-    path, removed = tmp_path / "database.db", shutil.rmtree
+    path = tmp_path / "database.db"
+    removed = shutil.rmtree
     synthesize(path, num_rigs=2, num_points3D=50)
 
     def remove_while_a_file_is_made(folder: Path) -> None:

@@ -147,7 +147,8 @@ def enlarged(model: pycolmap.Reconstruction, factor: float) -> pycolmap.Reconstr
 
 
 def lowest_agreement(graph: PairGraph, model: pycolmap.Reconstruction) -> float:
-    poses, cameras = poses_of(model), cameras_of(model)
+    poses = poses_of(model)
+    cameras = cameras_of(model)
     return min(graph.agreement(pair, poses, cameras) for pair in graph.pairs)
 
 

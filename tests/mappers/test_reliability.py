@@ -162,7 +162,8 @@ def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(tmp_path: Pa
 def test_camera_that_only_turned(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     first = mapped.reconstruction.images[min(mapped.reconstruction.reg_image_ids())]
-    pose, rng = first.cam_from_world(), np.random.default_rng(3)
+    pose = first.cam_from_world()
+    rng = np.random.default_rng(3)
 
     def turned(image: pycolmap.Image) -> np.ndarray:
         matrix = pycolmap.Rotation3d(rng.uniform(-0.15, 0.15, 3)).matrix()
@@ -219,7 +220,9 @@ def test_mirrored_copy_is_told_from_the_photograph(tmp_path: Path) -> None:
 
 
 def test_dense_keypoints_are_no_mirrored_copies() -> None:
-    rng, size, smaller = np.random.default_rng(2), (320, 240), (256, 192)
+    rng = np.random.default_rng(2)
+    size = (320, 240)
+    smaller = (256, 192)
     few, many, others = (rng.uniform(0, size, (number, 2)) for number in (900, 12000, 12000))
     assert mirrored_share(many, others, (size, size)) < 0.3
     assert mirrored_share(many, many, (size, size)) < 0.3
@@ -234,8 +237,10 @@ def test_dense_keypoints_are_no_mirrored_copies() -> None:
         assert mirrored_share(fewer, few, (smaller, size)) > 0.9
 
 
-NUM_IMAGES, STEP_DEG = 5, 30.0
-DISTANCE, NOISE_PX = 6.0, 0.3
+NUM_IMAGES = 5
+STEP_DEG = 30.0
+DISTANCE = 6.0
+NOISE_PX = 0.3
 
 
 def ring(folder: Path, views_per_point: int) -> tuple[MappedModel, MappingTask]:

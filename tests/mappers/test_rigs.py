@@ -184,7 +184,8 @@ class Step:
 )
 def test_trial_ends_once_its_cost_tells_enough(changes: list[float], num_steps: int) -> None:
     early_stop = EarlyStop(other_cost=100.0, enough=2.0, max_iterations=100)
-    cost, taken = 1100.0 if num_steps == 3 else 1050.0, 0
+    cost = 1100.0 if num_steps == 3 else 1050.0
+    taken = 0
     for number, change in enumerate(changes, 1):
         cost -= change
         taken += 1

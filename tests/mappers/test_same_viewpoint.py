@@ -15,7 +15,8 @@ from colmap_affrect.geometry.affine import project
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 
-WIDTH, HEIGHT = 480, 320
+WIDTH = 480
+HEIGHT = 320
 PRINT = np.array([[0.55, -0.01, 130.0], [0.01, 0.55, 40.0], [0.0, 0.0, 1.0]])
 TURNED = np.array([[0.9, 0.05, 10.0], [-0.02, 0.95, 8.0], [5e-4, 0.0, 1.0]])
 """Px of the photograph to those of its print and of another view, the corner of each at (0, 0)."""
@@ -29,7 +30,8 @@ def texture(seed: int) -> np.ndarray:
 def printed(photograph: np.ndarray, homography: np.ndarray = PRINT) -> np.ndarray:
     """A print on white paper, of half the contrast."""
     centres = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
-    moved, faded = centres @ homography @ np.linalg.inv(centres), 0.5 * photograph + 60
+    moved = centres @ homography @ np.linalg.inv(centres)
+    faded = 0.5 * photograph + 60
     return np.asarray(cv2.warpPerspective(faded, moved, (WIDTH, HEIGHT), borderValue=250.0))
 
 

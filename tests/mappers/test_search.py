@@ -36,7 +36,9 @@ from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.sparse import OWN_CAMERAS
 
-TRUE_FOCAL, SIZE, NUM_IMAGES = 1280.0, (1024, 768), 4
+TRUE_FOCAL = 1280.0
+SIZE = (1024, 768)
+NUM_IMAGES = 4
 NOISE_PX = 0.5
 UNKNOWN = CameraRecord(("a",), "guess", 1000.0, size=SIZE)
 Scene = tuple[Path, pycolmap.Reconstruction]
@@ -195,7 +197,8 @@ def test_an_adjustment_of_some_images_holds_cameras_that_others_share(tmp_path: 
     model = write_shared(tmp_path / "database.db", TRUE_FOCAL, 150)
     (camera,) = model.cameras.values()
     widen(model, 1.05)
-    before, some = camera.params.tolist(), sorted(model.reg_image_ids())[:3]
+    before = camera.params.tolist()
+    some = sorted(model.reg_image_ids())[:3]
     adjuster(model, FocalPrior(TRUE_FOCAL, USUAL_SIGMA)).adjust(model, FINAL, some)
     assert camera.params.tolist() == before
 
@@ -301,7 +304,8 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
     with open_database(path) as both:
         with open_database(parts[0]) as one, open_database(parts[1]) as other:
             pycolmap.Database.merge(one, other, both)
-        images, middle = both.read_all_images(), np.array(SIZE) / 2
+        images = both.read_all_images()
+        middle = np.array(SIZE) / 2
         enlarged = min(image.image_id for image in images if image.name.startswith("4/"))
         keypoints = both.read_keypoints(enlarged)
         keypoints[:, :2] = (keypoints[:, :2] - middle) * 1.7 + middle

@@ -116,7 +116,8 @@ class KillsOneWorker(Progress):
         del count
         if self.lost_tasks:
             return
-        there, doing = self._client.has_what(), self._client.processing()
+        there = self._client.has_what()
+        doing = self._client.processing()
         tasks = {worker: [*there[worker], *doing[worker]] for worker in there}
         victim = max(tasks, key=lambda worker: len(tasks[worker]))
         self.lost_tasks = tasks[victim]
@@ -152,7 +153,8 @@ def test_cluster_that_is_lost_ends_the_run_in_one_line(
     for name, seconds in (("SILENT_S", 3.0), ("WARN_AFTER_S", 0.5), ("GIVE_UP_AFTER_S", 3.0)):
         monkeypatch.setattr(cluster_watch, name, seconds)
     with started(tmp_path, 1) as (address, processes):
-        start, found = time.monotonic(), 0
+        start = time.monotonic()
+        found = 0
 
         def work() -> None:
             nonlocal found

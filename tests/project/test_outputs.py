@@ -92,7 +92,8 @@ def test_nothing_is_made_beside_the_models_of_a_run(tmp_path: Path) -> None:
 
 
 def test_among_photographs_only_work_folders_are_written(tmp_path: Path) -> None:
-    photographs, names = tmp_path / "photographs", ["a.png", "side/b.png", "../c.png"]
+    photographs = tmp_path / "photographs"
+    names = ["a.png", "side/b.png", "../c.png"]
     for name in names[:2]:
         (photographs / name).parent.mkdir(parents=True, exist_ok=True)
         (photographs / name).touch()

@@ -82,7 +82,8 @@ def test_full_device_is_one_line_and_loses_nothing(
 @pytest.mark.long
 def test_nothing_is_left_in_the_folder_for_temporary_files(tmp_path: Path) -> None:
     """COLMAP would leave logs there, of the warning that an orientation is odd, for one."""
-    (folder := tmp_path / "temporary").mkdir()
+    folder = tmp_path / "temporary"
+    folder.mkdir()
     (tmp_path / "photos").mkdir()
     for name in ("a.tif", "b.tif"):
         write_turned(tmp_path / "photos" / name)
@@ -331,7 +332,8 @@ def test_file_that_cannot_be_read_is_not_called_damaged(number: int) -> None:
 def test_folder_that_cannot_be_removed_is_named_with_its_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (folder := tmp_path / "sparse").mkdir()
+    folder = tmp_path / "sparse"
+    folder.mkdir()
 
     def refuse(_: Path) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "images.bin")

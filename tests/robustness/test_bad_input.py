@@ -167,7 +167,8 @@ def test_bad_images_are_named_and_the_others_registered(
         folder.chmod(0o755)
     assert state() == before
     extraction = ended.report["stages"][0]
-    failures, warnings = extraction["failures"], extraction["warnings"]
+    failures = extraction["failures"]
+    warnings = extraction["warnings"]
     # Decoders differ in what they make of data that ends early.
     assert set(failures) >= FAILING >= set(failures) - {"half.jpg", "half.png", "noise.jpg"}
     for kind, name in FORMATS.items():

@@ -69,7 +69,8 @@ def test_damaged_file_is_mended_or_named(
     scene: Path, expected: dict[str, Any], tmp_path: Path, call: Call, number: int
 ) -> None:
     chance = random.Random(f"damage {number}")
-    name, command = FILES[number % len(FILES)], chance.choice(READERS)
+    name = FILES[number % len(FILES)]
+    command = chance.choice(READERS)
     out = Path(shutil.copytree(scene / "out", tmp_path / "out"))
     done = damage(out / name, chance, others=[scene / "out" / other for other in FILES])
     before = tree(out)

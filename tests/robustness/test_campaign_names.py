@@ -81,7 +81,8 @@ def make_world(scene: Path, folder: Path) -> Path:
 
 def rename_image(base: Path, name: str) -> None:
     """Give an image a name in all that exports read, and make a photograph where it leads."""
-    world, path = base.parents[2], Path(os.path.normpath(base / "photos" / name))
+    world = base.parents[2]
+    path = Path(os.path.normpath(base / "photos" / name))
     with suppress(OSError):
         if path.is_relative_to(world) and not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,7 +120,8 @@ def attack_exports(
     base: Path, photograph: str, prepare: Prepare, call: Call, *codes: int
 ) -> list[str]:
     """Call all exports, each into a folder that is prepared; return what went wrong."""
-    world, wrong = base.parents[2], []
+    world = base.parents[2]
+    wrong = []
     for label, (words, result) in exports(base, photograph).items():
         out = base / "outputs" / label.replace(",", " ")
         allowed = prepare(out, result)

@@ -26,9 +26,12 @@ from colmap_affrect.stages.stationary import StationaryFilter
 pytestmark = CAMPAIGN
 
 SIZE = (480, 360)
-FOCAL_PX, DISTANCE, TEXTURE_PX = 700.0, 4.0, 240
+FOCAL_PX = 700.0
+DISTANCE = 4.0
+TEXTURE_PX = 240
 HALF = np.array([0.65, 0.8, 0.65])  # of the box, along its axes
-STEP_DEG, NUM_VIEWS = 12.0, 4
+STEP_DEG = 12.0
+NUM_VIEWS = 4
 CAMERA = [
     "--camera-mode", "single", "--camera-model", "PINHOLE",
     "--camera-params", f"{FOCAL_PX},{FOCAL_PX},{SIZE[0] / 2},{SIZE[1] / 2}",
@@ -38,7 +41,8 @@ KEEP_ALL = ["--set", "matching.filter_stationary_matches=false"]
 
 def turn(degrees: float) -> NDArray[np.float64]:
     """Return the rotation about the upright axis."""
-    cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    cosine = np.cos(np.deg2rad(degrees))
+    sine = np.sin(np.deg2rad(degrees))
     return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
 
@@ -70,7 +74,8 @@ def write_views(folder: Path, behind: NDArray[np.uint8]) -> Words:
 
 
 def test_box_before_a_still_camera_is_registered_by_what_turns(tmp_path: Path, call: Call) -> None:
-    words, out = write_views(tmp_path / "photos", texture(SIZE, 7)), tmp_path / "out"
+    words = write_views(tmp_path / "photos", texture(SIZE, 7))
+    out = tmp_path / "out"
     done = call(*words, "--output-path", out, "--json", "-q")
     assert done.code == 0, done
     assert len(done.report["registered_names"]) == NUM_VIEWS
@@ -85,11 +90,13 @@ def test_box_before_a_still_camera_is_registered_by_what_turns(tmp_path: Path, c
 
 def test_camera_that_goes_round_a_box_loses_no_match(tmp_path: Path, call: Call) -> None:
     plain = np.full(SIZE[::-1], 128, np.uint8)
-    words, workspace = write_views(tmp_path / "photos", plain), Workspace(tmp_path / "out")
+    words = write_views(tmp_path / "photos", plain)
+    workspace = Workspace(tmp_path / "out")
     done = call(*words, *KEEP_ALL, "--output-path", workspace.path, "--json", "-q")
     assert done.code == 0, done
     assert len(done.report["registered_names"]) == NUM_VIEWS
-    matches, before = MatchStore(workspace.matches), hdf5_content(workspace.matches)
+    matches = MatchStore(workspace.matches)
+    before = hdf5_content(workspace.matches)
     pairs = list(combinations(done.report["registered_names"], 2))
     assert StationaryFilter(FeatureStore(workspace.features), matches).learn(pairs) == ""
     assert hdf5_content(workspace.matches) == before

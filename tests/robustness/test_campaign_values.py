@@ -55,7 +55,8 @@ def test_database_that_contradicts_itself_is_mapped_or_named(
     scene: Path, tmp_path: Path, call: Call, number: int
 ) -> None:
     chance = random.Random(f"contradict {number}")
-    path, out = Path(shutil.copy(scene / "any.db", tmp_path / "any.db")), tmp_path / "out"
+    path = Path(shutil.copy(scene / "any.db", tmp_path / "any.db"))
+    out = tmp_path / "out"
     done = contradict(path, chance)
     before = path.read_bytes()
     for words in (
@@ -77,7 +78,8 @@ def test_database_that_contradicts_itself_is_mapped_or_named(
 def test_model_that_nothing_can_be_computed_with_is_named(
     scene: Path, tmp_path: Path, call: Call, what: str, value: str
 ) -> None:
-    model, odd = pycolmap.Reconstruction(scene / "plain"), float(value)
+    model = pycolmap.Reconstruction(scene / "plain")
+    odd = float(value)
     first, second = [model.image(image_id) for image_id in sorted(model.reg_image_ids())[:2]]
     if what == "pose":
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), [odd, 0.0, 0.0])
@@ -91,7 +93,8 @@ def test_model_that_nothing_can_be_computed_with_is_named(
     else:
         for frame_id in list(model.reg_frame_ids()):
             model.deregister_frame(frame_id)
-    (folder := tmp_path / "model").mkdir()
+    folder = tmp_path / "model"
+    folder.mkdir()
     model.write(folder)
     given = ["--model-path", folder, "--output-path", tmp_path / "new"]
     out = ["--output-path", tmp_path / "out", "--extend", folder, "-q"]

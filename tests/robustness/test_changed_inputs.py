@@ -42,7 +42,8 @@ def repaint(path: Path) -> None:
 def same_size_and_time(scene: Path) -> None:
     """As programs do that keep the time of what they change."""
     path = scene / "photos" / FIRST
-    before, there = path.read_bytes(), path.stat()
+    before = path.read_bytes()
+    there = path.stat()
     write_image(path, photograph((0.3, 0.1, 0.0), 4.0))
     path.write_bytes(path.read_bytes()[: len(before)].ljust(len(before), b"\0"))
     os.utime(path, ns=(there.st_atime_ns, there.st_mtime_ns))

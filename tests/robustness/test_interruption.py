@@ -76,9 +76,11 @@ class Case:
     @cached_property
     def calls(self) -> dict[str, list[int]]:
         """For each kind of call that changes files of the run, which ones of its thread do so."""
-        out, trace = self.folder / "traced", self.folder / "trace.txt"
+        out = self.folder / "traced"
+        trace = self.folder / "trace.txt"
         run_traced(["-y", "-s", "0", "-o", trace], self.arguments(out))
-        counts, found = Counter[tuple[str, str]](), defaultdict[str, list[int]](list)
+        counts = Counter[tuple[str, str]]()
+        found = defaultdict[str, list[int]](list)
         for line in trace.read_text(encoding="utf-8", errors="replace").splitlines():
             if called := re.match(r"(\d+) +(\w+)[(]", line):
                 counts[called[1], called[2]] += 1
@@ -187,7 +189,9 @@ def cases(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Case]:
 def test_runs_ended_again_and_again_have_the_results_of_an_undisturbed_one(
     cases: list[Case], tmp_path: Path, number: int
 ) -> None:
-    case, chance, out = cases[number % 2], random.Random(number), tmp_path / "out"
+    case = cases[number % 2]
+    chance = random.Random(number)
+    out = tmp_path / "out"
     for index, sent in enumerate(SIGNALS):
         # What is done stays done: later runs are nearer to their end.
         delay_s = chance.uniform(0.0, case.worked_s / (index + 1))
@@ -203,7 +207,10 @@ def test_runs_ended_again_and_again_have_the_results_of_an_undisturbed_one(
 def test_runs_killed_when_they_enter_a_system_call_lose_nothing(
     cases: list[Case], tmp_path: Path, number: int
 ) -> None:
-    case, chance, out, code = cases[number % 2], random.Random(number), tmp_path / "out", 0
+    case = cases[number % 2]
+    chance = random.Random(number)
+    out = tmp_path / "out"
+    code = 0
     while not code:
         shutil.rmtree(out, ignore_errors=True)
         kind = chance.choice(sorted(case.calls))
@@ -224,7 +231,8 @@ def mounted(*command: object) -> bool:
 def test_runs_on_full_disks_go_on_when_these_have_grown(
     cases: list[Case], tmp_path: Path, number: int
 ) -> None:
-    case, disk = cases[number % 2], tmp_path / "disk"
+    case = cases[number % 2]
+    disk = tmp_path / "disk"
     assert case.worked_s
     needed = sum(p.stat().st_size for p in (case.folder / "out").rglob("*") if p.is_file())
     num_kib = random.Random(number).randrange(8, needed // 1024)
@@ -265,7 +273,9 @@ def assert_says_what_to_do(ended: Ended, path: Path) -> None:
 def test_hdf5_write_that_fails_loses_nothing_else(
     cases: list[Case], tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, passing: int
 ) -> None:
-    workspace, calls, commit = Workspace(tmp_path / "out"), [], FileTransaction.commit
+    workspace = Workspace(tmp_path / "out")
+    calls = []
+    commit = FileTransaction.commit
 
     def full(changes: FileTransaction) -> None:
         calls.append(changes)

@@ -33,7 +33,8 @@ from colmap_affrect.stages import match, one_image
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.one_image import num_images_at_once, prepare
 
-WIDTH, HEIGHT = 480, 360
+WIDTH = 480
+HEIGHT = 360
 GRID = np.stack(np.meshgrid(np.arange(30, WIDTH - 20, 45), np.arange(30, HEIGHT - 20, 45)), -1)
 BLOBS = GRID.reshape(-1, 2) + np.random.default_rng(5).uniform(-2, 2, (GRID.size // 2, 2))
 BLOB_SIGMA_PX = 5.2
@@ -95,7 +96,8 @@ DEPTH = ["depth.kind=z", "max_image_size_px=360"]
 
 def courtyard(tmp_path: Path, num_maps: int) -> tuple[Path, Path]:
     """Two photographs and the depth maps of some of them."""
-    photos, depth = tmp_path / "photos", tmp_path / "depth"
+    photos = tmp_path / "photos"
+    depth = tmp_path / "depth"
     photos.mkdir()
     depth.mkdir()
     for name in ["court_3", "court_4"]:

@@ -149,8 +149,10 @@ def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from
 def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     workspace, report = finished
     command = ("colmap-affrect", "run", "--image-path", "a b", "--output-path", "out", "-q")
-    context, (model, *_) = Context(workspace, command=command), report.models
-    lost, wanted = NAMES[0], str(workspace.path.with_name(f"{workspace.path.name}-2"))
+    context = Context(workspace, command=command)
+    (model, *_) = report.models
+    lost = NAMES[0]
+    wanted = str(workspace.path.with_name(f"{workspace.path.name}-2"))
 
     monkeypatch.setattr(Workspace, "recipe", lambda _: "rectified")
 
@@ -230,7 +232,8 @@ def test_image_whose_features_are_lost_gets_the_same_again(
 def test_other_options_than_before_are_named(copy: Workspace, photos: Path, call: Call) -> None:
     out = ["--output-path", copy.path]
     images = ["--image-path", photos]
-    cameras, seed = CAMERA_ARGUMENTS, ["--random-seed", 3]
+    cameras = CAMERA_ARGUMENTS
+    seed = ["--random-seed", 3]
     before = {path: path.read_bytes() for path in (copy.features, copy.matches, copy.config)}
     cases = [
         (["run", *images, *seed], "cameras.mode"),
@@ -272,7 +275,8 @@ def test_options_survive_stage_by_stage(
     for stage in ("pairs", "match", "verify", "map"):
         ended = call(stage, "--output-path", out)
         assert ended.code == 0, ended.errors
-    workspace, now = Workspace(out), Workspace(out)
+    workspace = Workspace(out)
+    now = Workspace(out)
     assert workspace.require("match")["max_ratio"] == 0.8
     assert workspace.require("map")["init_min_num_inliers"] == 40
     changed = call("match", "--output-path", out, "--set", "matching.max_ratio=0.7", "--overwrite")
