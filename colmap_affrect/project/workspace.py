@@ -17,6 +17,7 @@ from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.record import (
     MADE_FROM,
+    OF_DATABASE,
     STAGES,
     WEIGHTS,
     first_difference,
@@ -280,10 +281,12 @@ class Workspace:
             outputs.remove_own(self._results(stage))
             begun = self._begun_before(stage)
             record = record if begun else {}
-        if stage in begun and (why := first_difference(record[stage], options)):
-            raise ConflictError(
-                f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
-            )
+        if stage in begun:
+            why = first_difference(record[stage], options, OF_DATABASE.get(stage, ()))
+            if why:
+                raise ConflictError(
+                    f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
+                )
         begun = [name for name in STAGES if name in begun or name == stage]
         later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
         changed = {**record, **later, stage: dict(options), "begun": begun}

@@ -25,7 +25,7 @@ from colmap_affrect.images.photographs import (
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.options import EffortName, Options
+from colmap_affrect.options import EffortName, Options, digest_of
 from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
@@ -91,15 +91,30 @@ class Inputs(Options):
     def contents(
         self, names: Iterable[str], options: ExtractionOptions, known: Mapping[str, Content]
     ) -> dict[str, Content]:
-        """Return what the files of images hold, read where it may not be what is ``known``."""
+        """Return what the files of images hold, read where it may not be what is ``known``.
+
+        Warps by depth depend on cameras, too; no other features do.
+        """
         found = {}
+        cameras = ""
+        if options.uses_depth and self.cameras != CameraOptions():
+            cameras = digest_of(self.cameras.to_mapping())
         for name in names:
             files = self.photographs.files(name)
             if options.uses_depth:
                 depth = options.depth.file(name)
                 files += [*([depth] if depth else []), *self.camera_files]
-            found[name] = content_of(files, known.get(name))
+            found[name] = content_of(files, known.get(name), cameras)
         return found
+
+    def cameras_digest(self) -> str:
+        """Return a digest of all that says which cameras images have, empty where nothing does."""
+        files = content_of(self.camera_files).digest
+        if self.cameras == CameraOptions():
+            return files
+        # A table or a model may lie elsewhere: what it holds is in the digest of the files.
+        options = self.cameras.changed(cameras_path="").to_mapping()
+        return digest_of([files, options])
 
     @property
     def camera_files(self) -> list[Path]:
