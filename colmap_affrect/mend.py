@@ -67,16 +67,17 @@ def watched(
         yield
     except AffrectError:
         if path.exists() and not damage_of(path):  # else it is looked through next time
-            _seal(workspace)
+            _seal(context)
         raise
-    _seal(workspace)
+    _seal(context)
 
 
-def _seal(workspace: Workspace) -> None:
+def _seal(context: Context) -> None:
+    workspace = context.workspace
     path = workspace.database
     if path.exists() and workspace.begun:
         with suppress(AffrectError):  # one that is not sealed is looked through next time
-            replace_text(workspace.seal, f"{rows_digest(path)}\n{_stamp(path)}\n")
+            replace_text(workspace.seal, f"{context.graph.digest()}\n{_stamp(path)}\n")
 
 
 def _stamp(path: Path) -> str:

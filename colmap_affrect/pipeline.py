@@ -120,7 +120,11 @@ def _run(
     resolve(recipe.required_weights, weights_path, progress=context.progress)
     load_matchers(context, recipe.extraction, recipe.matching)
     later = options.later_stages()
-    with workspace.locked(), watched(context, follows=False, discards=overwrite):
+    with (
+        workspace.locked(),
+        watched(context, follows=False, discards=overwrite),
+        context.graph.kept_open(),
+    ):
         reports = [
             extract_features(context, inputs, recipe, later=later, overwrite=overwrite),
             list_pairs(context, options.pairs),
@@ -181,6 +185,7 @@ def one_stage(name: str, context: Context, *, overwrite: bool = False) -> Iterat
     with (
         context.workspace.locked(),
         watched(context, follows=not is_first, maps=name == "map", discards=discards),
+        context.graph.kept_open(),
     ):
         yield context
 
@@ -439,7 +444,7 @@ def map_and_report(
     options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
-    sizes = read_sizes(workspace.database)
+    sizes = {name: (one.width, one.height) for name, one in context.graph.cameras.items()}
     marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
@@ -477,7 +482,8 @@ def map_and_report(
     replace_text(workspace.report, result.to_json())
     if page:
         pictures = draw_pairs_to_check(context, result, pair_inliers)
-        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures)
+        cameras = context.graph.cameras
+        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures, cameras)
         write_run_page(workspace, result, content, context.progress)
     return result
 

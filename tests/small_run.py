@@ -9,6 +9,7 @@ from small_comparison import IMAGE_SIZE, write_scene
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import read_cameras
 from colmap_affrect.project.report import (
     Advice,
     Bridge,
@@ -86,5 +87,6 @@ def make_run_page(folder: Path) -> Path:
         option=f"--reject-pair '{NAMES[0]},{NAMES[1]}'",
         picture=Picture.from_image(np.zeros((450, 900, 3), np.uint8)),
     )
-    content = RunContent(NAMES, pairs, photographs, pairs_to_check=[pair] * 3)
+    cameras = read_cameras(workspace.database)
+    content = RunContent(NAMES, pairs, photographs, pairs_to_check=[pair] * 3, cameras=cameras)
     return write_run_page(workspace, small_report(folder), content)

@@ -6,7 +6,6 @@ It is read anew for every decision, from the stores and the view graph: each ste
 import math
 from collections.abc import Mapping, Sequence
 
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import weakly_connected_images
 from colmap_affrect.escalation import expected_gain
 from colmap_affrect.escalation.expected_gain import PairState
@@ -141,7 +140,7 @@ class SetState:
             return {}
         graph = self.context.graph
         found = dict[Pair, int]()
-        with open_database(graph.path) as database:
+        with graph.reading() as database:
             for pair in pairs:
                 first, second = pair
                 matches = database.read_matches(graph.ids[first], graph.ids[second])

@@ -47,9 +47,7 @@ def stamp_of(paths: Iterable[Path]) -> str:
     return ", ".join(_or_empty(_stamp, path) for path in paths)
 
 
-def content_of(
-    paths: Iterable[Path], known: Content | None = None, options: str = ""
-) -> Content:
+def content_of(paths: Iterable[Path], known: Content | None = None, options: str = "") -> Content:
     """Return what files hold, without reading them if sizes and times are those that are known.
 
     Args:

@@ -18,6 +18,7 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
+from colmap_affrect.session.view_graph import ViewGraph
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
@@ -94,6 +95,7 @@ def _task(context: Context, extend: Extension | None, before: Sequence[MappedMod
     tie_points: Mapping[str, Mapping[str, int]] = {}
     if by_hand != NOTHING:
         path = workspace.mapped_database
+        context.graph.close()  # SQLite's own copy reads it
         tie_points = by_hand.copy_database(workspace.database, path)
     return MappingTask(
         path,
@@ -140,12 +142,13 @@ def _inputs(context: Context, extend: Extension | None) -> str:
     return f"{verified} {'own' if own else extend.digest()}"
 
 
-def agreements(path: Path, model: pycolmap.Reconstruction) -> dict[Pair, float]:
+def agreements(verified: ViewGraph, model: pycolmap.Reconstruction) -> dict[Pair, float]:
     """Return the share of inliers that agrees with a model by verified pair of a database.
 
     The strongest pairs of each photograph in the model count, the lower id of the database first.
     """
-    graph = PairGraph.read(path, 1)
+    with verified.reading() as database:
+        graph = PairGraph.of(database, 1)
     ids = {name: image_id for image_id, name in graph.names.items()}  # the model may have others
     same = {i: ids[image.name] for i, image in model.images.items() if image.name in ids}
     poses = {same[i]: pose for i, pose in poses_of(model).items() if i in same}
