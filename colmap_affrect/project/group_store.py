@@ -1,6 +1,5 @@
 """A HDF5 file of groups that are complete or do not count, which changes as a whole."""
 
-import json
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,18 +60,6 @@ class GroupStore:
                         "another --output-path"
                     )
                 yield file
-
-    def note(self, key: str) -> Any:
-        """Return what is kept with the whole file, as JSON has it; None where nothing is."""
-        if not self.path.exists():
-            return None
-        with self._open("r") as file:
-            return json.loads(file.attrs.get(key, "null"))
-
-    def keep_note(self, key: str, value: Any) -> None:
-        """Keep something with the whole file."""
-        with self._open("a") as file:
-            file.attrs[key] = json.dumps(value)
 
     def check_all(self) -> None:
         """Read all that is there; StoreError if it is damaged."""

@@ -75,7 +75,7 @@ def _or_empty(read: Callable[[Path], str], path: Path) -> str:
 
 Stage = Literal["copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"]
 STAGES: tuple[str, ...] = get_args(Stage)
-FORMAT_VERSION = 11  # counts up when a stage records other options than before
+FORMAT_VERSION = 12  # counts up when a stage records other options than before
 MADE_FROM = "made_from"  # digests of given files, and of the verified pairs that were mapped
 KEYS = ("recipe", "begun", *STAGES, MADE_FROM)
 

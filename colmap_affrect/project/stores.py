@@ -11,7 +11,6 @@ image or one batch of pairs and closed again; what is written in between appears
 (:mod:`colmap_affrect.project.atomic_files`).
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,22 +27,12 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
+from colmap_affrect.project.match_state import STATE_JSON, MatchState, Names, Worth
 from colmap_affrect.project.record import Content, stamp_of
-
-Names = tuple[str, str]  # of a pair of images
 
 MAX_INT16 = 32767
 NOT_KNOWN = Content()
-# Notes of matches:
-STATIONARY = "stationary_cells"  # [size, cells] of the places that never move
-STEP = "step"  # level and pairs of the step of escalation that has begun and not ended
-FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
-IN_VAIN = "all_features_in_vain"  # that list, and whether all features bring no more than some
-CLIMBING = "climbing_list"  # the same, of which there was a model before pairs were matched again
-EFFORT = "effort"  # how much was tried for images in need
-LEARNING = "learning"  # level and pairs of learned matching that is kept beside what is there
-LOOKED_AT = "learned_looked_at"  # what models of learned matches are worth, and of which pairs
-RESTORING = "restoring"  # matches are those of better models before, the models not yet
+STATE = "state"  # attribute of the file of matches
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
@@ -59,9 +48,6 @@ class PairMatches:
     num_keypoints1: int  # number of features of the first image
     level: int = 0  # of escalation, whose features were looked at together with those of level 0
     of_some: bool = False  # only of the features with the largest responses
-
-
-Worth = tuple[int, int]  # inliers; where there are none, how many matches confirm each other
 
 
 @dataclass(frozen=True)
@@ -261,6 +247,19 @@ class MatchStore(GroupStore):
     format = "colmap_affrect/matches"
     stage = "match"
 
+    @property
+    def state(self) -> MatchState:
+        """How far matching and escalation of the whole set have come."""
+        if not self.path.exists():
+            return MatchState()
+        with self._open("r") as file:
+            return _read_state(file)
+
+    def keep(self, **changes: Any) -> None:
+        """Change fields of the state."""
+        with self._open("a") as file:
+            _change_state(file, changes)
+
     def write(
         self,
         pairs: Iterable[PairMatches],
@@ -337,18 +336,17 @@ class MatchStore(GroupStore):
         return found
 
     def choose(
-        self, chosen: Iterable[PairMatches], measured_worths: Mapping[Names, Worth], **notes: Any
+        self, chosen: Iterable[PairMatches], measured_worths: Mapping[Names, Worth], **changes: Any
     ) -> None:
         """Let other matches take the place of those of their pairs, all or none.
 
         Args:
             chosen: matches that are used from now on.
             measured_worths: what the measured matches were worth that were used, by pair.
-            notes: what is kept with the whole file.
+            changes: of the state.
         """
         with self._open("a") as file:
-            for key, value in notes.items():
-                file.attrs[key] = json.dumps(value)
+            _change_state(file, changes)
             for pair in chosen:
                 self._write_pair(file, pair)
             for names, worth in measured_worths.items():
@@ -364,8 +362,7 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, LEARNING, LOOKED_AT, RESTORING):
-                file.attrs.pop(note, None)
+            _write_state(file, _read_state(file).without_pairs())
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
                 is_escalated = group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs
@@ -408,6 +405,18 @@ class MatchStore(GroupStore):
                 if not is_complete(file, key):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
                 yield _read_matches(file[key], (name1, name2))
+
+
+def _read_state(file: h5py.File) -> MatchState:
+    return STATE_JSON.validate_json(file.attrs.get(STATE, "{}"))
+
+
+def _change_state(file: h5py.File, changes: Mapping[str, Any]) -> None:
+    _write_state(file, replace(_read_state(file), **changes))
+
+
+def _write_state(file: h5py.File, state: MatchState) -> None:
+    file.attrs[STATE] = STATE_JSON.dump_json(state).decode()
 
 
 def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatches:

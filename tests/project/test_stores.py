@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import StoreError
+from colmap_affrect.project.match_state import Begun, LookedAt, MatchState
 from colmap_affrect.project.stores import (
     FeatureStore,
     Learned,
@@ -250,11 +251,11 @@ def test_learned_matches_kept_beside_those_in_use_stay_when_these_change(
     assert matches.learned_levels([names]) == {names: 2}
     assert matches.measured_worths([names]) == {names: (0, 5)}
     assert matches.levels([names], "tried") == {names: 0b11001}
-    matches.choose([learned.matches], {names: (3, 0)}, note=[1, "a"])
+    matches.choose([learned.matches], {names: (3, 0)}, follows="sparse.best")
     (used,) = matches.read([names])
     assert (used.level, used.indices.tolist()) == (2, [[4, 7]])
     assert matches.measured_worths([names]) == {names: (3, 0)}
-    assert matches.note("note") == [1, "a"]
+    assert matches.state == MatchState(follows="sparse.best")
 
 
 def test_pairs_without_learned_matches_beside_those_in_use_have_none(matches: MatchStore) -> None:
@@ -263,3 +264,29 @@ def test_pairs_without_learned_matches_beside_those_in_use_have_none(matches: Ma
     assert matches.learned([names]) == {}
     assert matches.learned_levels([names]) == {names: -1}
     assert matches.measured_worths([names]) == {names: (0, 0)}
+
+
+def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
+    matches: MatchStore,
+) -> None:
+    assert matches.state == MatchState()
+    pairs = (("a.png", "b.png"), ("a.png", "c.png"))
+    matches.write([pair_matches(pair, [[0, 0]], 1) for pair in pairs])
+    stationary = (((40, 30), ((1, 2), (3, 4))),)
+    matches.keep(stationary=stationary, effort="high", listed="digest")
+    looked_at = LookedAt("digest", 2.5, is_sure=True, score_without=0.75)
+    matches.keep(step=Begun(1, pairs), has_stepped=True, looked_at=looked_at, in_vain=("a", True))
+    assert matches.state == MatchState(
+        "digest", ("a", True), stationary, effort="high", looked_at=looked_at,
+        step=Begun(1, pairs), has_stepped=True,
+    )  # fmt: skip
+    matches.remove(pairs=pairs[:1])
+    assert matches.state == MatchState(stationary=stationary, effort="high")
+
+
+def test_state_that_is_none_is_damage(matches: MatchStore) -> None:
+    matches.keep(listed="digest")
+    with h5py.File(matches.path, "a") as file:
+        file.attrs["state"] = '{"step": {"level": "all"}}'
+    with pytest.raises(StoreError, match=r"matches\.h5: damaged .*--overwrite"):
+        _ = matches.state
