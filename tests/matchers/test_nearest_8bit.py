@@ -114,9 +114,7 @@ def test_torch_without_the_products_matches_exactly(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "AVX512")
     monkeypatch.setattr("torch.ops.onednn", Namespace(), raising=False)
     has_fast_8_bit_products.cache_clear()
-    matcher = NearestNeighbors(
-        NearestOptions(), MatcherContext(device="cpu", num_comparisons=1e15)
-    )
+    matcher = NearestNeighbors(NearestOptions(), MatcherContext(device="cpu", num_comparisons=1e15))
     has_fast_8_bit_products.cache_clear()
     features = LocalFeatures.empty(128)
     assert matcher.prepare(ImageFeatures(features, (32, 32), "rootsift")).coarse is None
