@@ -25,6 +25,8 @@ MAX_LOG_SPREAD = 0.5  # of focal lengths: farther apart they are no surer parts 
 # A bridge edge between two components may be of two scenes, found by chance among all pairs.
 CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (judged)
 CHANCE_SCALE = 10.0  # inliers more that make the former less likely by a factor of e (judged)
+MAX_ERROR_DEG = 5.0  # of poses that count as right, in BENCHMARKS and in the fit
+MIN_SIGMA_DEG = 1e-3  # of directions; they are divided by
 MIN_LOSS = 0.7  # of the log odds: what takes less, half of the odds, is no reason to doubt
 NUM_REASONS = 2  # that are said of a photograph
 
@@ -197,11 +199,8 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
     coefficients = _coefficients()
     log_odds = coefficients.constant + features.tie_point_log_odds
     odds_of_two_scenes = _odds_of_two_scenes(features)
-    edge = f"the {features.num_bridge_inliers} inliers of {features.bridge_edge}"
-    losses = [
-        _Loss(-features.tie_point_log_odds, "its tie points disagree"),
-        _Loss(math.log1p(odds_of_two_scenes), f"with others it hangs on {edge} alone"),
-    ]
+    share_of_directions = _share_of_directions(features)
+    losses = _other_losses(features)
     mendable = 0.0
     for name, fitted in coefficients.terms.items():
         value = TERMS[name].value(features)
@@ -210,10 +209,22 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
         losses.append(loss)
         if name in OF_MATCHES:
             mendable += max(0.0, loss.log_odds)
-    probability = _probability(log_odds) / (1.0 + odds_of_two_scenes)
-    return Confidence(
-        probability, _main_reasons(losses), _probability(log_odds + mendable) - probability
-    )
+    probability = _probability(log_odds) * share_of_directions / (1.0 + odds_of_two_scenes)
+    with_matches = _probability(log_odds + mendable) * share_of_directions
+    return Confidence(probability, _main_reasons(losses), with_matches - probability)
+
+
+def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
+    """Return what is taken beside the terms of the regression."""
+    losses = [_Loss(-features.tie_point_log_odds, "its tie points disagree")]
+    if features.bridge_edge:
+        odds = _odds_of_two_scenes(features)
+        edge = f"the {features.num_bridge_inliers} inliers of {features.bridge_edge}"
+        losses.append(_Loss(math.log1p(odds), f"with others it hangs on {edge} alone"))
+    if features.direction_sigma_deg:
+        share = _share_of_directions(features)
+        losses.append(_Loss(-math.log(share), _directions_reason(features)))
+    return losses
 
 
 def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:
@@ -221,6 +232,22 @@ def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:
     if not features.bridge_edge:
         return 0.0
     return math.exp((CHANCE_INLIERS - features.num_bridge_inliers) / CHANCE_SCALE)
+
+
+def _share_of_directions(features: ReliabilityFeatures) -> float:
+    """Return the probability that noise moves the directions to others by less than the limit.
+
+    Both angles of a direction are normal, with half of the variance each.
+    """
+    sigma_deg = max(features.direction_sigma_deg, MIN_SIGMA_DEG)
+    return -math.expm1(-((MAX_ERROR_DEG / sigma_deg) ** 2))
+
+
+def _directions_reason(features: ReliabilityFeatures) -> str:
+    return (
+        "it stands so near to others that the direction between them may be off by "
+        f"{features.direction_sigma_deg:.0f} degrees"
+    )
 
 
 def _probability(log_odds: float) -> float:

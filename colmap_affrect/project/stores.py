@@ -32,6 +32,7 @@ from colmap_affrect.project.record import Content, stamp_of
 
 MAX_INT16 = 32767
 NOT_KNOWN = Content()
+PAIRS_PER_WRITE = 64  # a run that is ended loses at most as many
 STATE = "state"  # attribute of the file of matches
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]

@@ -117,19 +117,9 @@ def unmeasured_pairs(context: Context) -> list[Pair]:
     is_measured = [level.features.has_shapes for level in context.extraction.levels]
     if not any(is_measured):
         return []
-    pairs = usable_pairs(context)
+    pairs = context.usable(context.listed_pairs())
     levels = context.matches.levels(pairs)
     return [pair for pair, level in levels.items() if not is_measured[level]]
-
-
-def usable_pairs(context: Context) -> list[Pair]:
-    """Return the listed pairs whose images the database has, but those rejected by hand."""
-    ids = context.graph.ids
-    return [
-        (first, second)
-        for first, second in context.listed_pairs()
-        if first in ids and second in ids and context.by_hand.allows(first, second)
-    ]
 
 
 def _inputs(context: Context, extend: Extension | None) -> str:

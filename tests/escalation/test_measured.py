@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from verified import copy_of, verified
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.expected_gain import Step
-from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import PairMatches, Worth
@@ -33,11 +31,7 @@ strong_num_inliers = 1000000
 """
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _shapeless() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EXTRACTORS.built_in, "shapeless", "shapeless_features:Shapeless")
-        yield
+pytestmark = pytest.mark.usefixtures("shapeless_features_are_known")
 
 
 @pytest.fixture(scope="module")

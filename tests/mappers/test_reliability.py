@@ -139,6 +139,17 @@ def test_a_bridge_edge_counts_by_its_inliers() -> None:
     assert probabilities == pytest.approx([0.12, 0.5, 0.88, 1.0], abs=0.01)
 
 
+def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses() -> None:
+    probabilities = []
+    for sigma_deg in (0.0, 1.0, 3.0, 6.0, 60.0):
+        features = replace(GOOD, direction_sigma_deg=sigma_deg)
+        probabilities.append(confidence(features).probability / confidence(GOOD).probability)
+    assert probabilities == pytest.approx([1.0, 1.0, 0.94, 0.5, 0.007], abs=0.005)
+    at_one_place = confidence(replace(GOOD, direction_sigma_deg=6.0))
+    assert "may be off by 6 degrees" in at_one_place.reason
+    assert at_one_place.gain < 0.1  # more matches do not help
+
+
 def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path, 5)
     ids = sorted(mapped.reconstruction.reg_image_ids())

@@ -21,7 +21,7 @@ from small_run import small_report
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import keypoint_counts, open_database
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.project.report import ModelSummary
@@ -92,6 +92,13 @@ def test_numbers_of_lines_are_bounded_for_inliers_and_the_others(
         assert drawn.count(rgb(COLORS[kind])) == min(num, 200)
 
 
+def num_keypoints(path: Path) -> dict[str, int]:
+    """Keypoints in a database by image."""
+    with open_database(path) as database:
+        images = database.read_all_images()
+        return {i.name: database.num_keypoints_for_image(i.image_id) for i in images}
+
+
 class Stores(SimpleNamespace):
     """Of a run whose odd features are of warps; from number 60 on they have no shapes."""
 
@@ -103,7 +110,7 @@ class Stores(SimpleNamespace):
         super().__init__(
             workspace=SimpleNamespace(sparse=folder / "sparse", begun=begun, is_changed=False),
             extraction=SimpleNamespace(levels=levels),
-            counts=keypoint_counts(folder / "database.db"),
+            counts=num_keypoints(folder / "database.db"),
             features=self,
             matches=self,
         )
