@@ -39,7 +39,7 @@ CHANGED = "was changed since the last run"
 def watched(
     context: Context, *, follows: bool = True, maps: bool = False, discards: bool = False
 ) -> Iterator[None]:
-    """Mend the database before a command works in a folder, and seal it in the end.
+    """Mend the database before a command works in a folder, keep it open, and seal it in the end.
 
     ``follows``: bring it up to the last stage that was run; else the command does that. A command
     that only ``maps`` takes a changed one as it is, with a warning; one that ``discards`` all there
@@ -64,7 +64,8 @@ def watched(
         _make_again(context, why, follows=follows)
     workspace.seal.unlink(missing_ok=True)
     try:
-        yield
+        with context.graph.kept_open():
+            yield
     except AffrectError:
         if path.exists() and not damage_of(path):  # else it is looked through next time
             _seal(context)

@@ -120,11 +120,7 @@ def _run(
     resolve(recipe.required_weights, weights_path, progress=context.progress)
     load_matchers(context, recipe.extraction, recipe.matching)
     later = options.later_stages()
-    with (
-        workspace.locked(),
-        watched(context, follows=False, discards=overwrite),
-        context.graph.kept_open(),
-    ):
+    with workspace.locked(), watched(context, follows=False, discards=overwrite):
         reports = [
             extract_features(context, inputs, recipe, later=later, overwrite=overwrite),
             list_pairs(context, options.pairs),
@@ -185,7 +181,6 @@ def one_stage(name: str, context: Context, *, overwrite: bool = False) -> Iterat
     with (
         context.workspace.locked(),
         watched(context, follows=not is_first, maps=name == "map", discards=discards),
-        context.graph.kept_open(),
     ):
         yield context
 

@@ -26,7 +26,7 @@ from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
+from colmap_affrect.project.group_store import GroupStore, checked, entries_of, has_entry
 from colmap_affrect.project.match_state import STATE_JSON, MatchState, Names, Worth
 from colmap_affrect.project.record import Content, stamp_of
 
@@ -64,7 +64,7 @@ def _entries_of(path: Path, _: str) -> Entries:
     """Go through a file, which takes long, unless that was done when its stamp was the same."""
     found: Entries = {}
     with FeatureStore(path)._open("r") as file:
-        for name, group in complete_groups(file):
+        for name, group in entries_of(file):
             width, height = checked(group, "image_size").tolist()
             found[name] = _content(group), len(group["keypoints"]), (width, height)
     return dict(sorted(found.items()))
@@ -171,7 +171,7 @@ class FeatureStore(GroupStore):
         self._write(file, name, datasets, content=content.digest, stamp=content.stamp)
 
     def read(self, name: str) -> LocalFeatures:
-        """Read all features of one image; StoreError if they are missing or incomplete."""
+        """Read all features of one image; StoreError if they are missing."""
         with self._open("r") as file:
             return self._features(self._group(file, name))
 
@@ -182,7 +182,7 @@ class FeatureStore(GroupStore):
         return np.concatenate([np.arange(part.start, part.stop) for part in parts])
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
-        if not is_complete(file, name):
+        if not has_entry(file, name):
             raise StoreError(f"{self.path}: no features of {name}; run extract first")
         return file[name]
 
@@ -289,7 +289,7 @@ class MatchStore(GroupStore):
         key = pair_key(*pair.names)
         known: dict[str, Any] = {"tried": 0}
         learned = None
-        if is_complete(file, key):
+        if has_entry(file, key):
             known = {name: file[key].attrs[name] for name in KEPT if name in file[key].attrs}
             learned = _read_learned(file[key], pair.names)
         known["tried"] |= 1 << pair.level
@@ -364,18 +364,18 @@ class MatchStore(GroupStore):
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
             _write_state(file, _read_state(file).without_pairs())
-            for key, group in list(complete_groups(file)):
+            for key, group in list(entries_of(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
                 is_escalated = group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs
                 if is_asked or is_escalated:
                     del file[key]
 
     def has(self, pairs: Sequence[Names]) -> Bools:
-        """Return, as (N,) bools, which of N pairs are there and complete."""
+        """Return, as (N,) bools, which of N pairs are there."""
         if not self.path.exists():
             return np.zeros(len(pairs), np.bool_)
         with self._open("r") as file:
-            there = (is_complete(file, pair_key(*pair)) for pair in pairs)
+            there = (has_entry(file, pair_key(*pair)) for pair in pairs)
             return np.fromiter(there, np.bool_, len(pairs))
 
     def nums_of_some(self, pairs: Iterable[Names]) -> dict[Names, int]:
@@ -403,7 +403,7 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             for name1, name2 in pairs:
                 key = pair_key(name1, name2)
-                if not is_complete(file, key):
+                if not has_entry(file, key):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
                 yield _read_matches(file[key], (name1, name2))
 
@@ -466,7 +466,7 @@ class GuidedStore(GroupStore):
             return []
         with self._open("r") as file:
             found = []
-            for _, group in sorted(complete_groups(file), key=lambda item: item[0]):
+            for _, group in sorted(entries_of(file), key=lambda item: item[0]):
                 (first, second) = group.attrs["names"]
                 num = int(group.attrs["num_inliers"])
                 found.append(GuidedPair((str(first), str(second)), checked(group, "exact"), num))

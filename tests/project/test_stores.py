@@ -107,18 +107,16 @@ def test_files_do_not_need_the_newest_hdf5(store: FeatureStore) -> None:
     assert store.path.read_bytes()[8] == 0
 
 
-def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) -> None:
-    for name in NAMES:
-        store.write(name, some_features(4), (4, 3))
-    with h5py.File(store.path, "a") as file:
-        del file[NAMES[1]].attrs["complete"]
-        del file[NAMES[3]].attrs["complete"]
-        del file[NAMES[3]]["descriptors"]
-    assert store.names() == list(store.num_keypoints()) == [NAMES[0], NAMES[2]]
-    with pytest.raises(StoreError, match=r"no features of b c\.png; run extract"):
-        store.read(NAMES[1])
-    store.write(NAMES[3], some_features(6), (4, 3))
-    assert len(store.read(NAMES[3])) == 6
+def test_images_in_folders_with_names_of_datasets_are_told_from_these(store: FeatureStore) -> None:
+    names = ["keypoints/descriptors/a.png", "keypoints/b.png", "z.png"]
+    for count, name in enumerate(names, start=3):
+        store.write(name, some_features(count), (4, 3))
+    assert store.num_keypoints() == dict(zip(sorted(names), (4, 3, 5), strict=True))
+    for absent in ("keypoints", "keypoints/descriptors", "keypoints/a.png"):
+        with pytest.raises(StoreError, match=rf"no features of {absent}; run extract"):
+            store.read(absent)
+    store.remove(names[:1])
+    assert store.names() == names[1:]
 
 
 @pytest.mark.parametrize("access", ["read", "write"])
@@ -132,7 +130,7 @@ def test_foreign_file_is_refused_and_left_as_it_is(
 ) -> None:
     with h5py.File(store.path, "w") as file:
         file.attrs.update(attributes)
-        file.create_group("a.png").attrs["complete"] = True
+        file.create_group("a.png").attrs["content"] = ""
     before = store.path.read_bytes()
     with pytest.raises(StoreError, match=rf"{store.path}: .*{found}.*--output-path"):
         store.names() if access == "read" else store.write("b.png", some_features(2), (4, 3))
@@ -207,14 +205,10 @@ def test_read_returns_the_matches_that_were_written(
     assert second.tolist() == [[2, 1], [3, 0]]
 
 
-@pytest.mark.parametrize("gone", ["group", "marker"])
-def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore, gone: str) -> None:
+def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore) -> None:
     matches.write([pair_matches((name, "z.png"), [[0, 0]], 1) for name in ("a.png", "b.png")])
     with h5py.File(matches.path, "a") as file:
-        if gone == "group":
-            del file["b.png/z.png"]
-        else:
-            del file["b.png/z.png"].attrs["complete"]
+        del file["b.png/z.png"]
     assert matches.has([("a.png", "z.png"), ("b.png", "z.png")]).tolist() == [True, False]
     with pytest.raises(StoreError, match=r"no matches of b\.png, z\.png; run match"):
         list(matches.read([("a.png", "z.png"), ("b.png", "z.png")]))
