@@ -192,7 +192,7 @@ def follow_keypoints(context: Context) -> None:
 
     Mapping again would be of the same pairs, and might end elsewhere.
     """
-    if context.workspace.made_from("map") != context.verified_digest():
+    if context.workspace.mapped_from() != context.to_map():
         _take_over(context, context.workspace.sparse)
 
 
@@ -203,7 +203,7 @@ def _take_over(context: Context, sparse_path: Path) -> None:
         new.mkdir()
         for folder in model_folders(sparse_path):
             copy_with_keypoints(folder, new / folder.name, workspace.database)
-    workspace.record_mapped(context.verified_digest())
+    workspace.record_mapped(context.to_map())
 
 
 # The best models so far
@@ -216,7 +216,7 @@ def keep_best(context: Context) -> None:
     """
     workspace = context.workspace
     is_small = len(context.features.names()) <= SMALL
-    if not is_small or workspace.made_from("map") != context.verified_digest():
+    if not is_small or workspace.mapped_from() != context.to_map():
         return
     present = present_score(context)
     if present < best_score(context):

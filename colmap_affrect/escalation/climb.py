@@ -53,9 +53,9 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         while step := escalation.next_step():
             keep_best(context)
             escalated = escalation.taken(step, escalated)
-        before = context.workspace.made_from("map")
+        before = context.workspace.mapped_from()
         reports += _mapped_on(context, mapper, recipe)
-        has_mapped = context.workspace.made_from("map") != before  # perhaps there is no model
+        has_mapped = context.workspace.mapped_from() != before  # perhaps there is no model
         if has_mapped or restore_best(escalation) or choose_learned(escalation, at_once=False):
             continue
         forget_others(context)

@@ -80,7 +80,7 @@ class SetState:
 
     def _is_mapped(self) -> bool:
         """Tell whether the models are those of the verified pairs."""
-        return self.context.workspace.made_from("map") == self.context.verified_digest()
+        return self.context.workspace.mapped_from() == self.context.to_map()
 
     def _insecure(self, wanted: set[str], *, num_images: int) -> set[str]:
         """Return the images that the next model may well lose; none where it will tell of them."""

@@ -76,8 +76,9 @@ def _or_empty(read: Callable[[Path], str], path: Path) -> str:
 Stage = Literal["copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"]
 STAGES: tuple[str, ...] = get_args(Stage)
 FORMAT_VERSION = 12  # counts up when a stage records other options than before
-MADE_FROM = "made_from"  # digests of given files, and of the verified pairs that were mapped
-KEYS = ("recipe", "begun", *STAGES, MADE_FROM)
+MADE_FROM = "made_from"  # digests of given files
+MAPPED = "mapped"  # what the models that are there were made from, and how many they are
+KEYS = ("recipe", "begun", *STAGES, MADE_FROM, MAPPED)
 
 PLACES = {
     "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",
@@ -90,12 +91,39 @@ OF_DATABASE = {"extract": ("cameras",)}
 """Options of a stage that decide only on the database, which others make anew."""
 
 
+class MappedFrom(NamedTuple):
+    """What models were made from."""
+
+    verified: str  # digest of the database
+    by_hand: str = ""  # of what a person said; empty for nothing
+    extends: str = ""  # of the model that was extended, or OWN; empty for none
+
+
+OWN = "own"  # a model of the folder itself is extended
+
+
+class Mapped(BaseModel):
+    """The models that are there."""
+
+    model_config = ConfigDict(extra="forbid")
+    verified: str
+    by_hand: str = ""
+    extends: str = ""
+    number: int
+
+    @property
+    def made_from(self) -> MappedFrom:
+        """What they were made from."""
+        return MappedFrom(self.verified, self.by_hand, self.extends)
+
+
 class _Record(BaseModel):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, dict[str, Any]]  # options by stage
     recipe: str = ""
     begun: list[Stage] = []
     made_from: dict[str, str] = {}
+    mapped: Mapped | None = None
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -123,7 +151,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def record_text(record: Mapping[str, Any]) -> str:
     """Return the content of ``config.toml``."""
-    ordered = {key: record[key] for key in KEYS if record.get(key) not in (None, "")}
+    ordered = {key: record[key] for key in KEYS if record.get(key) not in (None, "", {})}
     return tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered})
 
 

@@ -32,7 +32,7 @@ from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.paths import GivenPath, resolved
-from colmap_affrect.project.record import Content, content_of, file_sha256
+from colmap_affrect.project.record import Content, MappedFrom, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
@@ -250,10 +250,9 @@ class Context:
         if self.graph.path != self.workspace.database:
             object.__setattr__(self, "graph", ViewGraph(self.workspace.database))
 
-    def verified_digest(self) -> str:
-        """Return digests of the verified pairs and, after a plus, of what is said by hand."""
-        said = self.by_hand.digest()
-        return self.graph.digest() + (f"+{said}" if said else "")
+    def to_map(self, extends: str = "") -> MappedFrom:
+        """Return what models are made from now, perhaps with the digest of one that they extend."""
+        return MappedFrom(self.graph.digest(), self.by_hand.digest(), extends)
 
     def listed_pairs(self) -> PairList:
         """Return the pairs of the list whose images have features."""

@@ -16,6 +16,7 @@ from colmap_affrect.mappers.mapping import map_database, model_folders, read_sum
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.paths import resolved
+from colmap_affrect.project.record import OWN, MappedFrom
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
@@ -52,8 +53,8 @@ def map_images(
     workspace.require("verify")
     inputs = _inputs(context, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    known = "" if workspace.lacks_models() else workspace.made_from("map")
-    if known != inputs and " " in known and not extend:
+    known = None if workspace.lacks_models() else workspace.mapped_from()
+    if known and known != inputs and known.extends and not extend:
         raise ConflictError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
@@ -63,12 +64,12 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     known_models = read_summaries(workspace.sparse)  # refuses edited ones
-    said_before = known.partition("+")[2]  # what was said by hand
+    said_before = known.by_hand if known else ""
     before = list[MappedModel]()
-    if goes_on and said_before == inputs.partition("+")[2]:
+    if goes_on and said_before == inputs.by_hand:
         before = _models_before(workspace.sparse, known_models)
     task = _task(context, extend, before)
-    workspace.record_made_from(map="")  # a run that is killed begins anew
+    workspace.record_mapped(None)  # a run that is killed begins anew
     with context.progress.stage("map", len(context.graph.ids), "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
     workspace.record_mapped(inputs)
@@ -122,14 +123,13 @@ def unmeasured_pairs(context: Context) -> list[Pair]:
     return [pair for pair, level in levels.items() if not is_measured[level]]
 
 
-def _inputs(context: Context, extend: Extension | None) -> str:
-    """Return digests of what is mapped and, after a space, of the model that is extended."""
-    verified = context.verified_digest()
+def _inputs(context: Context, extend: Extension | None) -> MappedFrom:
+    """Return what is mapped, and of which model that is extended."""
     if not extend:
-        return verified
+        return context.to_map()
     folder = resolved(model_folder(extend.model_path))
     own = folder.is_relative_to(resolved(context.workspace.sparse))
-    return f"{verified} {'own' if own else extend.digest()}"
+    return context.to_map(OWN if own else extend.digest())
 
 
 def agreements(verified: ViewGraph, model: pycolmap.Reconstruction) -> dict[Pair, float]:

@@ -171,7 +171,7 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     assert present_score(context) == looked_at.score
     assert context.matches.state.modelled == context.matches.state.listed  # are gone on from
     assert context.matches.state.follows == ""
-    assert context.workspace.made_from("map") == context.verified_digest()
+    assert context.workspace.mapped_from() == context.to_map()
     assert levels(context) == {1}
     ids = image_ids(context.workspace.database)
     with open_database(context.workspace.database) as database:

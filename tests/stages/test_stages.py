@@ -108,7 +108,7 @@ def test_run_registers_all_photographs_and_leaves_all_results(finished: Finished
     assert (record.names, record.source, record.is_fixed) == (tuple(names), "given", True)
     assert len(workspace.pairs.read_text(encoding="utf-8").splitlines()) == 6
     stages = ["extract", "pairs", "match", "verify", "escalate", "guide", "map"]
-    assert workspace.recorded().keys() == {"recipe", "begun", *stages, "made_from"}
+    assert workspace.recorded().keys() == {"recipe", "begun", *stages, "made_from", "mapped"}
     assert workspace.begun == stages
 
 
