@@ -151,7 +151,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def record_text(record: Mapping[str, Any]) -> str:
     """Return the content of ``config.toml``."""
-    ordered = {key: record[key] for key in KEYS if record.get(key) not in (None, "", {})}
+    ordered = {key: record[key] for key in KEYS if record.get(key) not in (None, "")}
     return tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered})
 
 

@@ -260,8 +260,8 @@ class Workspace:
         Args:
             inputs: None where they are to be made anew.
         """
-        values = {**inputs._asdict(), "number": self.num_models()} if inputs else {}
-        if values != self.recorded().get(MAPPED, {}):
+        values = {**inputs._asdict(), "number": self.num_models()} if inputs else None
+        if values != self.recorded().get(MAPPED):
             self._write_record({**self.recorded(), MAPPED: values})
 
     def num_models(self) -> int:

@@ -68,6 +68,7 @@ class ViewGraph:
             with open_database(self.path) as database:
                 yield database
             return
+        self._forget_if_gone()
         if self._kept is None:
             self._kept = self._open.enter_context(open_database(self.path))
         try:
