@@ -278,9 +278,9 @@ def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
         kept = kept_probability(one.probability)
         probabilities[name] = kept
         if kept < DOUBTFUL:
-            doubtful[name] = one.reason
+            doubtful[name] = one.reasons
         elif kept < SURE:
-            unsure[name] = one.reason
+            unsure[name] = one.reasons
     return ModelSummary(
         registered_names=tuple(sorted(focals_px)),
         num_points3D=model.num_points3D(),
@@ -291,7 +291,7 @@ def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
         doubtful=doubtful,
         unsure=unsure,
         bridges={name: bridge for name, bridge in bridges.items() if name in focals_px},
-        taken_out={name: one.reason for name, one in scored.taken_out.items()},
+        taken_out={name: one.reasons for name, one in scored.taken_out.items()},
         focals_px=focals_px,
         moves=scored.mapped.moves,
         tie_points=tie_points_of(task, graph).report(model),
