@@ -186,6 +186,16 @@ def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
     assert model.sure == (third,)
 
 
+@pytest.mark.parametrize("name", ["sparse", "incremental", "global"])
+def test_models_of_fewer_images_than_wanted_are_dropped(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=3, num_points3D=150)
+    models, _ = reconstruct(path, mapper_of(name, min_model_size=4))
+    assert not models
+    (model,), _ = reconstruct(path, mapper_of(name, min_model_size=3))
+    assert len(model.registered_names) == 3
+
+
 def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
