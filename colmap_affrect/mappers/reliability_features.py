@@ -19,6 +19,7 @@ from colmap_affrect.mappers.direction_uncertainty import direction_sigmas_deg
 from colmap_affrect.mappers.focal_observability import fitting_focals, focal_growths
 from colmap_affrect.mappers.model_score import ModelScorer, pair_log_ratio
 from colmap_affrect.mappers.pair_graph import (
+    MAX_ERROR,
     MIN_NUM_MATCHES,
     MIN_SHARE,
     Ids,
@@ -38,7 +39,6 @@ MIN_TOLD = 0.03
 parts of photographs it is 0.15."""
 NUM_ROTATION_PAIRS = 4  # strongest pairs of a frame that are compared with a pure rotation
 MAX_ROTATION_PAIRS = 300  # the same of a model, to save time
-MAX_ROTATION_ERROR = 0.003  # longer sides, of a match that a rotation explains, as in verification
 MIN_MIRRORED_SHARE = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
 images a tenth by chance."""
@@ -203,7 +203,7 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
     step = sampling_step(len(strongest), MAX_ROTATION_PAIRS)
     for pair in list(strongest.values())[::step]:
         sizes = context.graph.sizes(pair.ids)
-        max_error_px = MAX_ROTATION_ERROR * max(map(max, sizes))
+        max_error_px = MAX_ERROR * max(map(max, sizes))
         points1, points2 = context.graph.points(pair)
         found[pair.ids] = pure_rotation_ratio(points1, points2, sizes, max_error_px)
     return found
