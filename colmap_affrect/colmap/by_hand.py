@@ -1,4 +1,4 @@
-"""What a person says of a set of photographs: tie points, wrong pairs, photographs to leave out.
+"""Manual input: tie points, wrong pairs, photographs to leave out.
 
 None of it changes ``database.db``: what is mapped is a copy with the tie points as keypoints behind
 the others, and without the verified pairs that are not to be used.
@@ -46,7 +46,7 @@ def unknown_size(_: str) -> None:
 
 
 class ByHand(Options):
-    """What is to be done otherwise than matches alone say."""
+    """Manual input, which is used where matches alone say something else."""
 
     tie_points_path: GivenPath | None = None
     """Table of the same points in several photographs."""

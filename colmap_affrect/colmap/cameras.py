@@ -1,6 +1,6 @@
-"""Cameras: what the user gives by options, table or model, and who knows each focal length.
+"""Cameras: what the user gives by options, table or model, and the source of each focal length.
 
-COLMAP's database only has a flag that somebody does; ``cameras.json`` beside it says who.
+COLMAP's database only has a flag that it is known; ``cameras.json`` beside it says its source.
 """
 
 from collections import defaultdict
