@@ -159,19 +159,28 @@ class Guiding:
         known = current(self.context)
         exact = exact_inliers(self.context, known)
         images = self._images_to_guide(exact)
-        levels = self.context.matches.levels(self.context.listed_pairs())
-        escalated = {frozenset(pair) for pair, level in levels.items() if level}  # have enough
+        pairs = [pair for pair in exact if not images.isdisjoint(pair)]
+        escalated = self._escalated(pairs)
         done = {pair.names for pair in known}
         todo = list[Pair]()
         num_done = 0
-        for pair in exact:
-            if images.isdisjoint(pair) or frozenset(pair) in escalated:
+        for pair in pairs:
+            if frozenset(pair) in escalated:
                 continue
             if pair in done:
                 num_done += 1
             else:
                 todo.append(pair)
         return todo, num_done
+
+    def _escalated(self, pairs: Sequence[Pair]) -> set[frozenset[str]]:
+        """Return the images of those pairs that were matched again, and have enough."""
+        if not pairs:
+            return set()
+        asked = {frozenset(pair) for pair in pairs}
+        listed = [pair for pair in self.context.listed_pairs() if frozenset(pair) in asked]
+        levels = self.context.matches.levels(listed)
+        return {frozenset(pair) for pair, level in levels.items() if level}
 
     def _images_to_guide(self, exact: Mapping[Pair, Indices]) -> set[str]:
         """Return the images whose verified pairs are guided, by their exact inliers."""
