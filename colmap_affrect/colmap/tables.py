@@ -11,9 +11,15 @@ from typing import Any, NamedTuple
 
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.project.paths import resolved
-from colmap_affrect.project.regular_files import NotAFileError, read_regular, require_regular
+from colmap_affrect.project.regular_files import (
+    NotAFileError,
+    open_regular,
+    read_regular,
+    require_regular,
+)
 
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
+MAGIC = b"SQLite format 3\0"  # begins each file of SQLite's that is not empty
 HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
 DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # what sqlite3 raises, also quoting odd bytes
 MAX_NUM_IMAGES = 2**31 - 1  # an id of a pair is the smaller image id times this, plus the larger
@@ -23,6 +29,10 @@ DIGESTED = (  # tables that decide what is mapped
     "cameras", "rigs", "rig_sensors", "frames", "frame_data", "images", "pose_priors", "keypoints",
     "matches", "two_view_geometries",
 )  # fmt: skip
+
+
+class NoDatabaseError(DatabaseError):
+    """A file that has never been one of SQLite's, or whose beginning is lost."""
 
 
 @contextmanager
@@ -39,6 +49,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
             raise OptionError(f"{file}: {error}; give a COLMAP database") from error
     if not path.is_file():
         raise OptionError(f"{path}: no such file; give a COLMAP database")
+    _require_sqlite(path)
     mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
     address = f"{resolved(path).as_uri()}?{mode}"
     try:
@@ -58,6 +69,19 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
                 f"may write, e.g. sqlite3 {path.name} .tables"
             ) from error
         raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error
+
+
+def _require_sqlite(path: Path) -> None:
+    """Refuse a file that is none of SQLite's, text perhaps, or a model; NoDatabaseError."""
+    try:
+        with open_regular(path) as file:
+            start = file.read(len(MAGIC))
+    except OSError:
+        return  # SQLite says why
+    if start and start != MAGIC and not MAGIC.startswith(start):
+        raise NoDatabaseError(
+            f"{path}: not a usable COLMAP database (it does not begin as files of SQLite do)"
+        )
 
 
 class Camera(NamedTuple):

@@ -35,7 +35,8 @@ Names = tuple[str, str]  # of a pair of images
 MAX_INT16 = 32767
 NOT_KNOWN = Content()
 # Notes of matches:
-STATIONARY = "stationary_cells"  # [size, cells] of the places that never move
+STATIONARY = "stationary_cells"  # [size, cells, of a still camera] of the places that never move
+BACKGROUNDS = "stationary_backgrounds"  # packed cells that show what never moves, by image
 STEP = "step"  # level and pairs of the step of escalation that has begun and not ended
 FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
 IN_VAIN = "all_features_in_vain"  # that list, and whether all features bring no more than some

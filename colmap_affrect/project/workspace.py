@@ -251,9 +251,17 @@ class Workspace:
         return 0
 
     def lacks_models(self) -> bool:
-        """Return whether models that were made are gone, removed by somebody or half removed."""
+        """Return whether models that were made are gone, removed by somebody or half removed.
+
+        Earlier versions did not record how many there were: none that are left, or a gap in their
+        numbers, then count as removed.
+        """
+        num = self.num_models()
         made = self.made_from("models")
-        return not self.sparse.exists() or (made.isdecimal() and self.num_models() < int(made))
+        if not made.isdecimal():
+            is_numbered = all((self.sparse / str(number)).exists() for number in range(num))
+            return not (num and is_numbered)
+        return not self.sparse.exists() or num < int(made)
 
     def record_options(
         self,
