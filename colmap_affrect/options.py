@@ -63,13 +63,33 @@ def within(low: float, high: float) -> Any:
 Documented = TypeVar("Documented", bound=type)
 
 
+class _DocstringWithFields:
+    """Docstring of a class with what its fields mean, which is looked up when it is asked for.
+
+    Commands, which show no docstrings, would wait for that.
+    """
+
+    def __init__(self, docstring: str | None, texts: Callable[[], Mapping[str, str]]) -> None:
+        self._docstring = docstring
+        self._texts = texts
+        self._whole: str | None = None
+
+    def __get__(self, instance: object, owner: type) -> str:
+        if self._whole is None:
+            self._whole = with_attributes(self._docstring, self._texts())
+        return self._whole
+
+
 def documented(cls: Documented) -> Documented:
     """Add what stands below each field of a dataclass to its docstring, for ``help()``."""
-    found: dict[str, str] = {}
-    for each in reversed(cls.__mro__):
-        found |= _below_fields(each)
-    texts = {field.name: found.get(field.name, "") for field in fields(cls)}
-    cls.__doc__ = with_attributes(inspect.cleandoc(cls.__doc__ or "").split(ATTRIBUTES)[0], texts)
+
+    def texts() -> dict[str, str]:
+        found: dict[str, str] = {}
+        for each in reversed(cls.__mro__):
+            found |= _below_fields(each)
+        return {field.name: found.get(field.name, "") for field in fields(cls)}
+
+    type.__setattr__(cls, "__doc__", _DocstringWithFields(cls.__doc__, texts))
     return cls
 
 
@@ -104,12 +124,16 @@ def with_attributes(docstring: str | None, texts: Mapping[str, str]) -> str:
     return head + ATTRIBUTES + "\n".join(lines) if lines else head
 
 
+def field_meaning(options: type[BaseModel], name: str) -> str:
+    """Return what stands below a field of options, in the class or in a base of it."""
+    texts = (_below_fields(base).get(name) for base in options.__mro__)
+    return next(filter(None, texts), "")
+
+
 def _field_text(options: type[BaseModel], name: str) -> str:
     """Say what a field of options means, which values it takes, and its default."""
     field = options.model_fields[name]
-    bases = (base.model_fields for base in options.__mro__ if issubclass(base, Options))
-    texts = (base[name].description for base in bases if name in base)
-    text = next(filter(None, texts), "")
+    text = field_meaning(options, name)
     ends = [limit for item in field.metadata for limit in _limits(item)]
     values = [repr(value) for value in get_args(field.annotation) if isinstance(value, str)]
     extent = f" From {ends[0]:g} to {ends[1]:g}." if len(ends) == 2 else ""
@@ -140,9 +164,7 @@ class Summarized:
 class Options(BaseModel):
     """Base of all options."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     if not TYPE_CHECKING:  # editors and type checkers see the fields as arguments
 
@@ -157,8 +179,11 @@ class Options(BaseModel):
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         """Add the fields to the docstring, so that ``help()`` shows what each of them means."""
-        texts = {name: _field_text(cls, name) for name in cls.model_fields}
-        cls.__doc__ = with_attributes(cls.__doc__, texts)
+
+        def texts() -> dict[str, str]:
+            return {name: _field_text(cls, name) for name in cls.model_fields}
+
+        type.__setattr__(cls, "__doc__", _DocstringWithFields(cls.__doc__, texts))
 
     @classmethod
     def given(cls, options: Any, argument: str) -> Self:
@@ -430,7 +455,7 @@ def described_toml(options: Options, path: str = "") -> str:
         elif isinstance(value, dict):
             sections.append(tomli_w.dumps({name: value}) if value else "")
         else:
-            text = type(options).model_fields[name].description or ""
+            text = field_meaning(type(options), name)
             comment = textwrap.wrap(text.replace("``", "'"), MAX_COMMENT)
             lines += [*(f"# {line}\n" for line in comment), tomli_w.dumps({name: value})]
     return "".join([*lines, *sections])

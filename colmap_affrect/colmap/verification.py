@@ -7,7 +7,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
-import networkx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -308,6 +307,8 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
 
 def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
     """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
+    import networkx  # which takes as long to load as numpy and OpenCV together
+
     graph: networkx.Graph[T] = networkx.Graph()
     graph.add_nodes_from(images)
     graph.add_edges_from(pairs)
@@ -316,6 +317,8 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     """Return, smaller image first, the pairs that alone tie two parts of two images or more."""
+    import networkx
+
     graph: networkx.Graph[T] = networkx.Graph()
     graph.add_edges_from(pairs)
     return [(min(p), max(p)) for p in networkx.bridges(graph) if min(map(graph.degree, p)) > 1]
