@@ -9,6 +9,7 @@ from small_comparison import IMAGE_SIZE, write_scene
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import (
     Advice,
     Bridge,
@@ -20,6 +21,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pairs import PairPicture
 from colmap_affrect.report.pictures import Picture
 from colmap_affrect.report.run_page import RunContent, write_run_page
+from colmap_affrect.session.view_graph import ViewGraph
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "b\u202egnp.c", "c.png", "d.png", "e.png", "f.png")
 """The second one is shown turned round where nobody takes care."""
@@ -34,7 +36,7 @@ def small_report(folder: Path) -> ReconstructionReport:
         90,
         3.5,
         0.25,
-        doubtful={NAMES[3]: "hangs on few <points>"},
+        doubtful={NAMES[3]: (Doubt("mirrored_copy", {"original": "<b>.jpg"}),)},
         probabilities=dict(zip(NAMES, (0.99, 0.95, 0.7, 0.4), strict=False)),
         bridges={NAMES[2]: Bridge(NAMES[0], 12, 15, 0.031)},
     )
@@ -45,7 +47,7 @@ def small_report(folder: Path) -> ReconstructionReport:
     failure = f"{folder / 'photographs' / 'f.png'}: not a readable image"
     return ReconstructionReport(
         images_total=6,
-        unregistered={NAMES[4]: "no verified pair", NAMES[5]: "unreadable"},
+        unregistered={NAMES[4]: Missing("no_verified_pair"), NAMES[5]: Missing("unreadable")},
         models=(model,),
         num_verified_pairs=15,
         num_pairs=15,
@@ -86,5 +88,6 @@ def make_run_page(folder: Path) -> Path:
         option=f"--reject-pair '{NAMES[0]},{NAMES[1]}'",
         picture=Picture.from_image(np.zeros((450, 900, 3), np.uint8)),
     )
-    content = RunContent(NAMES, pairs, photographs, pairs_to_check=[pair] * 3)
+    cameras = ViewGraph(workspace.database).cameras
+    content = RunContent(NAMES, pairs, photographs, pairs_to_check=[pair] * 3, cameras=cameras)
     return write_run_page(workspace, small_report(folder), content)

@@ -6,7 +6,6 @@ It is read anew for every decision, from the stores and the view graph: each ste
 import math
 from collections.abc import Mapping, Sequence
 
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import weakly_connected_images
 from colmap_affrect.escalation import expected_gain
 from colmap_affrect.escalation.expected_gain import PairState
@@ -42,14 +41,11 @@ class SetState:
 
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of the pairs that may be used, 0 of those that are not verified."""
-        ids = self.context.graph.ids
         verified = self.context.num_verified_inliers()
         found = dict[Pair, int]()
-        for first, second in self.pairs:
-            are_there = first in ids and second in ids
-            if are_there and self.context.by_hand.allows(first, second):
-                count = verified.get((first, second)) or verified.get((second, first), 0)
-                found[first, second] = count
+        for first, second in self.context.usable(self.pairs):
+            count = verified.get((first, second)) or verified.get((second, first), 0)
+            found[first, second] = count
         return found
 
     def models(self) -> list[ModelSummary]:
@@ -84,7 +80,7 @@ class SetState:
 
     def _is_mapped(self) -> bool:
         """Tell whether the models are those of the verified pairs."""
-        return self.context.workspace.made_from("map") == self.context.verified_digest()
+        return self.context.workspace.mapped_from() == self.context.to_map()
 
     def _insecure(self, wanted: set[str], *, num_images: int) -> set[str]:
         """Return the images that the next model may well lose; none where it will tell of them."""
@@ -141,7 +137,7 @@ class SetState:
             return {}
         graph = self.context.graph
         found = dict[Pair, int]()
-        with open_database(graph.path) as database:
+        with graph.reading() as database:
             for pair in pairs:
                 first, second = pair
                 matches = database.read_matches(graph.ids[first], graph.ids[second])

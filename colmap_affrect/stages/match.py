@@ -19,11 +19,16 @@ from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.matchers.base import MATCHERS, ImageFeatures, MatcherContext, MatcherOptions
-from colmap_affrect.pairs.lists import Pair, PairList, ordered_for_reuse
+from colmap_affrect.pairs.lists import USUAL_IMAGES_IN_MEMORY, Pair, PairList, ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import FINISHED, IN_VAIN, FeatureStore, MatchStore, PairMatches
+from colmap_affrect.project.stores import (
+    PAIRS_PER_WRITE,
+    FeatureStore,
+    MatchStore,
+    PairMatches,
+)
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.session.context import Context, Resources, require_same_files
 from colmap_affrect.session.database_export import write_images_and_keypoints, write_matches
@@ -31,15 +36,13 @@ from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
 
-PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
 MANY_MATCHES = 300  # of the features matched first: photographs of different things have up to 76
 NUM_TRIED = 40  # pairs matched by all features before many are
 MIN_GROWTH = 1.1  # of the matches that confirm each other, by all features; small scans have none
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
-IMAGES_IN_MEMORY = 40  # of 13,000 features
-BYTES_PER_FEATURE = 614  # of a feature ready for matching, with descriptors of 128
+BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
 
 Found = TypeVar("Found")
 
@@ -98,15 +101,15 @@ class _Missing:
 def _match_missing(context: Context, pairs: PairList, options: MatcherOptions) -> _Missing:
     """Match the pairs that are not stored, by some of their features first, and learn what stands.
 
-    A note has the digest of the list once all is done, so that an idle run looks at no pair.
+    The state has the digest of the list once all is done, so that an idle run looks at no pair.
     """
     matches = context.matches
     digest = file_sha256(context.workspace.pairs)
-    finished = matches.note(FINISHED)
+    finished = matches.state.listed
     is_finished = finished == digest and matches.num_pairs() == len(pairs)
     missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
     if missing:
-        matches.keep_note(FINISHED, None)
+        matches.keep(listed="")
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance, options.max_num_first)
     wanted = not_well_tied(matches, pairs) if pairs and not is_finished else []
@@ -114,14 +117,14 @@ def _match_missing(context: Context, pairs: PairList, options: MatcherOptions) -
         if not _is_in_vain(context, wanted, options, digest):
             match_pairs(context, wanted, options, advance)
     warnings = dict[str, str]()
-    has_new = bool(pairs) and (bool(missing) or finished is None)
+    has_new = bool(pairs) and (bool(missing) or not finished)
     if has_new and options.filter_stationary_matches:
         line = StationaryFilter(context.features, matches).learn(pairs)
         if line:
             warnings["matches"] = line
             logger.warning("matches: %s", line)
     if finished != digest:
-        matches.keep_note(FINISHED, digest)
+        matches.keep(listed=digest)
     return _Missing(len(missing), warnings)
 
 
@@ -181,16 +184,16 @@ def _is_in_vain(
 ) -> bool:
     """Tell whether all features tie pairs no better than some, by a sample where pairs are many."""
     matches = context.matches
-    known = matches.note(IN_VAIN)
-    is_known = bool(known) and known[0] == digest
+    known = matches.state.in_vain
+    is_known = known is not None and known[0] == digest
     if not is_known and len(pairs) > NUM_TRIED:
         sample = pairs[:: math.ceil(len(pairs) / NUM_TRIED)]
         with closing(matched_at_level(context, sample, options, 0)) as found:
             num_after = _sum_confirming(context.features, found)
         num_before = _sum_confirming(context.features, matches.read(sample))
-        known = [digest, num_after < MIN_GROWTH * num_before]
-        matches.keep_note(IN_VAIN, known)
-    return bool(known == [digest, True])
+        known = (digest, num_after < MIN_GROWTH * num_before)
+        matches.keep(in_vain=known)
+    return known == (digest, True)
 
 
 def _sum_confirming(features: FeatureStore, found: Iterable[PairMatches]) -> int:
@@ -269,7 +272,8 @@ class Matching:
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     max_num_features: int = 0  # of each image, those of the largest responses; 0: all
-    num_kept: int = IMAGES_IN_MEMORY
+    num_comparisons: float = 0  # about how many pairs of features there will be to compare
+    num_kept: int = USUAL_IMAGES_IN_MEMORY
 
 
 def iterate_matches(
@@ -286,8 +290,10 @@ def iterate_matches(
     limit = matching.max_num_features
     if limit:
         counts = {name: min(count, limit) for name, count in counts.items()}
+    num_comparisons = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    matcher = CachedMatcher(replace(matching, num_kept=max(2, num_kept)))
+    known = replace(matching, num_comparisons=num_comparisons, num_kept=max(2, num_kept))
+    matcher = CachedMatcher(known)
     ordered = ordered_for_reuse(pairs, max(1, num_kept // 2))
     yield from executor.map(matcher, ordered, [matching.store.path])
 
@@ -315,7 +321,7 @@ class CachedMatcher:
         self._weights = resolve(options.weights, resources.weights_path)
         if sent is not None:
             require_same_files(self._weights, sent)
-        context = MatcherContext(self._weights, resources.device)
+        context = MatcherContext(self._weights, resources.device, matching.num_comparisons)
         self.matcher = MATCHERS.make(options, context)
         self._images = lru_cache(matching.num_kept)(self._prepare)
         self._lock = threading.Lock()

@@ -23,13 +23,8 @@ from colmap_affrect.geometry.stationary import (
 )
 from colmap_affrect.images.reading import grown
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.stores import (
-    BACKGROUNDS,
-    STATIONARY,
-    FeatureStore,
-    MatchStore,
-    PairMatches,
-)
+from colmap_affrect.project.match_state import Size
+from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
@@ -62,8 +57,6 @@ CAMERA_STANDS_STILL = (
     "stands still; take photographs from several places, or give masks of what stands still "
     "(--mask-path) where something turns before it"
 )
-
-Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -105,14 +98,11 @@ class StationaryFilter:
         self._matches = matches
         self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
         self._places = dict[Size, Mask]()
-        self._of_still_cameras = set[Size]()
-        # The (N, 2) cells, column and row, by size; whether the camera stood still.
-        for size, cells, *is_of_still_camera in matches.note(STATIONARY) or []:
-            self._places[tuple(size)] = _mask(np.array(cells, np.int64).reshape(-1, 2))
-            if any(is_of_still_camera):
-                self._of_still_cameras.add(tuple(size))
+        self._of_still_cameras = set(matches.state.still_cameras)
+        for size, cells in matches.state.stationary:
+            self._places[size] = _mask(np.array(cells, np.int64).reshape(-1, 2))
         self._backgrounds = dict[str, Mask]()
-        for name, packed in (matches.note(BACKGROUNDS) or {}).items():
+        for name, packed in matches.state.backgrounds:
             self._backgrounds[name] = _unpacked(packed)
 
     @cached_property
@@ -210,13 +200,17 @@ class StationaryFilter:
 
     def _keep(self) -> None:
         """Put what is known on record."""
-        kept = list[tuple[Size, list[list[int]], bool]]()
-        for size, places in self._places.items():
-            cells = np.argwhere(places.T).tolist()
-            kept.append((size, cells, size in self._of_still_cameras))
-        packed = {name: _packed(background) for name, background in self._backgrounds.items()}
-        self._matches.keep_note(BACKGROUNDS, packed)
-        self._matches.keep_note(STATIONARY, kept)
+        kept = []
+        for size, mask in self._places.items():
+            kept.append((size, tuple(map(tuple, np.argwhere(mask.T).tolist()))))
+        packed = []
+        for name, background in self._backgrounds.items():
+            packed.append((name, _packed(background)))
+        self._matches.keep(
+            stationary=tuple(kept),
+            still_cameras=tuple(sorted(self._of_still_cameras)),
+            backgrounds=tuple(packed),
+        )
 
     def _find(self, pairs: Sequence[Pair]) -> dict[Size, "_Places"]:
         """Return the cells in which nothing moves, by size."""

@@ -188,28 +188,6 @@ def test_models_that_somebody_put_beside_ours_are_not_removed(
     assert foreign.exists()
 
 
-@pytest.mark.parametrize(
-    ("num_made", "there", "lacks"),
-    [
-        ("2", "01", False),
-        ("2", "1", True),
-        ("0", "", False),
-        ("", "01", False),  # an earlier version has not recorded how many there were
-        ("", "1", True),
-        ("", "", True),
-    ],
-)
-def test_models_that_somebody_has_removed_are_missed(
-    workspace: Workspace, num_made: str, there: str, lacks: bool
-) -> None:
-    workspace.record_options("extract", {})
-    workspace.record_made_from(map="digest", models=num_made)
-    workspace.sparse.mkdir()
-    for number in there:
-        (workspace.sparse / number).mkdir()
-    assert workspace.lacks_models() == lacks
-
-
 LOCK_AND_WAIT = """
 import sys
 from pathlib import Path

@@ -21,9 +21,10 @@ from small_run import small_report
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import keypoint_counts, open_database
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
+from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import GuidedPair
 from colmap_affrect.report import pairs
@@ -31,6 +32,7 @@ from colmap_affrect.report.pair_choice import pairs_to_check
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pairs import COLORS, draw_matches
 from colmap_affrect.report.sheets import WIDTH_PX, rgb
+from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
 
 NAMES = ("a.png", "b.png", "c.png", "d.png", "e.png", "f.png")
@@ -91,6 +93,13 @@ def test_numbers_of_lines_are_bounded_for_inliers_and_the_others(
         assert drawn.count(rgb(COLORS[kind])) == min(num, 200)
 
 
+def num_keypoints(path: Path) -> dict[str, int]:
+    """Keypoints in a database by image."""
+    with open_database(path) as database:
+        images = database.read_all_images()
+        return {i.name: database.num_keypoints_for_image(i.image_id) for i in images}
+
+
 class Stores(SimpleNamespace):
     """Of a run whose odd features are of warps; from number 60 on they have no shapes."""
 
@@ -102,7 +111,7 @@ class Stores(SimpleNamespace):
         super().__init__(
             workspace=SimpleNamespace(sparse=folder / "sparse", begun=begun, is_changed=False),
             extraction=SimpleNamespace(levels=levels),
-            counts=keypoint_counts(folder / "database.db"),
+            counts=num_keypoints(folder / "database.db"),
             features=self,
             matches=self,
         )
@@ -150,7 +159,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned: bool) -> None:
     stores: Any = Stores(scene, ["match"])
-    reader = PairReader(scene / "database.db", stores)
+    reader = PairReader(ViewGraph(scene / "database.db"), stores)
     names = NAMES[3:1:-1] if turned else NAMES[2:4]
     pair = reader.read(names)
     with open_database(scene / "database.db") as database:
@@ -177,13 +186,13 @@ def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned
 def test_of_the_database_of_another_program_inliers_are_of_one_kind(scene: Path) -> None:
     stores: Any = Stores(scene, [])
     stores.workspace.sparse = scene / "none"
-    reader = PairReader(scene / "database.db", stores)
+    reader = PairReader(ViewGraph(scene / "database.db"), stores)
     pair = reader.read(NAMES[2:4])
     assert set(pair.kinds.tolist()) == {MatchKind.FOREIGN, MatchKind.REJECTED}
     assert "model" not in pair.text
     stores = Stores(scene, ["match"])
     stores.counts[NAMES[3]] += 1  # the database has others than the run
-    pair = PairReader(scene / "database.db", stores).read(NAMES[2:4])
+    pair = PairReader(ViewGraph(scene / "database.db"), stores).read(NAMES[2:4])
     assert set(pair.kinds.tolist()) == {MatchKind.FOREIGN, MatchKind.REJECTED, MatchKind.BY_HAND}
     with pytest.raises(OptionError, match=r"c\.jpg: no such photograph \(did you mean 'c\.png'"):
         reader.read(("c.jpg", NAMES[3]))
@@ -211,14 +220,16 @@ def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
     one, other = (model.find_image_with_name(name) for name in NAMES[:2])
     one.frame.rig_from_world = pycolmap.Rigid3d(other.cam_from_world().matrix())
-    shares = agreements(scene / "database.db", model)
+    shares = agreements(ViewGraph(scene / "database.db"), model)
     for pair, share in shares.items():
         assert share < 0.5 if NAMES[0] in pair else share > 0.95
 
 
 def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
-    model = ModelSummary(tuple("abcdef"), 9, 2.0, 0.5, doubtful={"f": "why"})
-    report = replace(small_report(tmp_path), models=(model,), unregistered={"g": "not registered"})
+    model = ModelSummary(tuple("abcdef"), 9, 2.0, 0.5, doubtful={"f": (Doubt("few_matches"),)})
+    report = replace(
+        small_report(tmp_path), models=(model,), unregistered={"g": Missing("not_registered")}
+    )
     verified = {
         ("a", "b"): 900, ("b", "c"): 800, ("c", "d"): 50, ("d", "e"): 40, ("a", "f"): 30,
         ("e", "f"): 20, ("f", "g"): 60, ("a", "c"): 700,
@@ -247,7 +258,7 @@ def test_of_many_pairs_twelve_are_shown_and_without_a_model_the_missing_ones(
     doubtful = dict.fromkeys(names, "why")
     whole = replace(report, models=(ModelSummary(tuple(names), 9, 2.0, 0.5, doubtful=doubtful),))
     assert len(pairs_to_check(whole, verified, {})) == 12
-    without = replace(report, models=(), unregistered={"007.jpg": "not registered"})
+    without = replace(report, models=(), unregistered={"007.jpg": Missing("not_registered")})
     assert pairs_to_check(without, verified, {}) == {("006.jpg", "007.jpg"): "007.jpg is missing"}
 
 
