@@ -1,5 +1,6 @@
 """Geometric verification of raw matches by pycolmap, and its significance."""
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -396,13 +397,20 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     """Return, smaller image first, the pairs that alone tie two parts of two images or more."""
+    listed = list(pairs)
+    partners = defaultdict[T, set[T]](set)
+    for first, second in listed:
+        partners[first].add(second)
+        partners[second].add(first)
+    if not any(partners[first].isdisjoint(partners[second]) for first, second in listed):
+        return []  # a third image ties each pair, too
     import networkx
 
     graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_edges_from(pairs)
+    graph.add_edges_from(listed)
     found = []
     for first, second in networkx.bridges(graph):
-        if graph.degree(first) > 1 and graph.degree(second) > 1:
+        if len(partners[first]) > 1 and len(partners[second]) > 1:
             found.append((min(first, second), max(first, second)))
     return found
 
