@@ -339,13 +339,27 @@ def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
     return cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
-    """Read an image, by default as gray in the type it is stored in; ImageError if it is none."""
+def decode(path: Path, flags: int = GRAY_AS_STORED, *, keeps_numbers: bool = False) -> NDArray[Any]:
+    """Read an image, by default as gray in the type it is stored in.
+
+    Args:
+        path: the file.
+        flags: OpenCV's.
+        keeps_numbers: numbers are no tones, but depths: white is not made that of the type.
+
+    Returns:
+        (H, W) or (H, W, channels).
+
+    Raises:
+        ImageError: it is no image.
+    """
     require_possible(path)
-    return decoded(read_photograph(path), path, flags)
+    return decoded(read_photograph(path), path, flags, keeps_numbers=keeps_numbers)
 
 
-def decoded(data: Bytes, path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
+def decoded(
+    data: Bytes, path: Path, flags: int = GRAY_AS_STORED, *, keeps_numbers: bool = False
+) -> NDArray[Any]:
     """Decode the bytes of a photograph, which may change them; see :func:`decode`."""
     if name := foreign_format(data):
         raise ImageError(
@@ -363,7 +377,7 @@ def decoded(data: Bytes, path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any
     if image is None:
         raise ImageError(f"{path}: {UNREADABLE}")
     image = np.asarray(image)
-    if header and not header.is_scaled:
+    if header and not (header.is_scaled or keeps_numbers):
         image = with_usual_white(image, header.white)
     return image
 

@@ -4,6 +4,7 @@ It changes together with matches, all or nothing, so that an interrupted run res
 rest of what is done tell the matches themselves: a pair is matched when it is there.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from pydantic import TypeAdapter
@@ -73,12 +74,16 @@ class MatchState:
     follows: str = ""
     """Folder of better models whose matches these are already, while ``sparse/`` has others."""
 
-    def without_pairs(self) -> "MatchState":
-        """Return what is left where pairs have gone: which ones escalate depends on all others."""
+    def without_pairs(self, images: Collection[str] = ()) -> "MatchState":
+        """Return what is left where pairs have gone: which ones escalate depends on all others.
+
+        Of images that have gone nothing is left; others may get their names.
+        """
+        backgrounds = tuple(known for known in self.backgrounds if known[0] not in images)
         return MatchState(
             stationary=self.stationary,
             still_cameras=self.still_cameras,
-            backgrounds=self.backgrounds,
+            backgrounds=backgrounds,
             effort=self.effort,
         )
 

@@ -185,6 +185,12 @@ def test_white_of_pnm_is_any_number(tmp_path: Path, kind: int, white: int) -> No
     assert np.abs(read_gray(path) - expected).max() <= 1.0
 
 
+def test_numbers_that_are_no_tones_stay(tmp_path: Path) -> None:
+    path = tmp_path / "depth.pgm"
+    path.write_bytes(b"P5 2 1 5000\n" + np.array([1200, 5000], ">u2").tobytes())
+    assert decode(path, cv2.IMREAD_UNCHANGED, keeps_numbers=True).tolist() == [[1200, 5000]]
+
+
 @pytest.mark.parametrize("header", [b"P5 2 2 0\n", b"P5 2 2 70000\n", b"P4 16 2\n", b"P5 2 2"])
 def test_header_without_a_possible_white_changes_nothing(header: bytes) -> None:
     assert pnm_header(np.frombuffer(header + bytes(8), np.uint8)) is None

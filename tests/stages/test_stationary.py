@@ -201,6 +201,17 @@ def test_what_stands_still_is_left_out_of_later_matches_anywhere(tmp_path: Path)
         assert len(left) > 0.9 * num
 
 
+def test_background_of_a_photograph_that_is_gone_is_forgotten(tmp_path: Path) -> None:
+    points, _ = turntable(6)
+    features, matches, pairs = stores(tmp_path, points)
+    StationaryFilter(features, matches).learn(pairs)
+    known = [name for name, _ in matches.state.backgrounds]
+    matches.remove(images=["2.jpg"])
+    left = [name for name, _ in matches.state.backgrounds]
+    assert set(known) - set(left) == {"2.jpg"}
+    assert matches.state.still_cameras == (SIZE,)
+
+
 def test_background_ties_photographs_from_elsewhere(tmp_path: Path) -> None:
     """Something turns before a tripod, and the same background is seen from another place."""
     points, _ = turntable(6, 2000)
