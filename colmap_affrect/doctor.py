@@ -316,7 +316,7 @@ class _OutputFolder:
             summary = self.read(folder, partial(read_summary, folder))
             if summary:
                 counts.append(str(len(summary.registered_names)))
-        if workspace.lacks_models() and workspace.made_from("map"):
+        if workspace.lacks_models() and workspace.mapped:
             advice = f"{SAME_RUN}: maps again"
             self.diagnosis.add("error", workspace.sparse, "models are gone", advice)
         listed = ", ".join(counts) or "no"
