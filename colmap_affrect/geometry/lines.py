@@ -18,14 +18,16 @@ from functools import cached_property
 
 import numpy as np
 
-from colmap_affrect.geometry.arrays import Array, Floats
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
 
 FOCALS: Array = np.exp(np.linspace(math.log(0.4), math.log(6.0), 28))
 """Grid of focal lengths, longer sides: lenses of 14 to 216 mm for film of 36 mm."""
 SHIFTS: Array = np.linspace(-0.3, 0.3, 13)
 """Grid of shifts, longer sides: view cameras go to a quarter of their plate."""
 
-MIN_NUM_SEGMENTS = 12  # fewer say nothing: three directions have eight unknowns with the focal length
+MIN_NUM_SEGMENTS = (
+    12  # fewer say nothing: three directions have eight unknowns with the focal length
+)
 MAX_NUM_SEGMENTS = 160  # the longest are looked at
 NUM_SEGMENTS_OF_TRIALS = 90  # the longest, by which first frames are tried
 NUM_TRIALS = 160  # frames of three directions that are tried for each focal length
@@ -39,9 +41,14 @@ SAME_LINE_ANGLE = 0.05  # rad
 CHANCE_DENSITY = 2.0 / math.pi  # of the angle of a segment that is there by chance, per rad
 CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand
 DIRECTION_COUNT = 1.0  # segments of each direction that are reckoned with beforehand
-TEMPER = 2.5
-"""Lines that count as one piece of evidence: what is built errs together. Fitted by
-``tests/benchmarks/lines.py``."""
+TEMPER = 2.0  # lines that count as one piece of evidence: what is built errs together
+MODEL_SIGMA = 0.05
+"""Deviation of log focal length that is left where lines are many. This and ``TEMPER`` are fitted
+by ``tests/benchmarks/lines.py``, with each scene left out in turn."""
+USUAL_FOCAL = 1.2  # longer sides: what COLMAP guesses
+USUAL_FOCAL_SIGMA = 0.5  # of the logarithm of the focal lengths that photographs have
+KNOWN_SIGMA = 0.15  # of log focal length, below which lines know it
+MIDDLE_SIGMA = 0.02  # longer sides, of the axis of a photograph that is as the camera took it
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,7 @@ class Segments:
     @cached_property
     def directions(self) -> Floats:
         """(N, 2) unit vectors along the segments."""
-        return (self.ends - self.starts) / self.lengths[:, None]
+        return np.asarray((self.ends - self.starts) / self.lengths[:, None])
 
     @cached_property
     def sigmas(self) -> Floats:
@@ -109,7 +116,7 @@ class Segments:
         distances = np.abs(np.einsum("ijk,ik->ij", offsets, normals))
         is_same = (cosines > math.cos(SAME_LINE_ANGLE)) & (distances < SAME_LINE_DISTANCE)
         is_same |= is_same.T
-        return self.lengths / (is_same @ self.lengths)
+        return np.asarray(self.lengths / (is_same @ self.lengths))
 
 
 @dataclass(frozen=True)
@@ -124,7 +131,68 @@ class LineLikelihood:
 
     log_likelihoods: Floats
     rotations: Floats
-    kinds: Floats
+    kinds: Indices
+
+
+@dataclass(frozen=True)
+class LineCamera:
+    """The camera of a photograph by its straight lines.
+
+    Attributes:
+        focal: focal length in longer sides, the geometric mean.
+        focal_sigma: deviation of its logarithm.
+        shift: of the principal point, down from the middle, in longer sides.
+        shift_sigma: its deviation.
+        rotation: (3, 3), rows are the three directions in the camera's frame, for the likeliest.
+        up: (3,) the direction of these that is nearest to the upright of the image, upwards.
+    """
+
+    focal: float
+    focal_sigma: float
+    shift: float
+    shift_sigma: float
+    rotation: Floats
+    up: Floats
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the lines tell the focal length."""
+        return self.focal_sigma < KNOWN_SIGMA
+
+
+def line_camera(likelihood: LineLikelihood, shift_sigma: float = MIDDLE_SIGMA) -> LineCamera:
+    """Return what lines say of a camera, together with what is usual.
+
+    Args:
+        likelihood: of the lines.
+        shift_sigma: how far the optical axis may be from the middle beforehand, in longer sides.
+
+    Returns:
+        The camera, with deviations.
+    """
+    log_focals = np.log(FOCALS)
+    focal_prior = -0.5 * ((log_focals - math.log(USUAL_FOCAL)) / USUAL_FOCAL_SIGMA) ** 2
+    shift_prior = -0.5 * (SHIFTS / shift_sigma) ** 2
+    logs = likelihood.log_likelihoods + focal_prior[:, None] + shift_prior[None, :]
+    chances = np.exp(logs - logs.max())
+    chances /= chances.sum()
+    of_focals = chances.sum(axis=1)
+    of_shifts = chances.sum(axis=0)
+    log_focal = float(of_focals @ log_focals)
+    focal_variance = float(of_focals @ (log_focals - log_focal) ** 2)
+    shift = float(of_shifts @ SHIFTS)
+    shift_variance = float(of_shifts @ (SHIFTS - shift) ** 2)
+    row, column = np.unravel_index(chances.argmax(), chances.shape)
+    rotation = likelihood.rotations[row, column]
+    upright = rotation[np.abs(rotation[:, 1]).argmax()]
+    return LineCamera(
+        math.exp(log_focal),
+        math.hypot(math.sqrt(focal_variance), MODEL_SIGMA),
+        shift,
+        math.sqrt(shift_variance),
+        rotation,
+        upright if upright[1] < 0.0 else -upright,
+    )
 
 
 def line_likelihood(segments: Segments, random_seed: int = 0) -> LineLikelihood | None:
@@ -159,7 +227,7 @@ def _rotations_of_centred_cameras(segments: Segments, random_seed: int) -> Float
         segments, starts.reshape(-1, 3, 3), focals, np.zeros(len(focals)), NUM_STEPS
     )
     best = scores.reshape(-1, NUM_KEPT).argmax(axis=1)
-    return refined.reshape(-1, NUM_KEPT, 3, 3)[np.arange(len(best)), best]
+    return np.asarray(refined.reshape(-1, NUM_KEPT, 3, 3)[np.arange(len(best)), best])
 
 
 def _first_rotations(segments: Segments, random_seed: int) -> Floats:
@@ -277,7 +345,7 @@ class _Fit:
         steps *= np.minimum(1.0, 0.1 / np.maximum(size, 1e-12))
         return _turned(self.rotations, steps)
 
-    def kinds(self) -> Floats:
+    def kinds(self) -> Indices:
         """Return the (K, N) likeliest kinds, 3 for chance."""
         return np.asarray(self._parts(self.mixing).argmax(axis=2))
 
@@ -298,7 +366,7 @@ def _refined(
     return best, scores
 
 
-def _kinds(segments: Segments, rotation: Floats, focal: float, shift: float) -> Floats:
+def _kinds(segments: Segments, rotation: Floats, focal: float, shift: float) -> Indices:
     fit = _Fit(segments, rotation[None], np.array([focal]), np.array([shift]))
     kinds = fit.kinds()[0]
     return np.where(kinds == 3, -1, kinds)
