@@ -1,17 +1,15 @@
 """Rectified wide-baseline features for COLMAP.
 
-Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)``. The public names
-are those of ``__init__.pyi``; they are loaded when first used, so that importing the package stays
-light.
+Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)``. What else there
+is, ``docs/python.md`` lists.
+
+A public name is loaded when it is first used, so that importing the package takes no time: these
+are the first lines of a command, too, which Ctrl-C may already meet. Type checkers and editors read
+the same names in ``__init__.pyi``.
 """
 
-import importlib
-import logging
-import re
 import sys
 import zlib
-from pathlib import Path
-from typing import Any
 
 __version__ = "0.1.0"
 
@@ -23,20 +21,88 @@ PYCOLMAP_CAME_FIRST = _first.startswith("pycolmap")
 if not PYCOLMAP_CAME_FIRST:
     zlib.decompress(zlib.compress(b"warm"))
 
-logging.getLogger(__name__).addHandler(logging.NullHandler())
+_NAMES_OF_MODULES = {
+    # Photographs to a model: everything, one stage after the other, or the database of others.
+    "pipeline": (
+        "choose_pairs",
+        "extract",
+        "map_database",
+        "map_images",
+        "match",
+        "run",
+        "verify",
+    ),
+    # What a run is made of, and what it returns.
+    "colmap.by_hand": ("ByHand",),
+    "colmap.verification": ("VerificationOptions",),
+    "features.sift": ("SiftOptions",),
+    "images.depth": ("DepthOptions",),
+    "images.photographs": ("CameraOptions", "MaskOptions"),
+    "mappers.existing": ("Extension",),
+    "mappers.global_mapper": ("GlobalOptions",),
+    "mappers.incremental": ("IncrementalOptions",),
+    "mappers.sparse": ("SparseOptions",),
+    "matchers.nearest": ("NearestOptions",),
+    "pairs.lists": ("PairOptions",),
+    "progress": ("Progress",),
+    "project.report": ("ModelSummary", "ReconstructionReport", "StageReport"),
+    "recipes": ("ExtractionOptions", "Recipe", "load_recipe", "recipe_names"),
+    "report.run_report": ("RunReport",),
+    "session.context": ("Resources",),
+    "session.run_options": ("RunOptions",),
+    # Models and files for and from other programs.
+    "colmap.old_databases": ("export_database",),
+    "images.conversion": ("convert_images",),
+    "interop.align": ("Alignment", "Reference", "align"),
+    "interop.export": ("export",),
+    "interop.hdf5": ("export_h5", "import_h5"),
+    "interop.panoramas": ("reconstruct_panoramas",),
+    # What is good, what is wrong.
+    "comparison.compare": ("compare",),
+    "comparison.method_run": ("CompareOptions",),
+    "comparison.results": ("Comparison",),
+    "doctor": ("Diagnosis", "diagnose"),
+    "errors": (
+        "AffrectError",
+        "DatabaseError",
+        "DepthError",
+        "ImageError",
+        "NoModelError",
+        "OptionError",
+        "PartError",
+        "StoreError",
+        "WorkspaceError",
+    ),
+    "evaluation.evaluate": ("EvaluateOptions", "evaluate"),
+    "evaluation.results": ("Evaluation",),
+    "evaluation.truths": ("ScoreOptions",),
+    # Functions with pycolmap's names, and arrays of any program.
+    "data": ("LocalFeatures",),
+    "interop.pycolmap_api": (
+        "extract_features",
+        "incremental_mapping",
+        "match_exhaustive",
+        "match_image_pairs",
+        "match_sequential",
+        "match_spatial",
+        "verify_matches",
+    ),
+    "stages.descriptors": ("match_descriptors", "match_feature_sets"),
+}
+_MODULES = {name: module for module, names in _NAMES_OF_MODULES.items() for name in names}
 
-_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-_PUBLIC = {n: module for module, n in re.findall(r"^from (\S+) import (\w+)", _STUB, re.MULTILINE)}
-
-__all__ = ["__version__"]
-__all__ += list(_PUBLIC)
+__all__ = ["__version__", *_MODULES, "pycolmap"]  # noqa: PLE0604 (all are strings)
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_PUBLIC]
+    return sorted(__all__)
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _PUBLIC:
+def __getattr__(name: str) -> object:
+    from importlib import import_module
+
+    if name == "pycolmap":
+        return import_module(f"{__name__}.pycolmap")
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_PUBLIC[name]), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

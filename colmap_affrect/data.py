@@ -72,14 +72,19 @@ class ShapeGrid:
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """Local features of one image as full local affine frames."""
+    """Local features of one image as full local affine frames.
 
-    # (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the measurement
-    # ellipse (conventions, item 6); det A > 0
+    Attributes:
+        lafs: (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the
+            measurement ellipse (conventions, item 6); det A > 0.
+        responses: (N,) float32 detector responses, > 0.
+        descriptors: (N, D) float32 of unit length; D = 0 before they are described.
+        rectification_ids: (N,) int32, the warp each feature comes from; 0 is the image itself.
+    """
+
     lafs: Array
-    responses: Singles  # (N,) float32 detector responses, > 0
-    descriptors: Singles  # (N, D) float32 of unit length; D = 0 before they are described
-    # (N,) int32, the warp each feature comes from; 0 is the image itself
+    responses: Singles
+    descriptors: Singles
     rectification_ids: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __post_init__(self) -> None:
@@ -180,7 +185,8 @@ def in_mask(mask: Mask, points: Floats, origin: tuple[int, int] = (0, 0)) -> Mas
     height, width = mask.shape
     columns, rows = (np.rint(points).astype(int) - origin).T
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
+    columns = np.where(inside, columns, 0)
+    rows = np.where(inside, rows, 0)
     return np.asarray(inside & mask[rows, columns])
 
 

@@ -7,7 +7,7 @@ Files are read as runs read them, and what their readers say is what is found.
 import dataclasses
 import json
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,9 +20,11 @@ from colmap_affrect.colmap.model_files import has_model, model_folder, read_give
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.project.paths import PathLike, as_path
-from colmap_affrect.project.report import installed_versions
+from colmap_affrect.project.argument_types import checks_arguments
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
+from colmap_affrect.project.report import ModelSummary, installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
 
@@ -35,22 +37,30 @@ HARMLESS = WARNED | {"camera-panorama"}  # problems of databases that may be of 
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
+@documented
 @dataclass(frozen=True)
 class Finding:
     """One thing that was found."""
 
     severity: Severity
-    where: str  # file, folder or part of the installation
+    """``error``, ``warning`` or ``note``."""
+    where: str
+    """File, folder or part of the installation."""
     what: str
+    """What is wrong with it."""
     advice: str
+    """What helps."""
 
 
+@documented
 @dataclass
-class Diagnosis:
+class Diagnosis(Summarized):
     """The result of an examination: what was looked at, and what was found, the worst first."""
 
     checked: list[str] = field(default_factory=list)
+    """What was looked at."""
     findings: list[Finding] = field(default_factory=list)
+    """What was found, the worst first."""
 
     def add(self, severity: Severity, where: Path | str, what: str, advice: str) -> None:
         """Add what is wrong with a file, folder or part of the installation, and what helps."""
@@ -86,12 +96,14 @@ class Diagnosis:
         return json.dumps(content, indent=2, ensure_ascii=False)
 
 
+@checks_arguments
 def diagnose(path: PathLike | None = None, *, weights_path: PathLike | None = None) -> Diagnosis:
     """Examine the installation and, if a path is given, an output folder, a database or a model.
 
     OptionError when something that is given is not there.
     """
-    path, weights_path = (as_path(given) if given else None for given in (path, weights_path))
+    path = None if path is None else as_path(path, "path")
+    weights_path = as_path_or_none(weights_path, "weights_path")
     if path is not None and not path.exists():
         wanted = "give an output folder, a COLMAP database or the folder of a model"
         raise OptionError(f"{path}: no such file or folder; {wanted}")
@@ -121,7 +133,8 @@ def _examine_installation(diagnosis: Diagnosis, weights_path: Path | None) -> No
     diagnosis.checked.append(f"weights: {files or 'none found'}")
     for key, path in found.items():
         if is_published(key, path) is False:
-            what, advice = f"not the published file of {key}", remedy(path)
+            what = f"not the published file of {key}"
+            advice = remedy(path)
             diagnosis.add("warning", path, what, f"unless it is your own, {advice}")
 
 
@@ -131,7 +144,8 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
     ``advice`` is what to do about problems, where it is not what ``CHECKS`` says.
     """
     try:
-        version, newest = refuse_newer(path), newest_schema_version()
+        version = refuse_newer(path)
+        newest = newest_schema_version()
         tables, problems = check_database(path)
     except DatabaseError as error:
         recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
@@ -148,7 +162,8 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         diagnosis.add("note", path, older, f"keep a copy: {copy}")
     diagnosis.checked.append(f"{path}: {tables.summary()}")
     for kind in sorted(problems, key=list(CHECKS).index):
-        what, usual = CHECKS[kind]["what"], CHECKS[kind]["advice"]
+        what = CHECKS[kind]["what"]
+        usual = CHECKS[kind]["advice"]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
         severity: Severity = "warning" if kind in HARMLESS else "error"
         diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
@@ -195,13 +210,15 @@ def _examine_model(diagnosis: Diagnosis, path: Path) -> None:
         what, _, advice = _without_path(path, error).partition("; ")
         diagnosis.add("error", path, what, advice or "make the model again")
         return
-    registered, points = model.num_reg_images(), model.num_points3D()
+    registered = model.num_reg_images()
+    points = model.num_points3D()
     diagnosis.checked.append(f"{path}: a model of {registered} images and {points} points")
 
 
 def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
     """Read every file of an output folder, that of one stage after the other."""
-    context, quoted = Context(workspace), shlex.quote(str(workspace.path))
+    context = Context(workspace)
+    quoted = shlex.quote(str(workspace.path))
 
     def read(path: Path, reader: Callable[..., Read], *given: Any, advice: str = "") -> Read | None:
         try:
@@ -233,14 +250,24 @@ def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
     remake = f"remove it and {SAME_RUN}: it is made anew"
     advice = remake if done and not workspace.users_database else ""
     if examine_database(diagnosis, workspace.database, advice) and "map" in done:
-        models = [read(f, read_summary, f) for f in model_folders(workspace.sparse)]
-        listed = ", ".join(str(len(model.registered_names)) for model in models if model) or "no"
-        diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
+        found = [read(folder, read_summary, folder) for folder in model_folders(workspace.sparse)]
+        _examine_models(diagnosis, workspace, [model for model in found if model])
+
+
+def _examine_models(
+    diagnosis: Diagnosis, workspace: Workspace, models: Sequence[ModelSummary]
+) -> None:
+    """Say what models there are, and whether some are gone."""
+    if workspace.lacks_models() and workspace.made_from("map"):
+        diagnosis.add("error", workspace.sparse, "models are gone", f"{SAME_RUN}: maps again")
+    listed = ", ".join(str(len(model.registered_names)) for model in models) or "no"
+    diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
 
 
 def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:
     """Return the stages that have begun, after all options on record have been read."""
-    workspace, done = context.workspace, context.workspace.begun
+    workspace = context.workspace
+    done = context.workspace.begun
     if "extract" in done:
         _ = context.inputs, context.extraction
     _ = context.pairing, context.matching, context.verification, context.escalation

@@ -1,7 +1,10 @@
 """What is said to people: errors of one line, what, where and what to do; names out of files."""
 
 import codecs
+import errno
 import io
+import logging
+import os
 import re
 import shlex
 import sys
@@ -15,7 +18,16 @@ DAMAGE = (
     OverflowError, EOFError,
 )  # fmt: skip
 """What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or not ours."""
+OUTSIDE = {
+    errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ESTALE, errno.ENOTCONN,
+    errno.ETIMEDOUT,
+}  # fmt: skip
+"""Numbers of errors of the system that say nothing of what is in a file."""
+# What is logged is shown by the command line, or as the program says that uses the package.
+logging.getLogger("colmap_affrect").addHandler(logging.NullHandler())
+
 MAX_REASON = 200  # characters of what a reader says
+MAX_LINE = 2000  # of a line that is shown, which may name anything that is in a file
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
     "photographs, --set max_image_size_px=1600, or --device cpu where that of a GPU is full"
@@ -32,6 +44,20 @@ def lacks_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or any(t in str(error).lower() for t in NO_MEMORY)
 
 
+ARGUMENTS = {
+    "camera-mask-path": "masks.camera_path", "camera-mode": "cameras.mode",
+    "camera-params": "cameras.params", "cameras-path": "cameras.cameras_path",
+    "device": "resources.device", "distance": "distances", "film-width-mm": "cameras.film_width_mm",
+    "focal-length-px": "cameras.focal_length_px", "focal-mm": "cameras.focal_mm",
+    "format": "formats", "gps": "gps_database", "ignore-exif": "cameras.ignore_exif",
+    "leave-out": "by_hand.left_out", "mapper": "mapping", "mapper-options": "mapper_options",
+    "mask-path": "masks.path", "max-distance-m": "pairs.max_distance_m", "max-time": "max_minutes",
+    "num-neighbors": "pairs.num_neighbors", "pairs": "pairs.methods", "points": "points_path",
+    "positions": "positions_path", "principal-point": "cameras.principal_point",
+    "reject-pair": "by_hand.rejected", "scheduler": "executor",
+    "tie-points": "by_hand.tie_points_path", "weights": "resources.weights_path",
+}  # fmt: skip
+"""What functions call the flags whose argument has another name; a dot leads to a field."""
 FLAG = re.compile(r"(?:colmap-affrect|colmap|pip) [^';)]*|--([a-z][a-z-]*)")  # not of a command
 
 
@@ -47,11 +73,18 @@ class AffrectError(Exception):
 
 
 def _argument(flag: re.Match[str]) -> str:
-    return (flag[1] or "").replace("-", "_") or flag[0]
+    name = flag[1]
+    if name is None:  # a command, whose flags stay
+        return flag[0]
+    return ARGUMENTS.get(name, name.replace("-", "_"))
 
 
 class OptionError(AffrectError, ValueError):
-    """An option is unknown, out of range, contradicts another one, or names what is not there."""
+    """The command cannot be carried out as it is given, and nothing is computed.
+
+    An option is unknown, out of range, contradicts another one, or names what is not there or does
+    not hold what it should: a folder, a list or a table.
+    """
 
     exit_code = 2
 
@@ -70,6 +103,10 @@ class StoreError(AffrectError):
     """A file of features or matches is foreign, incomplete, or of another format version."""
 
 
+class ConflictError(StoreError, OptionError):
+    """Results are there that the command would replace, or that it cannot go on from."""
+
+
 class DatabaseError(AffrectError):
     """A COLMAP database cannot be used as asked."""
 
@@ -82,6 +119,13 @@ class DepthError(AffrectError):
     """The depth map of a photograph is missing or cannot be used."""
 
 
+class PartError(AffrectError):
+    """A part of another package fails, or returns what it must not."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}; use another one, or tell its authors")
+
+
 @contextmanager
 def damage(path: Path, mend: str, error_class: type[AffrectError] = StoreError) -> Iterator[None]:
     """Say of a file that cannot be read in one line that it is damaged, and what mends it."""
@@ -92,10 +136,15 @@ def damage(path: Path, mend: str, error_class: type[AffrectError] = StoreError) 
     except DAMAGE as error:
         if lacks_memory(error):
             raise
+        if isinstance(error, OSError) and error.errno in OUTSIDE:
+            why = os.strerror(error.errno)  # h5py says more, and in other words
+            raise error_class(
+                f"{path}: cannot be read ({why}); mend that, and run the same command again"
+            ) from error
         raise error_class(f"{path}: damaged ({reason(error)}); {mend}") from error
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """Return why something cannot be read, in one short line: pydantic takes several."""
     first = getattr(error, "errors", None)
     text = first()[0]["msg"] if callable(first) else str(error)
@@ -140,6 +189,19 @@ def one_line(text: str) -> str:
     return shown(text).replace("\n", _escaped("\n"))
 
 
+def clipped(text: str, most: int = MAX_LINE) -> str:
+    """Return a text, of one that is too long its beginning and its end.
+
+    >>> clipped("abcdefghijklmnopqrstuvwxyz", 12)
+    'abcd ... xyz'
+    """
+    if len(text) <= most:
+        return text
+    mark = " ... "
+    end = (most - len(mark)) // 2
+    return text[: most - len(mark) - end] + mark + text[len(text) - end :]
+
+
 def escape_what_lacks(stream: TextIO | None) -> None:
     r"""Have a stream write characters that its encoding lacks as JSON does, and go on.
 
@@ -164,9 +226,33 @@ ESCAPED = "colmap_affrect.escaped"  # how streams write what their encoding lack
 codecs.register_error(ESCAPED, _escape_lacking)
 
 
+class _Heedless(io.FileIO):
+    """A file for lines that nobody has to read: what it cannot take is left out."""
+
+    def write(self, data: bytes | memoryview) -> int:  # type: ignore[override]
+        """Write, as :class:`io.FileIO`; a full disk, a closed pipe or a limit is no error."""
+        count: int | None = None
+        with suppress(OSError):
+            count = super().write(data)
+        return memoryview(data).nbytes if count is None else count
+
+
+def heedless_stream(descriptor: int, encoding: str, *, closes: bool) -> TextIO:
+    """Return a stream for what is shown meanwhile: no work ends because that cannot be written.
+
+    Args:
+        descriptor: of an open file.
+        encoding: of what is written; see :func:`escape_what_lacks`.
+        closes: whether the file is closed with the stream.
+    """
+    raw: io.FileIO = _Heedless(descriptor, "w", closefd=closes)
+    file = io.BufferedWriter(raw)
+    return io.TextIOWrapper(file, encoding, ESCAPED, line_buffering=True)
+
+
 def say(line: str) -> None:
     """Print a line on stderr, which nobody may read any more."""
-    with suppress(OSError):
+    with suppress(OSError, RuntimeError):  # the latter of a handler that a signal calls meanwhile
         if sys.stderr:  # it may have been closed
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()

@@ -45,7 +45,8 @@ def watched(
     that only ``maps`` takes a changed one as it is, with a warning; one that ``discards`` all there
     is needs nothing mended. A database of the user is refused where COLMAP could not use it.
     """
-    workspace, path = context.workspace, context.workspace.database
+    workspace = context.workspace
+    path = context.workspace.database
     if workspace.users_database:
         if path.exists() and path.stat().st_size:
             refuse_unusable(path, FATAL_BEFORE_MAPPING)
@@ -84,7 +85,8 @@ def _stamp(path: Path) -> str:
 
 def _why_lost(workspace: Workspace) -> str:
     """Say why the database is not what the last command left, empty if it is."""
-    path, begun = workspace.database, workspace.begun
+    path = workspace.database
+    begun = workspace.begun
     if not path.exists():
         return "is missing" if "verify" in begun else ""
     sealed = list[str]()
@@ -105,14 +107,13 @@ def _why_lost(workspace: Workspace) -> str:
 
 
 def _make_again(context: Context, why: str, *, follows: bool) -> None:
-    workspace, begun = context.workspace, context.workspace.begun
+    workspace = context.workspace
+    begun = context.workspace.begun
     foreign = None
     if workspace.is_foreign:
         foreign = ForeignDatabase.of_record(workspace.require("copy"))
-    source, hint = (
-        foreign.path if foreign else f"{workspace.features.name} and {workspace.matches.name}",
-        "",
-    )
+    source = foreign.path if foreign else f"{workspace.features.name} and {workspace.matches.name}"
+    hint = ""
     if kept := _put_aside(workspace.database):
         again = f"map --from-database {shlex.quote(str(kept))} --output-path OTHER"
         hint = f"; 'colmap-affrect {again}' maps what was there"

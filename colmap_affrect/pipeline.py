@@ -2,96 +2,58 @@
 
 import math
 import time
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack, get_args
 
-from colmap_affrect.colmap.by_hand import NOTHING, ByHand, Marks, SizeOf
-from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
+from colmap_affrect.colmap.by_hand import ByHand, Marks, SizeOf
 from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
-from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.escalation.climb import climb
 from colmap_affrect.escalation.escalate import escalate, matched_again
 from colmap_affrect.features.weights import resolve
-from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
-from colmap_affrect.mappers.existing import Extension, existing_names
-from colmap_affrect.mappers.sparse import SparseOptions
+from colmap_affrect.mappers.existing import (
+    Extension,
+    as_extension,
+    existing_names,
+    read_to_extend,
+)
+from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.mend import watched
-from colmap_affrect.options import EFFORT_NAMES, EffortName
+from colmap_affrect.options import require_bools, takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
-from colmap_affrect.progress import SILENT, Forecast, Progress
+from colmap_affrect.progress import Forecast, GivenProgress, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.paths import PathLike, TakesPaths, as_path
-from colmap_affrect.project.report import (
-    ModelSummary,
-    ReconstructionReport,
-    StageReport,
-    installed_versions,
-    summed,
-)
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
+from colmap_affrect.project.report import StageReport, installed_versions, summed
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.advice import advice
-from colmap_affrect.report.pairs import pairs_of_page
-from colmap_affrect.report.run_page import write_run_page
-from colmap_affrect.session.context import Context, Inputs, Resources
-from colmap_affrect.stages.extract import extract
+from colmap_affrect.report.pairs import draw_pairs_to_check
+from colmap_affrect.report.run_page import RunContent, write_run_page
+from colmap_affrect.report.run_report import RunReport, cameras_of_report
+from colmap_affrect.session.context import Context, Resources
+from colmap_affrect.session.run_options import RunKeywords, RunOptions
+from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
 from colmap_affrect.stages.guide import guide, guided_counts
-from colmap_affrect.stages.map import image_names, map_images, unregistered
-from colmap_affrect.stages.match import load_matchers, match
-from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import verify_matches
+from colmap_affrect.stages.map import image_names, unregistered
+from colmap_affrect.stages.map import map_images as map_pairs
+from colmap_affrect.stages.match import load_matchers
+from colmap_affrect.stages.match import match as match_pairs
+from colmap_affrect.stages.pairs import choose_pairs as list_pairs
+from colmap_affrect.stages.verify import verify_matches as verify_pairs
 
 
-@dataclass(frozen=True, kw_only=True)
-class InputOptions(TakesPaths):
-    """What runs and comparisons of methods both depend on, beside images and recipes."""
-
-    cameras: CameraOptions = field(default_factory=CameraOptions)  # how images share cameras
-    masks: MaskOptions = field(default_factory=MaskOptions)  # where features may be
-    pairs: PairOptions = field(default_factory=PairOptions)  # which pairs are matched
-    verification: VerificationOptions = field(default_factory=VerificationOptions)
-    mapping: MapperOptions = field(default_factory=SparseOptions)  # the mapper and its options
-    image_list_path: Path | None = None  # the images to use; None: all below the folder
-    from_database: Path | None = None  # with the images, cameras, rigs, frames and pose priors used
-    resources: Resources = field(default_factory=Resources)  # weights and device of networks
-
-    def inputs(self, image_path: Path) -> Inputs:
-        """Return the photographs of a folder, with their cameras and masks."""
-        names = ("image_list_path", "from_database", "cameras", "masks")
-        return Inputs.of(image_path, **{name: getattr(self, name) for name in names})
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunOptions(InputOptions):
-    """Everything a run depends on beside its images and its output folder."""
-
-    recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
-    database_descriptors: bool = False  # also into the database, as COLMAP's matchers need them
-    extend: Extension | None = None  # the model that the photographs are registered into
-    by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
-    effort: EffortName = "normal"  # how much is tried for photographs in need
-    max_minutes: float = math.inf  # after which nothing more is tried for photographs in need
-    command: tuple[str, ...] = ()  # words of the command line, for advice
-
-    def __post_init__(self) -> None:
-        """Refuse what would fail, or do nothing, once the first model is there."""
-        super().__post_init__()
-        if self.effort not in EFFORT_NAMES:
-            raise OptionError(f"effort {self.effort!r} is not one of {', '.join(EFFORT_NAMES)}")
-        if not self.max_minutes >= 0.0:
-            raise OptionError(f"max_minutes {self.max_minutes!r}: must be at least 0")
-
-
+@takes_fields_of(RunOptions)
 def run(
     image_path: PathLike,
     output_path: PathLike,
@@ -100,45 +62,70 @@ def run(
     executor: Executor | None = None,
     overwrite: bool = False,
     page: bool = True,
-    progress: Progress = SILENT,
-) -> ReconstructionReport:
+    progress: GivenProgress = None,
+    **keywords: Unpack[RunKeywords],
+) -> RunReport:
     """Extract, match, verify and map; go on where an earlier run stopped.
-
-    Returns the report that is also written to ``report.json``. Raises AffrectError for anything
-    that the caller can mend; what is done stays.
 
     Args:
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder for all results, made if missing.
-        options: see :class:`RunOptions`.
+        options: options to begin with; None for the usual ones.
         executor: where images and pairs are worked on, e.g. a cluster
             (:func:`colmap_affrect.parallel.cluster.connected`); None: threads of this process.
         overwrite: discard results that are there.
         page: also write ``report.html``.
-        progress: where to show progress.
+        progress: True shows it on standard error, False nowhere; None where somebody looks at it,
+            on a terminal or in a notebook. See also :class:`Progress`.
+        keywords: fields of :class:`RunOptions`, as ``recipe="rectified"``,
+            ``cameras={"mode": "single"}`` or ``effort="high"``.
+
+    Returns:
+        The report that is also written to ``report.json``, with the models.
+
+    Raises:
+        OptionError: for wrong arguments, by their names.
+        AffrectError: for anything else that the caller can mend; what is done stays.
     """
-    image_path, output_path = as_path(image_path), as_path(output_path)
-    options = options or RunOptions()
-    recipe, mapper = options.recipe, MAPPERS.make(options.mapping)
+    image_path = as_path(image_path, "image_path")
+    hint = "; a recipe is given as recipe='NAME'" if isinstance(options, str) else ""
+    options = RunOptions.with_keywords(options, keywords, hint=hint)
+    require_bools(overwrite=overwrite, page=page)
+    context = replace(
+        _context(output_path, progress, options.resources, executor, options.by_hand),
+        deadline_s=time.monotonic() + 60 * options.max_minutes,
+        effort=options.effort,
+        command=options.command,
+    )
+    return _run(context, image_path, options, overwrite=overwrite, page=page)
+
+
+def _run(
+    context: Context, image_path: Path, options: RunOptions, *, overwrite: bool, page: bool
+) -> RunReport:
+    """Run all stages in the folder of a context, after everything that can be has been checked."""
+    recipe = options.recipe
+    workspace = context.workspace
+    mapper = MAPPERS.make(options.mapper_options())
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    _check_extension(options.extend, mapper, output_path, overwrite=overwrite)
+    _check_extension(options.extend, mapper, workspace.path, overwrite=overwrite)
     _check_by_hand(options.by_hand, names, mapper, lambda name: header_size(image_path / name))
     forecast = Forecast(len(names), _num_pairs(names, options.pairs, image_path))
-    workspace = Workspace(output_path)
-    context = _context_of(workspace, options, executor, replace(progress, forecast=forecast))
+    context = replace(context, progress=replace(context.progress, forecast=forecast))
     if options.extend:
         existing_names(options.extend.model_path, names)
     recipe.extraction.check_depth()
-    resolve(recipe.required_weights, options.resources.weights_path, progress=progress)
+    weights_path = options.resources.weights_path
+    resolve(recipe.required_weights, weights_path, progress=context.progress)
     load_matchers(context, recipe.extraction, recipe.matching)
-    later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
+    later = options.later_stages()
     with workspace.locked(), watched(context, follows=False, discards=overwrite):
         reports = [
-            extract(context, inputs, recipe, later=later, overwrite=overwrite),
-            choose_pairs(context, options.pairs),
-            match(context, recipe.matching),
-            verify_matches(context, options.verification),
+            extract_features(context, inputs, recipe, later=later, overwrite=overwrite),
+            list_pairs(context, options.pairs),
+            match_pairs(context, recipe.matching),
+            verify_pairs(context, options.verification),
         ]
         if not recipe.extraction.escalation:
             reports.append(guide(context, recipe.guided))
@@ -149,21 +136,6 @@ def run(
         if options.database_descriptors:
             fill_descriptors(workspace.database, context.features)
         return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
-
-
-def _context_of(
-    workspace: Workspace, options: RunOptions, executor: Executor | None, progress: Progress
-) -> Context:
-    return Context(
-        workspace,
-        options.resources,
-        executor,
-        progress,
-        deadline_s=time.monotonic() + 60 * options.max_minutes,
-        effort=options.effort,
-        by_hand=options.by_hand,
-        command=options.command,
-    )
 
 
 def _check_by_hand(
@@ -198,23 +170,194 @@ def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> 
     return count if is_all else min(count, len(names) * options.num_neighbors)
 
 
-def map_from_database(
+# One stage after the other, each from what the stages before have left in the output folder.
+
+
+@contextmanager
+def one_stage(name: str, context: Context, *, overwrite: bool = False) -> Iterator[Context]:
+    """Lock the folder of a context for one stage, and bring its database up to date before."""
+    is_first = name == "extract"
+    discards = is_first and overwrite
+    with (
+        context.workspace.locked(),
+        watched(context, follows=not is_first, maps=name == "map", discards=discards),
+    ):
+        yield context
+
+
+def _context(
+    output_path: PathLike,
+    progress: GivenProgress,
+    resources: Resources | Mapping[str, Any] | None = None,
+    executor: Executor | None = None,
+    by_hand: ByHand | Mapping[str, Any] | None = None,
+) -> Context:
+    """Return where a stage works and with what."""
+    path = as_path(output_path, "output_path")
+    if not (executor is None or callable(getattr(executor, "map", None))):
+        raise OptionError(f"executor={executor!r}: has no method 'map'; give an Executor")
+    if path.is_file():
+        wanted = "give the output folder of a run; map_database and verify_matches take databases"
+        raise OptionError(f"output_path={str(path)!r}: is a file; {wanted}")
+    return Context(
+        Workspace(path),
+        Resources.given(resources, "resources"),
+        executor,
+        Progress.given(progress),
+        by_hand=ByHand.given(by_hand, "by_hand"),
+    )
+
+
+@takes_fields_of(RunOptions)
+def extract(
+    image_path: PathLike,
+    output_path: PathLike,
+    options: RunOptions | None = None,
+    *,
+    executor: Executor | None = None,
+    overwrite: bool = False,
+    progress: GivenProgress = None,
+    **keywords: Unpack[RunKeywords],
+) -> StageReport:
+    """Extract features into ``features.h5``, cameras and keypoints into ``database.db``.
+
+    Arguments are those of :func:`run`; options of later stages are kept for these.
+
+    Returns:
+        How many images were extracted, and why others were not.
+    """
+    image_path = as_path(image_path, "image_path")
+    options = RunOptions.with_keywords(options, keywords)
+    require_bools(overwrite=overwrite)
+    inputs = options.inputs(image_path)
+    later = options.later_stages()
+    context = _context(output_path, progress, options.resources, executor)
+    with one_stage("extract", context, overwrite=overwrite):
+        report = extract_features(context, inputs, options.recipe, later=later, overwrite=overwrite)
+        if options.database_descriptors:
+            fill_descriptors(context.workspace.database, context.features)
+    return report
+
+
+def choose_pairs(
+    output_path: PathLike,
+    pairs: PairOptions | Mapping[str, Any] | None = None,
+    *,
+    overwrite: bool = False,
+    progress: GivenProgress = None,
+) -> StageReport:
+    """Write ``pairs.txt``, which says which images are matched.
+
+    Args:
+        output_path: folder that :func:`extract` was given.
+        pairs: which; None: as :func:`extract` was told, else all.
+        overwrite: discard the results of this and later stages.
+        progress: see :func:`run`.
+    """
+    require_bools(overwrite=overwrite)
+    chosen = None if pairs is None else PairOptions.given(pairs, "pairs")
+    with one_stage("pairs", _context(output_path, progress)) as context:
+        return list_pairs(context, chosen, overwrite=overwrite)
+
+
+def match(
+    output_path: PathLike,
+    matching: MatcherOptions | Mapping[str, Any] | str | None = None,
+    *,
+    resources: Resources | Mapping[str, Any] | None = None,
+    executor: Executor | None = None,
+    overwrite: bool = False,
+    progress: GivenProgress = None,
+) -> StageReport:
+    """Match the pairs of ``pairs.txt``, into ``matches.h5`` and ``database.db``.
+
+    Args:
+        output_path: folder that :func:`choose_pairs` was given.
+        matching: the matcher and its options, or its name; None: that of the recipe.
+        resources: weights and device of networks.
+        executor: see :func:`run`.
+        overwrite: discard the results of this and later stages.
+        progress: see :func:`run`.
+    """
+    require_bools(overwrite=overwrite)
+    matcher = None if matching is None else MATCHERS.options(matching, "matching")
+    context = _context(output_path, progress, resources, executor)
+    with one_stage("match", context):
+        return match_pairs(context, matcher, overwrite=overwrite)
+
+
+def verify(
+    output_path: PathLike,
+    verification: VerificationOptions | Mapping[str, Any] | None = None,
+    *,
+    overwrite: bool = False,
+    progress: GivenProgress = None,
+) -> StageReport:
+    """Estimate the two-view geometries of the matched pairs, into ``database.db``.
+
+    Args:
+        output_path: folder that :func:`match` was given.
+        verification: its options; None: as :func:`extract` was told.
+        overwrite: discard the results of this and later stages.
+        progress: see :func:`run`.
+    """
+    require_bools(overwrite=overwrite)
+    chosen = None
+    if verification is not None:
+        chosen = VerificationOptions.given(verification, "verification")
+    with one_stage("verify", _context(output_path, progress)) as context:
+        return verify_pairs(context, chosen, overwrite=overwrite)
+
+
+def map_images(
+    output_path: PathLike,
+    mapping: MapperOptions | Mapping[str, Any] | str | None = None,
+    *,
+    extend: Extension | PathLike | None = None,
+    by_hand: ByHand | Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+    page: bool = True,
+    progress: GivenProgress = None,
+) -> RunReport:
+    """Make models of the verified pairs, in ``sparse/0``, ``sparse/1`` and so on.
+
+    Args:
+        output_path: folder that :func:`verify` was given.
+        mapping: the mapper and its options, or its name; None: as :func:`extract` was told.
+        extend: a model that the images are registered into, or its folder.
+        by_hand: tie points, wrong pairs, photographs to leave out.
+        overwrite: discard the models that are there.
+        page: also write ``report.html``.
+        progress: see :func:`run`.
+
+    Returns:
+        The report that is also written to ``report.json``, with the models.
+    """
+    require_bools(overwrite=overwrite, page=page)
+    extension = as_extension(extend)
+    chosen = None if mapping is None else _mapper_of(mapping)
+    with one_stage("map", _context(output_path, progress, by_hand=by_hand)) as context:
+        mapper = chosen or MAPPERS.make(context.mapping)
+        return map_and_report(context, mapper, extension, overwrite=overwrite, page=page)
+
+
+def map_database(  # noqa: PLR0913 (all but two are keywords)
     database_path: PathLike,
     output_path: PathLike,
     *,
     image_path: PathLike | None = None,
-    cameras: CameraOptions | None = None,
+    cameras: CameraOptions | Mapping[str, Any] | None = None,
     matches_path: PathLike | None = None,
     match_type: MatchType = "raw",
     match_list_path: PathLike | None = None,
-    mapping: MapperOptions | None = None,
-    verification: VerificationOptions | None = None,
-    extend: Extension | None = None,
-    by_hand: ByHand = NOTHING,
+    mapping: MapperOptions | Mapping[str, Any] | str | None = None,
+    verification: VerificationOptions | Mapping[str, Any] | None = None,
+    extend: Extension | PathLike | None = None,
+    by_hand: ByHand | Mapping[str, Any] | None = None,
     overwrite: bool = False,
     page: bool = True,
-    progress: Progress = SILENT,
-) -> ReconstructionReport:
+    progress: GivenProgress = None,
+) -> RunReport:
     """Map a database of any program; it is copied and stays as it is.
 
     Pairs without two-view geometry are verified; where no images are matched, they are matched by
@@ -224,46 +367,62 @@ def map_from_database(
         database_path: the database.
         output_path: folder for all results, made if missing.
         image_path: folder of the photographs, for the colours of the points.
-        cameras: what is known of the cameras of its images; which images share one stays.
+        cameras: what is known of its cameras; which images share one stays.
         matches_path: a file of matches (:mod:`colmap_affrect.pairs.given_matches`).
         match_type: what it has, ``raw`` matches or ``inliers``.
         match_list_path: pairs to match by descriptors; None: all.
-        mapping: the mapper and its options.
+        mapping: the mapper and its options, or its name; None for the sparse mapper.
         verification: of pairs that are not verified.
-        extend: a model that the images are registered into.
+        extend: a model that the images are registered into, or its folder.
         by_hand: tie points, wrong pairs, photographs to leave out.
         overwrite: discard results that are there.
         page: also write ``report.html``.
-        progress: where to show progress.
+        progress: see :func:`run`.
+
+    Returns:
+        The report that is also written to ``report.json``, with the models.
     """
-    database_path, output_path = as_path(database_path), as_path(output_path)
-    mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
-    schema_version(database_path)  # refuses what is no database before anything is made
-    _check_extension(extend, mapper, output_path, overwrite=overwrite)
-    if extend:
-        read_given_model(extend.model_path, "--extend ")
-    sizes = read_sizes(database_path)
-    _check_by_hand(by_hand, read_names(database_path), mapper, sizes.get)
+    require_bools(overwrite=overwrite, page=page)
     foreign = ForeignDatabase(
-        database_path,
-        as_path(image_path) if image_path else None,
-        cameras or CameraOptions(),
-        as_path(matches_path) if matches_path else None,
+        as_path(database_path, "database_path"),
+        as_path_or_none(image_path, "image_path"),
+        CameraOptions.given(cameras, "cameras"),
+        as_path_or_none(matches_path, "matches_path"),
         match_type,
-        as_path(match_list_path) if match_list_path else None,
+        as_path_or_none(match_list_path, "match_list_path"),
     )
-    foreign.check()
-    context = Context(Workspace(output_path), progress=progress, by_hand=by_hand)
+    context = _context(output_path, progress, by_hand=by_hand)
+    mapper = _mapper_of(mapping)
+    chosen = VerificationOptions.given(verification, "verification")
+    extension = as_extension(extend)
+    _check_foreign(context, foreign, mapper, extension, overwrite=overwrite)
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
-        chosen = verification or VerificationOptions()
         report = copy_verified(context, foreign, chosen, overwrite=overwrite)
-        return map_and_report(context, mapper, extend, earlier=[report], page=page)
+        return map_and_report(context, mapper, extension, earlier=[report], page=page)
 
 
-def _extended(record: CameraRecord, before: Sequence[str]) -> CameraRecord:
-    """Say of a camera that nobody knew but the model that is extended that it is from there."""
-    is_known = record.source == "guess" and not set(before).isdisjoint(record.names)
-    return replace(record, source="model", lens_mm=0.0) if is_known else record
+def _mapper_of(mapping: MapperOptions | Mapping[str, Any] | str | None) -> Mapper:
+    return MAPPERS.make(MAPPERS.options(mapping or MAPPERS.default, "mapping"))
+
+
+def _check_foreign(
+    context: Context,
+    foreign: ForeignDatabase,
+    mapper: Mapper,
+    extend: Extension | None,
+    *,
+    overwrite: bool,
+) -> None:
+    """Refuse what cannot be mapped, or not so, before anything is made."""
+    if foreign.match_type not in get_args(MatchType):
+        raise OptionError(f"match_type={foreign.match_type!r}: give 'raw' or 'inliers'")
+    schema_version(foreign.path)
+    _check_extension(extend, mapper, context.workspace.path, overwrite=overwrite)
+    if extend:
+        read_to_extend(extend.model_path)
+    sizes = read_sizes(foreign.path)
+    _check_by_hand(context.by_hand, read_names(foreign.path), mapper, sizes.get)
+    foreign.check()
 
 
 def map_and_report(
@@ -274,15 +433,16 @@ def map_and_report(
     earlier: Sequence[StageReport] = (),
     overwrite: bool = False,
     page: bool = True,
-) -> ReconstructionReport:
+) -> RunReport:
     """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
-    workspace, options = context.workspace, mapper.options
+    workspace = context.workspace
+    options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
     sizes = read_sizes(workspace.database)
     marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
-    report, models = map_images(context, mapper, extend, overwrite=overwrite)
+    report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
     lost = dict.fromkeys(gone, "is gone since its features were extracted; these are used")
     report = replace(report, warnings={**report.warnings, **lost})
     copied = workspace.is_foreign
@@ -291,7 +451,8 @@ def map_and_report(
     missing = unregistered(context, names, models, pair_inliers)
     again = matched_again(context)
     strongest = max(pair_inliers.values(), default=0)
-    result = ReconstructionReport(
+    result = RunReport(
+        output_path=workspace.path,
         images_total=len(names),
         unregistered=missing,
         models=tuple(models),
@@ -304,7 +465,7 @@ def map_and_report(
         verification=context.verification.to_mapping(),
         mapping=options.to_mapping(),
         guided={} if copied else guided_counts(context),
-        cameras=_cameras_of(workspace, models, before),
+        cameras=cameras_of_report(workspace, models, before),
         extended=tuple(before),
         advice=advice(context, missing, models, strongest, again.untried, again.effort),
         by_hand=context.by_hand.texts(),
@@ -315,29 +476,10 @@ def map_and_report(
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
     replace_text(workspace.report, result.to_json())
     if page:
-        image_path = workspace.photographs()
-        looks, progress = pairs_of_page(context, result, pair_inliers), context.progress
-        write_run_page(
-            workspace, result, names, pair_inliers, image_path, progress, marks=marks, looks=looks
-        )
+        pictures = draw_pairs_to_check(context, result, pair_inliers)
+        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures)
+        write_run_page(workspace, result, content, context.progress)
     return result
-
-
-def _cameras_of(
-    workspace: Workspace, models: Sequence[ModelSummary], before: Sequence[str]
-) -> tuple[dict[str, Any], ...]:
-    """Return what a report has of the cameras, as the largest model has them.
-
-    Args:
-        workspace: with the record of the cameras.
-        models: the largest first.
-        before: names of the images of the model that was extended.
-    """
-    largest = models[0] if models else None
-    found = list[dict[str, Any]]()
-    for camera_id, record in read_camera_records(workspace.cameras).items():
-        found.append(_extended(record, before).to_report(camera_id, largest))
-    return tuple(found)
 
 
 def _names_and_gone(context: Context, *, may_be_gone: bool) -> tuple[list[str], list[str]]:

@@ -1,6 +1,7 @@
 """Progress of long stages: a tqdm bar, lines or silence; and when the first model will be there."""
 
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +11,7 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-from colmap_affrect.errors import shown
+from colmap_affrect.errors import OptionError, shown
 
 Advance = Callable[[int], None]  # report that so many more units are done
 NUM_PLAIN_LINES = 10
@@ -36,7 +37,8 @@ class Forecast:
     def begin(self, name: str, total: int) -> None:
         """A stage begins with so many units."""
         is_known = self._costs.pop(name, None) is not None
-        self._cost, self._start_s = is_known * COSTS.get(name, 0.0) * total, self._clock()
+        self._cost = is_known * COSTS.get(name, 0.0) * total
+        self._start_s = self._clock()
 
     def text(self, frac: float) -> str:
         """Say how long the first model takes, when a fraction of the stage is done.
@@ -56,12 +58,42 @@ class Forecast:
 
 @dataclass(eq=False)
 class Progress:
-    """Where progress goes; the library is silent unless it is given one of these."""
+    """Where progress goes, and how it is shown: a bar on a terminal or in a notebook, else lines.
 
-    stream: TextIO | None = None  # None is silence
-    num_plain_lines: int = NUM_PLAIN_LINES  # of a stage at most, where the stream is no terminal
-    title: str = ""  # with which the names of stages begin
-    forecast: Forecast | None = None  # to say how long all stages take
+    Attributes:
+        stream: where it is written to, as ``sys.stderr``; None is silence.
+        num_plain_lines: most lines of a stage, where the stream takes no bars.
+        title: with which the names of stages begin.
+        forecast: says how long all stages take.
+    """
+
+    stream: TextIO | None = None
+    num_plain_lines: int = NUM_PLAIN_LINES
+    title: str = ""
+    forecast: Forecast | None = None
+
+    @classmethod
+    def given(cls, progress: "GivenProgress") -> "Progress":
+        """Return what the argument ``progress`` of a function asks for.
+
+        Args:
+            progress: one of these as it is; True for standard error, False for silence; None for
+                standard error where somebody looks at it, on a terminal or in a notebook.
+        """
+        if isinstance(progress, cls):
+            return progress
+        if not (progress is None or isinstance(progress, bool)):
+            raise OptionError(f"progress={progress!r}: give True, False or a Progress")
+        shown = cls(sys.stderr)
+        is_wanted = shown.takes_bars if progress is None else progress
+        return shown if is_wanted else SILENT
+
+    @property
+    def takes_bars(self) -> bool:
+        """Whether the stream can replace what it has shown."""
+        if self.stream is None:
+            return False
+        return self.stream.isatty() or (self.stream is sys.stderr and _is_notebook())
 
     @property
     def file_number(self) -> int:
@@ -74,7 +106,9 @@ class Progress:
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
         """Show one stage of ``total`` units for as long as the context lasts."""
-        forecast, stream, title = self.forecast, self.stream, self.title + name
+        forecast = self.forecast
+        stream = self.stream
+        title = self.title + name
         done = num_lines = 0
         if forecast:
             forecast.begin(name, total)
@@ -96,7 +130,7 @@ class Progress:
 
         if stream is None or total == 0:
             yield lambda _: None
-        elif stream.isatty():
+        elif self.takes_bars:
             with tqdm(total=total, desc=title, unit=unit, file=stream) as bar, _ticking(bar):
 
                 def advance(count: int) -> None:
@@ -129,6 +163,14 @@ def _ticking(bar: tqdm) -> Iterator[None]:
 
 
 SILENT = Progress()
+GivenProgress = Progress | bool | None
+"""What functions take as ``progress``, see :meth:`Progress.given`."""
+
+
+def _is_notebook() -> bool:
+    """Tell whether this process is the kernel of a notebook, whose cells show bars."""
+    interactive = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return interactive is not None and "IPKernelApp" in interactive.config
 
 
 def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:

@@ -6,6 +6,7 @@ A section is the options of a part, which ``name`` chooses; what is left out kee
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -20,12 +21,16 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.options import Options, suggestion, within
+from colmap_affrect.project.argument_types import checks_arguments
+from colmap_affrect.project.paths import as_path
+from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions, IdentityOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
 
 AnyRectifier = Annotated[SerializeAsAny[RectifierOptions], BeforeValidator(RECTIFIERS.options)]
 AnyFeatures = Annotated[SerializeAsAny[FeatureOptions], BeforeValidator(EXTRACTORS.options)]
 AnyMatcher = Annotated[SerializeAsAny[MatcherOptions], BeforeValidator(MATCHERS.options)]
+AnyMapper = Annotated[SerializeAsAny[MapperOptions], BeforeValidator(MAPPERS.options)]
 ImageSize = Annotated[int, within(16, 1_000_000)]
 
 
@@ -33,9 +38,13 @@ class LevelOptions(Options):
     """A level of escalation; what is not given is as it is for all images."""
 
     rectifier: AnyRectifier = IdentityOptions()
+    """Warps of this level."""
     features: AnyFeatures | None = None
+    """Features of the image and its warps; None: those of all images."""
     matching: AnyMatcher | None = None
+    """How pairs are matched; None: as the recipe says."""
     max_image_size_px: ImageSize | None = None
+    """Larger images are shrunk to this longer side; None: as the recipe says."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +62,10 @@ class Level:
     @property
     def name(self) -> str:
         """Name in reports."""
-        warps, own = self.rectifier.name, self.features.name if self.base else ""
-        return own if own and warps == "identity" else f"{warps} {own}".rstrip()
+        warps = self.rectifier.name
+        own = self.features.name if self.base else ""
+        adds_nothing = self.rectifier.warps == "none"
+        return own if own and adds_nothing else f"{warps} {own}".rstrip()
 
     @property
     def network_parts(self) -> tuple[NetworkOptions, ...]:
@@ -83,7 +94,9 @@ class ExtractionOptions(Options):
     escalation: Annotated[tuple[LevelOptions, ...], Field(strict=False)] = ()
     """For pairs that fail verification, one after the other until it succeeds."""
     features: AnyFeatures = SiftOptions()
+    """Features of the image and its warps."""
     depth: DepthOptions = DepthOptions()
+    """Depth maps, for rectifiers that read them."""
     max_image_size_px: ImageSize = 2400
     """Larger images are shrunk to this longer side before extraction, which bounds memory. COLMAP's
     limit for SIFT is 3200."""
@@ -94,9 +107,11 @@ class ExtractionOptions(Options):
     @property
     def levels(self) -> tuple[Level, ...]:
         """All levels, that of every image first."""
-        size, found = self.max_image_size_px, list[Level]()
+        size = self.max_image_size_px
+        found = list[Level]()
         for item in (LevelOptions(rectifier=self.rectifier), *self.escalation):
-            features, limit = item.features or self.features, item.max_image_size_px or size
+            features = item.features or self.features
+            limit = item.max_image_size_px or size
             alike = (k for k, level in enumerate(found)
                      if (level.features, level.max_image_size_px) == (features, limit))  # fmt: skip
             base = next(alike, len(found))
@@ -150,8 +165,11 @@ class Recipe(ExtractionOptions):
     summary: str = ""
     """One line for people."""
     matching: AnyMatcher = NearestOptions()
+    """How pairs are matched."""
     escalate: EscalateOptions = EscalateOptions()
+    """Which pairs are matched again by the levels of ``escalation``."""
     guided: GuidedOptions = GuidedOptions()
+    """Matching once more along the epipolar lines of verified pairs."""
     mapping: dict[str, Any] = Field(default_factory=dict)
     """``name`` of the mapper and options that differ from the preset."""
 
@@ -214,13 +232,30 @@ def recipe_names() -> list[str]:
     return sorted(path.stem for path in recipe_folder().glob("*.toml"))
 
 
-def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
+def as_recipe(given: Any) -> Recipe:
+    """Return a recipe: as it is, by its name or the path of a TOML file, or from its sections."""
+    if isinstance(given, Recipe):
+        return given
+    if isinstance(given, str | PathLike):
+        return load_recipe(str(given))
+    if isinstance(given, Mapping):
+        return Recipe(**given)
+    raise OptionError(f"recipe={given!r}: give a Recipe, a name, a path or a dictionary")
+
+
+GivenRecipe = Annotated[Recipe, BeforeValidator(as_recipe)]
+"""Field of options that takes what :func:`as_recipe` takes."""
+
+
+@checks_arguments
+def load_recipe(name: str | PathLike[str], settings: str | Sequence[str] = ()) -> Recipe:
     """Load a recipe by its name or the path of a TOML file, and change single options.
 
     ``settings`` are ``section.option=value`` with a TOML value; strings may go without quotes.
     ``section=name`` chooses another part, with its defaults.
     Raises OptionError for an unknown recipe or option, or a value out of range.
     """
+    name = name if isinstance(name, str) else str(as_path(name))
     is_file = name.endswith(".toml")
     if not is_file and name not in recipe_names():
         raise OptionError(f"unknown recipe '{name}'{suggestion(name, recipe_names())}")
@@ -228,12 +263,12 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
     if path.exists() and not path.is_file():  # a pipe would be read only once
         raise OptionError(f"recipe {path}: is not a file; give the path of a TOML file")
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        values = tomllib.loads(read_regular_text(path, "utf-8-sig"))
     except FileNotFoundError as error:
         raise OptionError(f"recipe {name}: no such file") from error
     except (OSError, ValueError, RecursionError) as error:  # what tomllib raises on odd files
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
-    changed = with_settings(values, settings)
+    changed = with_settings(values, [settings] if isinstance(settings, str) else settings)
     return Recipe.from_mapping({**changed, "name": name}, f"recipe {name}")
 
 

@@ -16,8 +16,10 @@ from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.stages.one_image import prepare
 
-OUTSIDE = {"README.md": "index.md", "BENCHMARKS.md": "BENCHMARKS.md",
-           "ARCHITECTURE.md": "ARCHITECTURE.md"}  # fmt: skip
+OUTSIDE = {"README.md": "index.md"}
+OUTSIDE |= {
+    name: name for name in ("ARCHITECTURE.md", "BENCHMARKS.md", "CHANGELOG.md", "CONTRIBUTING.md")
+}
 PHOTOGRAPH = "sample_scenes/facade/images/view_3_tilt45.jpg"
 """One plane, seen at 45 degrees."""
 

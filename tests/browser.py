@@ -27,7 +27,8 @@ needs_chromium = pytest.mark.skipif(
 
 def _call(address: str, method: str = "POST", **arguments: Any) -> Any:
     """Send a command of WebDriver and return its value."""
-    data, headers = json.dumps(arguments).encode(), {"Content-Type": "application/json"}
+    data = json.dumps(arguments).encode()
+    headers = {"Content-Type": "application/json"}
     request = urllib.request.Request(address, data, headers, method=method)
     with urllib.request.urlopen(request, timeout=60) as answer:
         return json.load(answer)["value"]

@@ -52,7 +52,10 @@ def on_photographs(photos: Path, out: Path) -> list[str]:
 
 
 def start(
-    *arguments: object, python: Sequence[str] = (), stderr: int = subprocess.PIPE
+    *arguments: object,
+    python: Sequence[str] = (),
+    stderr: int = subprocess.PIPE,
+    start_new_session: bool = False,
 ) -> subprocess.Popen[str]:
     """Start the command line in a process of its own, which Ctrl-C ends.
 
@@ -63,6 +66,7 @@ def start(
         stdout=subprocess.PIPE,
         stderr=stderr,
         text=True,
+        start_new_session=start_new_session,
         preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - no threads
     )
 

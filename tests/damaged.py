@@ -39,7 +39,8 @@ def noise(data: bytearray, chance: random.Random) -> None:
 
 
 def exchanged(data: bytearray, chance: random.Random) -> None:
-    source, target = _page(data, chance), _page(data, chance)
+    source = _page(data, chance)
+    target = _page(data, chance)
     data[target] = data[source][: target.stop - target.start]
 
 
@@ -72,12 +73,15 @@ def damage(
 
     Its times stay as they were half of the times: disks fail, too.
     """
-    stat, data = path.stat(), bytearray(path.read_bytes())
-    before, done = bytes(data), ""
+    stat = path.stat()
+    data = bytearray(path.read_bytes())
+    before = bytes(data)
+    done = ""
     while data == before:
         if others and chance.randrange(len(harms) + 1) == 0:
             other = chance.choice([other for other in others if other.name != path.name])
-            data, done = bytearray(other.read_bytes()), f"content of {other.name}"
+            data = bytearray(other.read_bytes())
+            done = f"content of {other.name}"
         else:
             harm = chance.choice(harms)
             harm(data, chance)

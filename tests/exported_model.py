@@ -15,7 +15,8 @@ NAMES = ("a.png", "b.png", "side/c.png", "d.png")
 
 def write_model(folder: Path, camera_model: str = "SIMPLE_RADIAL") -> pycolmap.Reconstruction:
     """Write a model of four images and sixty points, whose keypoints are exact."""
-    rng, model = np.random.default_rng(3), pycolmap.Reconstruction()
+    rng = np.random.default_rng(3)
+    model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, camera_model, 150.0, *SIZE)
     params = np.array(camera.params)
     params[camera.principal_point_idxs()] = [75.0, 66.0]

@@ -45,11 +45,13 @@ def hloc_names(path: Path) -> set[str]:
 
 
 def hloc_matches(path: Path, name0: str, name1: str) -> tuple[Array, Array]:
-    first, second = name0.replace("/", "-"), name1.replace("/", "-")
+    first = name0.replace("/", "-")
+    second = name1.replace("/", "-")
     with h5py.File(path, "r") as file:
         is_reversed = f"{first}/{second}" not in file
         group = file[f"{second}/{first}" if is_reversed else f"{first}/{second}"]
-        matches, scores = group["matches0"][()], group["matching_scores0"][()]
+        matches = group["matches0"][()]
+        scores = group["matching_scores0"][()]
     rows = np.flatnonzero(matches != -1)
     pairs = np.stack([rows, matches[rows]], axis=-1)
     return pairs[:, ::-1] if is_reversed else pairs, scores[rows]
@@ -102,7 +104,8 @@ class Files:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.photos = write_photos(folder / "photos", NAMES)
-        self.features, self.matches = folder / "features.h5", folder / "matches.h5"
+        self.features = folder / "features.h5"
+        self.matches = folder / "matches.h5"
         self.database = folder / "new.db"
         write_h5(self.features, {name: hloc_group(3 + n, n) for n, name in enumerate(NAMES)})
         write_h5(self.matches, {"a.png/sub-b c.png": match_group([2, -1, 0])})

@@ -18,8 +18,8 @@ PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
     "lines of the longest file": 500,
     "lines of the longest function": 60,
-    "imports between folders": 215,
-    "words of ARCHITECTURE.md": 2_600,
+    "imports between folders": 220,
+    "words of ARCHITECTURE.md": 3_100,
     "words of BENCHMARKS.md": 2_600,
 }
 """What a stranger can still read in one go. How many lines there are in all has no limit."""
@@ -42,10 +42,14 @@ def imported_rooms(tree: ast.Module) -> Iterator[str]:
 def main() -> int:
     """Print the table and the limits."""
     rooms = Counter[str]()
-    arrows, files, functions = set(), [], []
+    arrows = set()
+    files = []
+    functions = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        text, where = path.read_text(encoding="utf-8"), path.relative_to(PACKAGE)
-        tree, room = ast.parse(text), where.parts[0].removesuffix(".py")
+        text = path.read_text(encoding="utf-8")
+        where = path.relative_to(PACKAGE)
+        tree = ast.parse(text)
+        room = where.parts[0].removesuffix(".py")
         rooms[room] += text.count("\n")
         arrows |= {(room, other) for other in imported_rooms(tree) if other != room}
         files.append((text.count("\n"), str(where)))

@@ -78,7 +78,8 @@ def nearest_planes(
 def look_up(texture: GrayImage, x: NDArray[np.floating], y: NDArray[np.floating]) -> GrayImage:
     """Values of a texture at points of its pixel grid; its border is reflected once."""
     height, width = texture.shape
-    x, y = np.clip(x, -width, 2 * width), np.clip(y, -height, 2 * height)
+    x = np.clip(x, -width, 2 * width)
+    y = np.clip(y, -height, 2 * height)
     maps = x.astype(np.float32), y.astype(np.float32)
     return cv2.remap(texture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
 
@@ -165,7 +166,8 @@ def write_panoramas(folder: Path, count: int) -> None:
     normals = np.concatenate([np.eye(3), -np.eye(3)])  # inwards
     width, height = PANORAMA_SIZE
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    yaw, pitch = (2 * x / width - 1) * np.pi, (2 * y / height - 1) * np.pi / 2
+    yaw = (2 * x / width - 1) * np.pi
+    pitch = (2 * y / height - 1) * np.pi / 2
     towards = [np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)]
     directions = np.stack(towards, axis=-1)
     for index in range(count):

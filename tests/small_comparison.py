@@ -41,7 +41,8 @@ def make_comparison(folder: Path) -> Comparison:
         _method("broken", [], failed="weights <affnet> & more are missing"),
         _method("default", [first, replace(second, models=models, points3D=70)]),
     )
-    settings, versions = {"camera": {"mode": "auto"}}, {"pycolmap": pycolmap.__version__}
+    settings = {"camera": {"mode": "auto"}}
+    versions = {"pycolmap": pycolmap.__version__}
     return Comparison(
         tuple(sorted(NAMES)), str(photographs), methods, (0, 1), 15, settings, versions
     )
@@ -52,7 +53,9 @@ def write_scene(
 ) -> tuple[pycolmap.Reconstruction, dict[Pair, int]]:
     """Write a database of all images; return their model and the inliers of all pairs."""
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, len(names), 90
+    options.num_rigs = 1
+    options.num_frames_per_rig = len(names)
+    options.num_points3D = 90
     options.camera_width, options.camera_height = IMAGE_SIZE
     options.camera_model_id = pycolmap.CameraModelId.PINHOLE
     options.camera_params = [200.0, 200.0, 80.0, 60.0]

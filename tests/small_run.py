@@ -17,8 +17,9 @@ from colmap_affrect.project.report import (
     StageReport,
 )
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.pairs import PairPicture
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.report.run_page import RunContent, write_run_page
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "b\u202egnp.c", "c.png", "d.png", "e.png", "f.png")
 """The second one is shown turned round where nobody takes care."""
@@ -78,12 +79,12 @@ def make_run_page(folder: Path) -> Path:
         if image.name not in NAMES[:4]:
             model.deregister_frame(image.frame_id)
     pycolmap.Reconstruction(model).write(workspace.sparse / "0")
-    look = {
-        "names": NAMES[:2],
-        "why": f"{NAMES[0]} is doubtful; guided",
-        "text": "120 raw matches of level 0 (dense-shapes), 60 inliers",
-        "option": f"--reject-pair '{NAMES[0]},{NAMES[1]}'",
-        "picture": Picture.of(np.zeros((450, 900, 3), np.uint8)),
-    }
-    report = small_report(folder)
-    return write_run_page(workspace, report, NAMES, pairs, photographs, looks=[look] * 3)
+    pair = PairPicture(
+        names=NAMES[:2],
+        why=f"{NAMES[0]} is doubtful; guided",
+        text="120 raw matches of level 0 (dense-shapes), 60 inliers",
+        option=f"--reject-pair '{NAMES[0]},{NAMES[1]}'",
+        picture=Picture.from_image(np.zeros((450, 900, 3), np.uint8)),
+    )
+    content = RunContent(NAMES, pairs, photographs, pairs_to_check=[pair] * 3)
+    return write_run_page(workspace, small_report(folder), content)

@@ -47,7 +47,8 @@ def photograph(
     """Render the faces, each over those before it; another seed makes another room."""
     width, height = IMAGE_SIZE
     camera = np.array([[FOCAL_PX, 0, width / 2 - 0.5], [0, FOCAL_PX, height / 2 - 0.5], [0, 0, 1]])
-    image, size = np.full((height, width), 90, np.uint8), (TEXTURE_PX, TEXTURE_PX)
+    image = np.full((height, width), 90, np.uint8)
+    size = (TEXTURE_PX, TEXTURE_PX)
     for seed, (origin, edge1, edge2) in enumerate(FACES, first_seed):
         plane = np.column_stack([edge1, edge2, np.subtract(origin, position)])
         plane = camera @ world_to_camera(yaw_deg) @ plane @ np.diag([1 / TEXTURE_PX] * 2 + [1])

@@ -69,7 +69,8 @@ def texture(size: tuple[int, int], seed: int, finest_sigma_px: float = 1.2) -> G
 
 def circles(centers: ArrayLike, sigmas_px: ArrayLike) -> LocalFeatures:
     """Upright features in order of falling response, as a detector returns them."""
-    points, sigmas = np.asarray(centers, float), np.asarray(sigmas_px, float)
+    points = np.asarray(centers, float)
+    sigmas = np.asarray(sigmas_px, float)
     lafs = lafs_from_keypoints(points, MEASUREMENT_SIGMAS * sigmas, np.zeros(len(points)))
     responses = np.linspace(1.0, 0.5, len(points), dtype=np.float32)
     ids = np.arange(len(points), dtype=np.int32)

@@ -11,7 +11,7 @@ from synthetic import blobs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.features.sift import RootSift, SiftOptions
-from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.affine import project, transform_lafs
 from colmap_affrect.geometry.conventions import (
     colmap_from_pixel,
     grid_origin,
@@ -29,7 +29,8 @@ UPSCALE_BIAS_PX = 0.05
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_colmap_counts_from_the_corner_half_a_pixel_further_in_x_and_y(dtype: type) -> None:
     points = np.array([[0.0, 7.0]], dtype=dtype)
-    colmap, pixel = colmap_from_pixel(points), pixel_from_colmap(points)
+    colmap = colmap_from_pixel(points)
+    pixel = pixel_from_colmap(points)
     assert (colmap.dtype, colmap.tolist()) == (dtype, [[0.5, 7.5]])
     assert (pixel.dtype, pixel.tolist()) == (dtype, [[-0.5, 6.5]])
     assert points.tolist() == [[0.0, 7.0]], "the argument stays"
@@ -47,7 +48,7 @@ def test_resized_from_original_maps_image_corners_to_image_corners(
 
 def test_resized_from_original_scales_affine_shapes_by_rows() -> None:
     laf = np.array([[[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]])
-    resized = transform_frames(resized_from_original((8, 8), (8, 4)), laf)
+    resized = transform_lafs(resized_from_original((8, 8), (8, 4)), laf)
     assert_allclose(resized[0, :, :2], [[1.0, 2.0], [1.5, 2.0]])
 
 

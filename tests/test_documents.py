@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import inspect
 import pkgutil
 import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 import colmap_affrect
 from colmap_affrect.cli.parser import COMMANDS, build_parser
+from colmap_affrect.colmap.cameras import Source
 from colmap_affrect.project.record import STAGES
 from colmap_affrect.recipes import load_recipe
 
 ROOT = Path(__file__).parents[1]
-PAGES = ["README.md", "BENCHMARKS.md", "sample_scenes/README.md"]
+PAGES = ["README.md", "BENCHMARKS.md", "CHANGELOG.md", "CONTRIBUTING.md"]
+PAGES += ["sample_scenes/README.md"]
 PAGES += sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.md"))
 TEXTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in PAGES}
 FOREIGN = {
@@ -93,7 +98,9 @@ def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
             script = "recipes/" in code or "tests/" in code
             assert script or flag in {*ALL_FLAGS, *FOREIGN}, code
         if re.fullmatch(r"colmap_affrect(\.\w+)+", code):
-            pkgutil.resolve_name(code)
+            found = pkgutil.resolve_name(code)
+            is_public = code.split(".")[1] in colmap_affrect.__all__
+            assert is_public or inspect.ismodule(found), f"{code}: import colmap_affrect has none"
         if words[0] == "--recipe" and words[1:] and not words[1].isupper() and ".toml" not in code:
             load_recipe(words[1])
         if words[0] == "--set" and "=" in code:
@@ -122,6 +129,40 @@ def test_links_lead_somewhere(name: str) -> None:
             assert anchor in slugs, target
 
 
+def said_by_the_program() -> set[str]:
+    """All pieces of text in the code, between what is filled in."""
+    checks = ROOT / "colmap_affrect" / "colmap" / "checks.toml"
+    found = {checks.read_text(encoding="utf-8")}
+    for path in (ROOT / "colmap_affrect").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value.removeprefix("error: ").strip())
+    return found
+
+
+def test_lines_that_troubleshooting_quotes_are_printed() -> None:
+    """Each piece between names and numbers is in a text of the code, or holds a long one of it."""
+    texts = said_by_the_program()
+    for row in re.findall(r"^\| (`.*?) \| ", TEXTS["docs/troubleshooting.md"], re.MULTILINE):
+        for quoted in re.findall(r"`([^`]+)`", row):
+            for piece in re.split(r"\.\.\.|[;:] |\b\w+\.jpg|\b\d+\b|sparse/", quoted):
+                words = piece.strip(" -:")
+                in_words = (text for text in texts if len(text) >= 8 and text in words)
+                assert any(words in text for text in texts) or any(in_words), (row, words)
+
+
+def test_guide_names_all_sources_of_focal_lengths() -> None:
+    (sentence,) = re.findall(
+        r"where its focal length is\s+from: (.*?)\.\n", TEXTS["docs/guide.md"], re.DOTALL
+    )
+    assert re.findall(r"`([\w-]+)`", sentence) == list(get_args(Source))
+
+
+def test_readme_and_guide_say_that_complaints_of_pip_are_harmless() -> None:
+    for name in ("README.md", "docs/guide.md", "docs/troubleshooting.md"):
+        assert re.search(r"`opencv-python`.*?harmless", TEXTS[name], re.DOTALL)
+
+
 def test_pages_name_every_command_and_readme_is_short() -> None:
     text = "\n".join(TEXTS.values())
     assert all(f"colmap-affrect {command}" in text for command in COMMANDS)
@@ -129,6 +170,19 @@ def test_pages_name_every_command_and_readme_is_short() -> None:
     assert len(readme.split()) < MAX_WORDS
     # The commands that set everything up, which .ci/run executes.
     assert len(re.findall(r"^python3 -m venv", readme, re.MULTILINE)) == 2
+
+
+def test_version_and_citation_agree_and_no_address_is_invented() -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    fields = dict(re.findall(r"^(\S+): (.+)$", citation, re.MULTILINE))
+    assert fields["version"] == colmap_affrect.__version__
+    assert {"cff-version", "message", "title", "license"} <= fields.keys()
+    assert citation.count("family-names") == citation.count("given-names") == 3
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert all(url.startswith("https://") for url in project.get("urls", {}).values())
+    extras = project["optional-dependencies"]
+    assert {"dev", "docs", "test"} <= extras.keys()
+    assert fields["license"] == project["license"]
 
 
 @pytest.mark.long

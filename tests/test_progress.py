@@ -13,7 +13,8 @@ class Terminal(io.StringIO):
 
 
 def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent() -> None:
-    terminal, file = Terminal(), io.StringIO()
+    terminal = Terminal()
+    file = io.StringIO()
     for kind in (Progress(terminal), Progress(file), SILENT):
         with kind.stage("match", 400, "pairs") as advance:
             for _ in range(400):
@@ -28,7 +29,8 @@ def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent
 
 
 def test_forecast_measures_what_has_begun_and_guesses_the_rest_from_it() -> None:
-    now_s, lines = 0.0, io.StringIO()
+    now_s = 0.0
+    lines = io.StringIO()
     forecast = Forecast(20, 190, clock=lambda: now_s)
     with Progress(lines, forecast=forecast).stage("extract", 20, "images") as advance:
         for _ in range(20):

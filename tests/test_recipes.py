@@ -41,7 +41,8 @@ def test_recipes_have_summaries_and_options_that_survive_being_written_down() ->
 @pytest.mark.parametrize(("name", "rectifier"), OF_THE_PAPER.items())
 def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> None:
     recipe = load_recipe(name)
-    extraction, features = recipe.extraction, recipe.extraction.features
+    extraction = recipe.extraction
+    features = recipe.extraction.features
     assert extraction.rectifier.name == rectifier
     assert (features.name, features.descriptor) == ("affnet-hardnet", "hardnet")
     assert features.contrast_threshold == 0.04

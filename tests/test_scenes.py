@@ -56,7 +56,8 @@ def test_facade_matches_follow_the_true_homography(view, low, high):
     homography = np.loadtxt(SCENES / "facade" / f"H_1_{view}.txt")
     correct = {}
     for name in ("rectified", "unrectified-rootsift"):
-        first, second = facade_view(name, 1), facade_view(name, view)
+        first = facade_view(name, 1)
+        second = facade_view(name, view)
         matches = MATCHER.match(first, second).indices
         expected = project(homography, first.keypoints[matches[:, 0]])
         errors = np.linalg.norm(expected - second.keypoints[matches[:, 1]], axis=1)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scene import IMAGE_SIZE, write_photographs
+from small_scene import FOCAL_PX, IMAGE_SIZE, NAMES, write_photographs
 
 from colmap_affrect.images.reading import read_mask
 
@@ -87,3 +89,19 @@ def test_cells_of_the_notebook_run_in_order_and_register_all_photographs(tmp_pat
     environment = {"PATH": "/usr/bin:/bin", "TMPDIR": str(tmp_path), "HOME": str(tmp_path)}
     environment |= {"MPLBACKEND": "agg"}
     assert "9 of 9 photographs" in run_script("-c", code, cwd=notebook.parent, env=environment)
+
+
+@pytest.mark.long
+def test_page_on_python_does_what_it_shows(photos: Path, tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    code = "\n".join(block for block in blocks if "cluster" not in block)
+    shutil.copytree(photos, tmp_path / "photos")
+    for name, new in ((NAMES[0], "left.jpg"), (NAMES[1], "right.jpg")):
+        (tmp_path / "photos" / name).rename(tmp_path / "photos" / new)
+    code = code.replace("1440.0", str(FOCAL_PX))
+    printed = run_script("-c", code, cwd=tmp_path)
+    assert "registered  4 of 4 images" in printed
+    assert "no problems found" in printed
+    assert (tmp_path / "for-others" / "points3D.ply").is_file()
+    assert (tmp_path / "metric" / "images.bin").is_file()

@@ -5,7 +5,7 @@ import errno
 import logging
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from typing import TextIO
@@ -19,8 +19,14 @@ from colmap_affrect.project.workspace import Workspace
 logger = logging.getLogger("colmap_affrect")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code."""
+def main(
+    arguments: Sequence[str] | None = None, *, begin: Callable[[], None] = lambda: None
+) -> int:
+    """Run the command line and return the exit code.
+
+    ``begin`` is called when everything is loaded, before the command begins to work. Ctrl-C goes on
+    to the caller, as KeyboardInterrupt.
+    """
     errors.AffrectError.names_flags = True
     try:
         given = sys.argv[1:] if arguments is None else arguments
@@ -30,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from colmap_affrect.cli import commands  # not for --help
 
             command = getattr(commands, options.command.replace("-", "_"), commands.stage)
+            begin()
             return command(options) or 0
     except errors.AffrectError as error:
         return _fail(str(error), error.exit_code)
@@ -39,21 +46,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename:
             return _fail(str(cannot_write(Path(error.filename), error)))
         return _fail(
-            f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
+            f"{error.filename or _place()}: {error.strerror or error}; when that is mended, "
             "run the same command again: what was done before is kept"
         )
     except Exception as error:
         if not errors.lacks_memory(error):
             raise
         return _fail(f"{errors.MEMORY_HINT}: what was done before is kept")
-    except KeyboardInterrupt:
-        errors.say(errors.INTERRUPTED)
-        return errors.EXIT_INTERRUPTED
+
+
+def _place() -> str:
+    """Name what an error of the system without a name is about."""
+    try:
+        Path.cwd()
+    except OSError:
+        return "the folder in which the command was started"
+    return "input/output"
 
 
 def _fail(message: str, code: int = 1) -> int:
     """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
-    errors.say(f"error: {errors.one_line(message)}")
+    errors.say(f"error: {errors.clipped(errors.one_line(message))}")
     return code
 
 
@@ -65,7 +78,8 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     command runs, and Python's ``sys.stderr`` to the terminal. A new output folder goes when the
     command fails before it has more than its log.
     """
-    log_path, new = Path(os.devnull), None
+    log_path = Path(os.devnull)
+    new = None
     if options.output_path:
         workspace = Workspace(options.output_path)
         new = None if workspace.path.exists() else workspace.path
@@ -77,7 +91,7 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     except OSError:  # it is closed, and whoever closed it wants to see nothing
         shown_on = os.open(os.devnull, os.O_WRONLY)
     encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
-    terminal = os.fdopen(shown_on, "w", buffering=1, encoding=encoding, errors=errors.ESCAPED)
+    terminal = errors.heedless_stream(shown_on, encoding, closes=True)
     log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
     with terminal, closing(log), redirect_stderr(terminal):
         shown = logging.StreamHandler(terminal)
@@ -108,7 +122,7 @@ class _OneLine(logging.Formatter):
     """Shows a message in one line, whatever names are in it; a traceback keeps its lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        return errors.one_line(super().formatMessage(record))
+        return errors.clipped(errors.one_line(super().formatMessage(record)))
 
 
 class _Log(logging.StreamHandler[TextIO]):

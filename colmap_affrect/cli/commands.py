@@ -34,11 +34,11 @@ from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import ReconstructionReport
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.report.pairs import draw_pair
+from colmap_affrect.session.run_options import RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.match import match as match_pairs
 from colmap_affrect.stages.one_image import prepare
@@ -48,7 +48,7 @@ from colmap_affrect.stages.verify import verify_matches
 
 def run(options: argparse.Namespace) -> None:
     recipe = given.recipe(options)
-    run_options = pipeline.RunOptions(
+    run_options = RunOptions(
         recipe=recipe,
         database_descriptors=bool(options.database_descriptors),
         extend=given.extension(options),
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
             options.output_path,
             run_options,
             executor=executor,
-            overwrite=options.overwrite,
+            overwrite=bool(options.overwrite),
             page=options.page,
             progress=given.progress(options),
         )
@@ -72,10 +72,11 @@ def run(options: argparse.Namespace) -> None:
 
 
 def extract(options: argparse.Namespace) -> None:
-    inputs = pipeline.InputOptions(**given.inputs(options)).inputs(options.image_path)
+    known = RunOptions(**given.inputs(options))
+    inputs = known.inputs(options.image_path)
     with given.context(options) as context:
         report = extract_features(
-            context, inputs, given.recipe(options), overwrite=options.overwrite
+            context, inputs, given.recipe(options), overwrite=bool(options.overwrite)
         )
         if options.database_descriptors:
             fill_descriptors(context.workspace.database, context.features)
@@ -85,7 +86,7 @@ def extract(options: argparse.Namespace) -> None:
 
 def stage(options: argparse.Namespace) -> None:
     """Run one stage, with the options on record and those that are given in their place."""
-    how = {"overwrite": options.overwrite}
+    how = {"overwrite": bool(options.overwrite)}
     with given.context(options) as at:
         match options.command:
             case "pairs":
@@ -99,9 +100,9 @@ def stage(options: argparse.Namespace) -> None:
 
 def map(options: argparse.Namespace) -> None:
     extend = given.extension(options)
-    how = {"overwrite": options.overwrite, "page": options.page}
+    how = {"overwrite": bool(options.overwrite), "page": options.page}
     if options.from_database:
-        report = pipeline.map_from_database(
+        report = pipeline.map_database(
             options.from_database,
             options.output_path,
             image_path=options.image_path,
@@ -134,7 +135,7 @@ def compare(options: argparse.Namespace) -> None:
             ground_truth_path=options.ground_truth_path,
             **given.inputs(options),
         ),
-        overwrite=options.overwrite,
+        overwrite=bool(options.overwrite),
         progress=SILENT if options.quiet else Progress(sys.stderr, num_plain_lines=1),
     )
     show(tables.to_json(comparison) if options.json else tables.summary(comparison))
@@ -160,7 +161,7 @@ def evaluate(options: argparse.Namespace) -> None:
             scores=ScoreOptions(random_seed=options.random_seed or 0),
             resources=given.resources(options),
         ),
-        overwrite=options.overwrite,
+        overwrite=bool(options.overwrite),
         progress=given.progress(options),
     )
     show(evaluation.to_json() if options.json else evaluation.summary())
@@ -210,12 +211,9 @@ def export_h5(options: argparse.Namespace) -> None:
 
 
 def export_database(options: argparse.Namespace) -> None:
-    workspace = Workspace(options.path)
-    if options.descriptors and not workspace.features.exists():
-        raise OptionError(f"--descriptors: {options.path} is no output folder with features.h5")
-    features = FeatureStore(workspace.features) if options.descriptors else None
-    path = workspace.database if options.path.is_dir() else options.path
-    number = old_databases.export_database(path, options.database_path, features)
+    number = old_databases.export_database(
+        options.path, options.database_path, descriptors=bool(options.descriptors)
+    )
     show(
         f"{options.database_path}: for COLMAP {options.colmap} to 3.13; {number or 'no'} images "
         "have descriptors, which COLMAP's own matchers need (--descriptors)\n"
@@ -271,7 +269,8 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
 
 def _next_steps(report: ReconstructionReport, workspace: Workspace) -> list[str]:
     """Say where the results are, and with which commands to go on."""
-    photos, model = workspace.photographs(), workspace.path / "sparse" / "0"
+    photos = workspace.photographs()
+    model = workspace.path / "sparse" / "0"
     page = f", to look at: {workspace.page}" if workspace.page.exists() else ""
     lines = [f"results     {workspace.path}{page}"]
     if report.status not in ("ok", "partial"):
@@ -349,7 +348,8 @@ def weights(options: argparse.Namespace) -> None:
         return
     folder = given.folder("--weights", options.weights)
     for key in keys or files.WEIGHT_FILES:
-        path, file = files.find(key, folder), files.WEIGHT_FILES[key]
+        path = files.find(key, folder)
+        file = files.WEIGHT_FILES[key]
         if not path:
             where = f"not found: {files.install_hint([file])}colmap-affrect weights fetch {key}"
         elif files.is_published(key, path) is False:

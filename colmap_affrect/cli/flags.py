@@ -16,12 +16,23 @@ Settings = dict[str, Any]
 """What ``add_argument`` takes."""
 
 
+def filled(text: str) -> str:
+    """Refuse nothing at all, which would be the current folder, or no option."""
+    if not text:
+        raise ArgumentTypeError("is empty; is a variable of the shell not set?")
+    return text
+
+
+def path(text: str) -> Path:
+    return Path(filled(text))
+
+
 def _value(metavar: str, text: str, **settings: Any) -> Settings:
-    return {"metavar": metavar, "help": text, **settings}
+    return {"metavar": metavar, "help": text, "type": filled, **settings}
 
 
 def _path(metavar: str, text: str, **settings: Any) -> Settings:
-    return {"metavar": metavar, "help": text, "type": Path, **settings}
+    return {"metavar": metavar, "help": text, "type": path, **settings}
 
 
 def _switch(text: str, **settings: Any) -> Settings:
@@ -30,6 +41,13 @@ def _switch(text: str, **settings: Any) -> Settings:
 
 def integers(text: str) -> tuple[int, ...]:
     return tuple(int(number) for number in text.split(","))
+
+
+def count(text: str) -> int:
+    number = int(text)
+    if number < 0:
+        raise ValueError
+    return number
 
 
 def minutes(text: str) -> float:
@@ -41,7 +59,10 @@ def minutes(text: str) -> float:
 
 def _fields(text: str, wanted: str) -> list[str]:
     """Split at commas as a table does: a name with a comma stands in double quotes."""
-    fields = next(csv.reader([text], strict=True))
+    try:
+        fields = next(csv.reader([text], strict=True), [])
+    except csv.Error:  # of quotes that do not end, for one
+        fields = []
     if len(fields) != wanted.count(",") + 1:
         raise ArgumentTypeError(
             f"{text!r}: give {wanted}, a name that holds a comma in double quotes"
@@ -71,7 +92,7 @@ FLAGS: dict[str, Settings] = {
     "--output-path": _path("PATH", "folder for all results"),
     "--overwrite": _switch("discard the results of this and later stages"),
     "--max-failures": _value("N", "exit code 1 if more images than this cannot be read "
-        "(default: 0)", type=int),
+        "(default: 0)", type=count),
     "--no-page": {"dest": "page", "action": "store_false", "default": True,
         "help": "leave out report.html, the page to look at"},
     "--random-seed": _value("N", "seed of all that is left to chance (default: 0)", type=int),
@@ -91,10 +112,10 @@ FLAGS: dict[str, Settings] = {
     "--mask-path": _path("FOLDER", "masks, black where features are not wanted: a/b.jpg has "
         "a/b.jpg.png or a/b.png; photographs without one are used whole", dest="masks.path"),
     "--camera-mask-path": _path("FILE", "one mask for all images", dest="masks.camera_path"),
-    "--camera-mode": _value("MODE", "which images share a camera: auto, single, per-folder or "
-        "per-image (default: auto, as --cameras-path says, else those of one body, lens, focal "
-        "length and size by EXIF; without EXIF one camera each, unless matches show that images "
-        "of one size share one)", dest="cameras.mode"),
+    "--camera-mode": _value("MODE", "which images of one size share a camera: auto, single (all), "
+        "per-folder or per-image (default: auto, as --cameras-path says, else those of one body, "
+        "lens and focal length by EXIF; without EXIF all, unless they match better with one each)",
+        dest="cameras.mode"),
     "--camera-model": _value("MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
         dest="cameras.model"),
     "--camera-params": _value("A,B,...",

@@ -16,10 +16,10 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
-from colmap_affrect.mend import watched
 from colmap_affrect.options import Options, flat
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
+from colmap_affrect.pipeline import one_stage
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
@@ -31,7 +31,8 @@ AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 def over(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOptions:
     """Return options with what is given of a section, as ``cameras.mode`` of ``cameras``."""
-    given, flags = known.to_mapping(), []
+    given = known.to_mapping()
+    flags = []
     for flag, settings in FLAGS.items():
         place, _, field = settings.get("dest", "").rpartition(".")
         value = getattr(options, f"{place}.{field}", None)
@@ -71,11 +72,17 @@ def refuse_without_database(options: argparse.Namespace) -> None:
 def extension(options: argparse.Namespace) -> Extension | None:
     if options.refine_existing and not options.extend:
         raise OptionError("--refine-existing: only with --extend MODEL")
-    return Extension(options.extend, bool(options.refine_existing)) if options.extend else None
+    if not options.extend:
+        return None
+    return Extension(model_path=options.extend, refine_existing=bool(options.refine_existing))
 
 
 def by_hand(options: argparse.Namespace) -> ByHand:
-    return ByHand(options.tie_points_path, tuple(options.rejected), tuple(options.left_out))
+    return ByHand(
+        tie_points_path=options.tie_points_path,
+        rejected=tuple(options.rejected),
+        left_out=tuple(options.left_out),
+    )
 
 
 def recipe(options: argparse.Namespace) -> Recipe:
@@ -85,7 +92,7 @@ def recipe(options: argparse.Namespace) -> Recipe:
 def depth_settings(options: argparse.Namespace) -> list[str]:
     """Return the change of a recipe that --depth-path asks for."""
     path = folder("--depth-path", options.depth_path)
-    return [f"depth.path={json.dumps(str(path.resolve()))}"] if path else []
+    return [f"depth.path={json.dumps(str(resolved(path)))}"] if path else []
 
 
 def matching(known: MatcherOptions, options: argparse.Namespace) -> MatcherOptions:
@@ -125,7 +132,9 @@ def _seed(options: argparse.Namespace) -> dict[str, int]:
 
 
 def resources(options: argparse.Namespace) -> Resources:
-    return Resources(folder("--weights", options.weights), options.device or "auto")
+    return Resources(
+        weights_path=folder("--weights", options.weights), device=options.device or "auto"
+    )
 
 
 def folder(flag: str, path: Path | None) -> Path | None:
@@ -147,13 +156,16 @@ def executor(options: argparse.Namespace) -> AbstractContextManager[Executor | N
 @contextmanager
 def context(options: argparse.Namespace) -> Iterator[Context]:
     """Lock the output folder and return what the stages work with."""
-    with Workspace(options.output_path).locked() as workspace, executor(options) as where:
-        is_first, maps = options.command == "extract", options.command == "map"
-        said = by_hand(options) if maps else NOTHING
-        shown, command = progress(options), options.words
-        found = Context(workspace, resources(options), where, shown, by_hand=said, command=command)
-        discards = is_first and options.overwrite
-        with watched(found, follows=not is_first, maps=maps, discards=discards):
+    with executor(options) as where:
+        found = Context(
+            Workspace(options.output_path),
+            resources(options),
+            where,
+            progress(options),
+            by_hand=by_hand(options) if options.command == "map" else NOTHING,
+            command=options.words,
+        )
+        with one_stage(options.command, found, overwrite=bool(options.overwrite)):
             yield found
 
 

@@ -13,7 +13,10 @@ from colmap_affrect.errors import OptionError
 
 EXAMPLES = (
     "run --image-path photos --output-path out",
-    "run --image-path photos --output-path out --recipe rectified --camera-mode single",
+    "run --image-path scans --output-path out --mask-path masks --effort high",
+    "run --image-path photos --output-path out --focal-mm 50 --film-width-mm 36",
+    "run --image-path photos --output-path out --pairs retrieval --num-neighbors 20",
+    "run --image-path photos --output-path out --tie-points tie-points.csv",
     "extract --image-path photos --output-path out",
     "pairs --output-path out --pairs retrieval,sequence --num-neighbors 30",
     "match --output-path out",
@@ -42,16 +45,19 @@ EXAMPLES = (
 )
 
 ENDING = """
-What computes goes on where it stopped when it is run again. Exit codes: 0 done, 1 failed (one
-line says why; also when images could not be read, see --max-failures), 2 wrong usage, or an option
-names a file or folder that is not there, or where something of yours lies, 3 finished without a
-model that can be trusted, 130 interrupted (143 by SIGTERM).
+What computes goes on where it stopped when it is run again. Exit codes: 0 done; 1 failed (one
+line says why; also when images could not be read, see --max-failures); 2 not carried out as it was
+given: unknown options and values, a file or folder that is not there, a list or table that is
+wrong, results of yours or of other options in the way; 3 finished without a model that can be
+trusted; 130 interrupted (143 by SIGTERM).
 """
 
 
 def epilog(command: str = "") -> str:
-    """Return the examples of a command, or all, and what all commands have in common."""
-    examples = [text for text in EXAMPLES if command in ("", text.split()[0])]
+    """Return the examples of a command, or one of each, and what all have in common."""
+    examples = [text for text in EXAMPLES if text.split()[0] == command]
+    if not command:
+        examples = list({text.split()[0]: text for text in reversed(EXAMPLES)}.values())[::-1]
     return "\n  colmap-affrect ".join(["examples:", *examples]) + "\n" + ENDING
 
 
@@ -121,12 +127,42 @@ def build_parser() -> argparse.ArgumentParser:
         subparser = commands.add_parser(
             name, help=summary, description=summary, epilog=epilog(name), **usual
         )
-        for word in [*flags.split(), VOLUME]:
-            parser.set_defaults(**dict.fromkeys(_add(subparser, word)))
+        words = [*flags.split(), VOLUME]
+        for title, some in _by_group(words).items():
+            target = subparser.add_argument_group(title) if title else subparser
+            for word in some:
+                parser.set_defaults(**dict.fromkeys(_add(target, word)))
+        if len(words) > MAX_UNGROUPED:
+            subparser.usage = _short_usage(subparser)
     return parser
 
 
-def _add(parser: argparse.ArgumentParser, word: str) -> list[str]:
+def _by_group(words: Sequence[str]) -> dict[str, list[str]]:
+    """Sort the flags of a command by the titles of :data:`GROUPS`; of a few nothing is sorted."""
+    if len(words) <= MAX_UNGROUPED:
+        return {"": list(words)}
+    found: dict[str, list[str]] = {}
+    for title, flags in GROUPS.items():
+        names = flags.split()
+        some = [word for word in words if _flag(word) in names]
+        if some:
+            found[title] = sorted(some, key=lambda word: names.index(_flag(word)))
+    return found
+
+
+def _flag(word: str) -> str:
+    """Return the flag of a word of :data:`COMMANDS` alone, as users write it."""
+    return word.removesuffix("!").partition("@")[0]
+
+
+def _short_usage(parser: argparse.ArgumentParser) -> str:
+    """Return the usage of a command with many options: what must be given, and nothing else."""
+    required = [action for action in parser._actions if action.required]
+    words = (f"{a.option_strings[0]} {a.metavar}" if a.option_strings else a.dest for a in required)
+    return f"{parser.prog} {' '.join(words)} [options]"
+
+
+def _add(parser: argparse._ActionsContainer, word: str) -> list[str]:
     """Add a flag, or several that exclude each other, see :data:`COMMANDS`; return their names."""
     names = word.removesuffix("!").split("|")
     required: dict[str, Any] = {"required": True} if word.endswith("!") else {}
@@ -151,6 +187,24 @@ MAPPER = "--preset --mapper --mapper-options"
 GIVEN_MATCHES = "--matches-path@given --match-type --match-list-path@given"
 BY_HAND = "--tie-points --reject-pair --leave-out"
 MODEL = f"--extend --refine-existing {BY_HAND} --random-seed --json --no-page"
+
+MAX_UNGROUPED = 12  # flags of a command that help lists in one go
+GROUPS = {
+    "": "protocol --image-path --dataset-path --output-path --mask-path --camera-mode --recipe "
+        "--methods --recipes --seeds --effort --max-time --overwrite --features-path "
+        "--matches-path --match-type --database-path",
+    "photographs": "--image-list-path --from-database --camera-mask-path --depth-path "
+        "--max-failures",
+    "cameras": f"{KNOWN_CAMERAS} --ignore-exif",
+    "features and pairs": "--set --max-num-keypoints --pairs --num-neighbors --max-distance-m "
+        "--match-list-path --database-descriptors --weights --device "
+        "--scheduler",
+    "models": "--extend --refine-existing --preset --mapper --mapper-options --random-seed "
+        "--ground-truth-path",
+    "by hand": BY_HAND,
+    "what is printed and drawn": f"--json --no-page {VOLUME}",
+}  # fmt: skip
+"""Titles and flags in the order in which help has them; what is used most has no title."""
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("all stages: photographs in, COLMAP model out",
@@ -179,7 +233,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "panoramas of 360 x 180 degrees, by views of them, into COLMAP models",
         "--image-path! --output-path@new! --order --random-seed"),
     "inspect": (
-        "draw what a recipe does to one image: regions, warps, features",
+        "draw what a recipe does to one image, a sheet for each level: regions, warps, features",
         f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),
     "show-pair": (
         "draw two photographs side by side, with lines between what was matched",

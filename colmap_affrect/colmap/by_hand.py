@@ -7,18 +7,19 @@ the others, and without the verified pairs that are not to be used.
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import cameras_of_images
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.options import suggestion
-from colmap_affrect.project.paths import TakesPaths
+from colmap_affrect.options import Options, suggestion
+from colmap_affrect.project.paths import GivenPath
 from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.tables import read_table
 
@@ -33,6 +34,7 @@ COLUMNS = {
 Marks = Mapping[str, Mapping[str, Array]]
 """(2,) px from the upper left corner of the image, as COLMAP has them, by point and image name."""
 Indices = Mapping[str, Mapping[str, int]]  # numbers of keypoints, by point and image name
+Names = Annotated[tuple[str, str], Field(strict=False)]  # a list, too
 SizeOf = Callable[[str], tuple[int, int] | None]  # (width, height) of a photograph by its name
 
 
@@ -40,13 +42,15 @@ def unknown_size(_: str) -> None:
     """Return that the size of a photograph is not known."""
 
 
-@dataclass(frozen=True)
-class ByHand(TakesPaths):
+class ByHand(Options):
     """What is to be done otherwise than matches alone say."""
 
-    tie_points_path: Path | None = None  # table of the same points in several photographs
-    rejected: tuple[tuple[str, str], ...] = ()  # pairs of names whose matches are wrong
-    left_out: tuple[str, ...] = ()  # names of photographs that are not to be mapped
+    tie_points_path: GivenPath | None = None
+    """Table of the same points in several photographs."""
+    rejected: Annotated[tuple[Names, ...], Field(strict=False)] = ()
+    """Pairs of names of photographs whose matches are wrong."""
+    left_out: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Names of photographs that are not to be mapped."""
 
     def marks(self, names: Collection[str], size_of: SizeOf = unknown_size) -> Marks:
         """Read the tie points, as :func:`read_marks` does.
@@ -200,7 +204,8 @@ def triangulated(model: pycolmap.Reconstruction, marks: Mapping[int, Array]) -> 
 
     None where their rays do not meet in front of the cameras.
     """
-    flat, poses = [], []
+    flat = []
+    poses = []
     for image_id, mark in marks.items():
         image = model.images[image_id]
         flat.append(model.cameras[image.camera_id].cam_from_img(mark))

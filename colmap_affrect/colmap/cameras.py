@@ -99,10 +99,17 @@ def known_model(name: str) -> str:
 
 def _split(text: object) -> object:
     """Separate numbers at commas, semicolons and spaces."""
-    return text.replace(",", " ").replace(";", " ").split() if isinstance(text, str) else text
+    if not isinstance(text, str):
+        return text
+    numbers = text.replace(",", " ").replace(";", " ").split()
+    if text and not numbers:
+        raise ValueError("holds no numbers")
+    return numbers
 
 
-Positive = Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]
+MOST = 1e7  # px, or mm: nothing can be computed with cameras of larger numbers
+Positive = Annotated[float, pydantic.Field(gt=0.0, le=MOST, allow_inf_nan=False)]
+Finite = Annotated[float, pydantic.Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 
 
 class GivenCamera(Options):
@@ -115,13 +122,13 @@ class GivenCamera(Options):
     camera: str = ""
     """Label; images with the same one share a camera."""
     model: Annotated[str, pydantic.AfterValidator(known_model)]
-    params: Annotated[tuple[pydantic.FiniteFloat, ...], pydantic.BeforeValidator(_split)] = ()
+    params: Annotated[tuple[Finite, ...], pydantic.BeforeValidator(_split)] = ()
     focal_px: Positive | None = None
     focal_mm: Positive | None = None
     plate_width_mm: Positive | None = None
     """Width of what the whole image shows, of a plate or a sensor."""
-    cx: pydantic.FiniteFloat | None = None
-    cy: pydantic.FiniteFloat | None = None
+    cx: Finite | None = None
+    cy: Finite | None = None
     """Principal point in COLMAP's px, from the corner of the image."""
     size: tuple[int, ...] = ()
     """(width, height) in px of its images; only of a model."""

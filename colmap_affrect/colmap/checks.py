@@ -28,7 +28,7 @@ from colmap_affrect.colmap.tables import (
     rows_of,
 )
 from colmap_affrect.errors import DatabaseError, such_as
-from colmap_affrect.geometry.arrays import Singles
+from colmap_affrect.geometry.arrays import Floats, Singles
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +83,8 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL, *, warns: bool =
     """
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
-        what, advice = CHECKS[kind]["what"], CHECKS[kind]["advice"].format(path=path)
+        what = CHECKS[kind]["what"]
+        advice = CHECKS[kind]["advice"].format(path=path)
         raise DatabaseError(f"{path}: {what} ({such_as(problems[kind])}); {advice}")
     for kind in sorted(WARNED & problems.keys()) if warns else ():
         check = CHECKS[kind]
@@ -104,6 +105,7 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
             check_links(connection, tables, found)
             _check_matrices(connection, found)
             _check_keypoints(connection, tables, found)
+            _check_descriptors(connection, tables, found)
             _check_pairs(connection, tables, found)
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
             raise DatabaseError(f"{path}: damaged ({error})") from error
@@ -171,7 +173,8 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
     rows = rows_of(connection, "image_id rows cols data", "keypoints")
     extents: dict[str, float] = {}
     for image_id, count, width, blob in rows:
-        if not (name := tables.names.get(image_id)):
+        name = tables.names.get(image_id)
+        if not name:
             continue
         if count and width not in KEYPOINT_COLUMNS:
             found["keypoint-data"].append(f"{name} has {width}")
@@ -188,9 +191,11 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
                 extents[name] = extent(keypoints, size)
     if are_in_a_corner(extents.values()):
         found["keypoints-in-a-corner"] += sorted(extents)
-    for image_id, count, width, blob in rows_of(
-        connection, "image_id rows cols data", "descriptors"
-    ):
+
+
+def _check_descriptors(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
+    rows = rows_of(connection, "image_id rows cols data", "descriptors")
+    for image_id, count, width, blob in rows:
         if _array(blob, count, width, np.dtype("u1")) is None:
             found["descriptor-data"].append(tables.names.get(image_id, f"image {image_id}"))
 
@@ -208,7 +213,7 @@ def are_in_a_corner(extents: Collection[float]) -> bool:
     return len(extents) >= MIN_IMAGES_IN_A_CORNER and max(extents) < IN_A_CORNER
 
 
-def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[str]:
+def keypoint_problems(keypoints: Floats, size: tuple[int, int] | None) -> list[str]:
     """Return which kinds of problems some keypoints of an image have.
 
     Args:
@@ -216,12 +221,14 @@ def keypoint_problems(keypoints: Singles, size: tuple[int, int] | None) -> list[
         size: (width, height) of the image in px, None where it is not known.
     """
     finite = np.asarray((np.abs(keypoints) <= MAX_SIDE_PX).all(axis=1))
-    points, found = keypoints[finite, :2], list[str]()
+    points = keypoints[finite, :2]
+    found = list[str]()
     if not finite.all():
         found.append("keypoints-not-finite")
+    is_larger = size is None or max(size) > MAX_NORMALISED
+    if is_larger and len(points) >= MIN_NORMALISED and np.abs(points).max() <= MAX_NORMALISED:
+        found.append("keypoints-normalised")
     if size and len(points):
-        if len(points) >= MIN_NORMALISED and np.abs(points).max() <= MAX_NORMALISED < max(size):
-            found.append("keypoints-normalised")
         margin = MAX_OUTSIDE * max(size) + MAX_OUTSIDE_PX
         beyond = np.maximum(-points, points - np.array(size, np.float32))
         if beyond.max() > margin:

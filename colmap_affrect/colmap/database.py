@@ -120,9 +120,11 @@ def read_positions(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
     with open_database(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
-    positions, wrong = dict[str, Array](), dict[str, str]()
+    positions = dict[str, Array]()
+    wrong = dict[str, str]()
     for prior in priors:
-        name, position = names.get(prior.corr_data_id.id), np.array(prior.position).ravel()
+        name = names.get(prior.corr_data_id.id)
+        position = np.array(prior.position).ravel()
         if name is None:
             continue
         is_on_earth = prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84

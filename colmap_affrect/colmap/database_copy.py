@@ -50,7 +50,8 @@ def newest_schema_version() -> int:
 
 def refuse_newer(path: Path) -> int:
     """Return the version of the tables; DatabaseError if pycolmap does not know it."""
-    version, newest = schema_version(path), newest_schema_version()
+    version = schema_version(path)
+    newest = newest_schema_version()
     if version > newest:
         raise DatabaseError(
             f"{path}: was made by a newer COLMAP (schema {version}, pycolmap "
@@ -79,7 +80,8 @@ def copy_database(
     if refused:
         refuse_unusable(source, refused)
     with temporary_folder(target.parent) as folder:
-        new, old = folder / "new.db", folder / "old.db"
+        new = folder / "new.db"
+        old = folder / "old.db"
         with open_database(new):  # which makes the tables
             pass
         with open_read_only(source) as original, _one_line(source, target):
@@ -157,7 +159,8 @@ def _copy_rows(original: sqlite3.Connection, copy: sqlite3.Connection, table: st
     if not common:
         return
     names = sorted(common)
-    listed, marks = ", ".join(f'"{name}"' for name in names), ", ".join("?" * len(names))
+    listed = ", ".join(f'"{name}"' for name in names)
+    marks = ", ".join("?" * len(names))
     # The table is one of ours, and the names of its columns are identifiers.
     rows = original.execute(f"SELECT {listed} FROM {table}")  # noqa: S608
     copy.executemany(f"INSERT INTO {table} ({listed}) VALUES ({marks})", rows)  # noqa: S608

@@ -76,20 +76,31 @@ class InitialCameras:
         return tags.size if tags else None
 
     def group(self, name: str) -> Group:
-        """Return what is the same for images that share a camera."""
+        """Return what is the same for images that share a camera, which all have one size."""
+        together = self._together(name)
+        if together:
+            return (*together, self.size(name))
+        if self.options.mode == "per-image":
+            return ("per-image", name)
+        tags = None if self.options.ignore_exif else self._tags(name)
+        if tags and tags.identity:
+            return ("exif", *tags.identity, self.given(name).said)
+        return ("image", name)
+
+    def _together(self, name: str) -> Group:
+        """Return what is the same for images of which the user says that they share a camera.
+
+        Scans and crops of what one camera took may have several sizes. Empty where nothing is said.
+        """
+        label = self.given(name).camera
         match self.options.mode:
             case "single":
                 return ("single",)
             case "per-folder":
                 return ("per-folder", str(PurePosixPath(name).parent))
-            case "per-image":
-                return ("per-image", name)
-        if label := self.given(name).camera:
-            return ("given", label)
-        tags = None if self.options.ignore_exif else self._tags(name)
-        if tags and tags.identity:
-            return ("exif", *tags.identity, self.given(name).said)
-        return ("image", name)
+            case "auto" if label:
+                return ("given", label)
+        return ()
 
     def groups(self, names: Sequence[str]) -> dict[Group, list[str]]:
         """Return the names of each group, in the order in which the groups begin."""
@@ -98,27 +109,59 @@ class InitialCameras:
             found[self.group(name)].append(name)
         return dict(found)
 
-    def check(self, names: Sequence[str]) -> None:
-        """Refuse images that cannot share the cameras that they should.
+    def check(self, names: Sequence[str]) -> str:
+        """Refuse images that cannot have the cameras that they should.
 
-        OptionError names the option, or file and line, and what to do.
+        OptionError names the option, or file and line, and what to do. Returns a line where images
+        are to share a camera that cannot, for their sizes; else an empty one.
         """
         unknown = [n for n in self._given if n and not (self.image_path / n).is_file()]
         self._refuse(unknown, names, str(self.image_path))
-        for group, same in self.groups(names).items():
+        for same in self.groups(names).values():
             given = self._given_of(same)
-            sizes = {name: size for name in same if (size := self.size(name))}
-            first, expected = next(iter(sizes.items()), ("", given.size))
-            if given.size:
-                first, expected = "its camera", given.size
-            for name, size in sizes.items():
-                if size != expected:
-                    by_mode = group[0] in ("single", "per-folder")
-                    who = f"--camera-mode {group[0]}" if by_mode else self.given(name).where
+            for name in same:
+                size = self.size(name)
+                if given.size and size and size != given.size:
                     raise OptionError(
-                        f"{who}: {first} is {expected[0]} x {expected[1]} px, {name} is {size[0]} "
-                        f"x {size[1]} px; images that share a camera must have its size"
+                        f"{given.where}: is {_px(given.size)}, {name} is {_px(size)}; give "
+                        "photographs of that size, or leave the model out"
                     )
+        return self._several_sizes(names)
+
+    def _several_sizes(self, names: Sequence[str]) -> str:
+        """Say which images have several sizes that are to share a camera, the first ones found.
+
+        OptionError where all parameters are given: these are of one size.
+        """
+        firsts: dict[Group, str] = {}
+        sizes: defaultdict[Group, set[Size]] = defaultdict(set)
+        note = ""
+        for name in names:
+            size = self.size(name)
+            together = self._together(name)
+            if not (size and together):
+                continue
+            sizes[together].add(size)
+            first = firsts.setdefault(together, name)
+            if size == self.size(first):
+                continue
+            both = f"{first} is {_px(self.size(first) or size)}, {name} is {_px(size)}"
+            if self.given(first).params and self.given(first).params == self.given(name).params:
+                raise OptionError(
+                    f"{self._who(first)}: {both}, and the given parameters are of one size; give "
+                    "those of each size as params in a table (--cameras-path), or leave them out"
+                )
+            note = note or both
+        most = max(map(len, sizes.values()), default=0)
+        if not note:
+            return ""
+        have = f"images that should share a camera have {most} sizes, and those of each share one"
+        return f"{note}; {have}"
+
+    def _who(self, name: str) -> str:
+        """Return what says that an image shares a camera with others."""
+        mode = self.options.mode
+        return self.given(name).where if mode == "auto" else f"--camera-mode {mode}"
 
     def check_known(self, names: Sequence[str], where: str) -> None:
         """Refuse cameras of images that are not among some, unless a model has more images."""
@@ -143,7 +186,8 @@ class InitialCameras:
             names[image.camera_id].append(image.name)
         records = {}
         for camera_id, same in sorted(names.items()):
-            given, before = self._given_of(same), database.read_camera(camera_id)
+            given = self._given_of(same)
+            before = database.read_camera(camera_id)
             size = (before.width, before.height)
             if not (given.params or given.focal_px or given.focal_mm or self.options.focal_mm):
                 continue
@@ -166,13 +210,15 @@ class InitialCameras:
             if other.said != first.said:
                 raise OptionError(
                     f"{other.where}: says something else than {first.where.rpartition(', ')[2]}, "
-                    f"and --camera-mode {self.options.mode} lets these images share a camera"
+                    f"and --camera-mode {self.options.mode} lets these images share a camera; "
+                    "leave that out, or give both the same"
                 )
         return first
 
     def camera(self, names: Sequence[str], size: Size) -> tuple[pycolmap.Camera, CameraRecord]:
         """Return the camera that images of one size share, and what is known of it."""
-        given, longer = self._given_of(names), max(size)
+        given = self._given_of(names)
+        longer = max(size)
         camera = pycolmap.Camera.create_from_model_name(
             1, given.model, self.options.default_focal_length_factor * longer, *size
         )
@@ -181,7 +227,8 @@ class InitialCameras:
         if given.params:
             camera.params = list(given.params)
         elif given.cx is not None and given.cy is not None and len(camera.principal_point_idxs()):
-            camera.principal_point_x, camera.principal_point_y = given.cx, given.cy
+            camera.principal_point_x = given.cx
+            camera.principal_point_y = given.cy
         if given.params or given.cx is not None:
             parts.append("principal-point")
         if given.params or (parts and not len(camera.extra_params_idxs())):
@@ -204,15 +251,19 @@ class InitialCameras:
         if given.params:
             return "given", ""
         source: Source = "given"
-        focal, why = given.focal_px, ""
+        focal = given.focal_px
+        why = ""
         if given.focal_mm and given.plate_width_mm:
             focal = given.focal_mm / given.plate_width_mm * camera.width
         if not focal:
             found = self._exif_focal(names)
             source = "exif-rescaled" if found.is_rescaled else "exif"
-            focal, why = found.focal_px, found.why
+            focal = found.focal_px
+            why = found.why
         if not focal and self.options.focal_mm:
-            source, why, longer = "given", "", max(camera.width, camera.height)
+            source = "given"
+            why = ""
+            longer = max(camera.width, camera.height)
             focal = self.options.focal_mm / self.options.film_width_mm * longer
         if not focal:
             return "guess", why
@@ -281,6 +332,10 @@ def sensor_width_mm(make: str, model: str) -> float | None:
     return 8.0 / focal if focal else None
 
 
+def _px(size: Sequence[int]) -> str:
+    return f"{size[0]} x {size[1]} px"
+
+
 def _focal(camera: pycolmap.Camera) -> float:
     return float(camera.mean_focal_length()) if len(camera.focal_length_idxs()) else 0.0
 
@@ -300,7 +355,8 @@ def import_images(
     if is_new:
         remove_own(database_files(path))  # what is beside it, of one that was removed
     with temporary_folder(path.parent) as folder:
-        new, read = folder / "new.db" if is_new else path, folder / "read.db"
+        new = folder / "new.db" if is_new else path
+        read = folder / "read.db"
         known = set[str]() if is_new else set(image_ids(new))
         missing = sorted(set(names) - known)
         missing = [name for name in missing if not why_unusable(image_path / name)]
@@ -391,7 +447,8 @@ def record_cameras(
         names[camera.camera_id].append(name)
     records = {}
     for camera_id, of_camera in names.items():
-        record, same = known.get(camera_id), tuple(sorted(of_camera))
+        record = known.get(camera_id)
+        same = tuple(sorted(of_camera))
         if record and set(record.names) <= set(same):
             records[camera_id] = replace(record, names=same)
         else:

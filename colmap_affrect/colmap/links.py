@@ -124,7 +124,8 @@ def _members(connection: sqlite3.Connection) -> list[_Member]:
 def _check_rigs(members: Sequence[_Member], tables: Tables, found: Found) -> None:
     """Find sensors that do not exist, are there twice, or are nobody knows where."""
     for member in members:
-        sensor, label = member.sensor, f"{member.sensor} of rig {member.rig_id}"
+        sensor = member.sensor
+        label = f"{member.sensor} of rig {member.rig_id}"
         if sensor.kind not in SENSOR_NAMES:
             found["bad-rig"].append(label)
         elif sensor.kind == SENSOR_CAMERA and sensor.number not in tables.cameras:

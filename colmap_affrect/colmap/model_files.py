@@ -7,7 +7,7 @@ So every record is followed to its end first. Models of ours have digests of fil
 import json
 import struct
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -117,7 +117,8 @@ OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")  # of COLMAP before 
 def _read_records(path: Path) -> list[Any]:
     """Read all records of a file; StoreError unless they end where it ends."""
     with errors.damage(path, _mend(path.parent)):
-        reader, record = _Reader(read_regular(path)), RECORDS[path.name]
+        reader = _Reader(read_regular(path))
+        record = RECORDS[path.name]
         try:
             records = [record(reader) for _ in range(reader.take("Q")[0])]
         except EOFError:
@@ -141,7 +142,8 @@ def registered_names(model_path: Path) -> list[str]:
 
 def require_intact(folder: Path) -> None:
     """Refuse a model of ours that is not as it was written, or a binary one that is damaged."""
-    known, now = kept_digests(folder), file_digests(folder)
+    known = kept_digests(folder)
+    now = file_digests(folder)
     for name in RECORDS if not known and _is_binary(folder) else ():
         if name in OLD_RECORDS or (folder / name).exists():
             _read_records(folder / name)
@@ -231,12 +233,13 @@ def read_given_model(
         require_intact(folder)
         with errors.damage(folder, _mend(folder)):
             model = pycolmap.Reconstruction(folder)
-            seen = sum(image.num_points3D for image in model.images.values())
-            if seen != sum(point.track.length() for point in model.points3D.values()):
-                raise ValueError("its images and points are not of one model")
     else:
         model = _read_text(folder, option, wanted)
-    if fault := "" if is_ours else _fault(model, needs_poses=needs_poses):
+    seen = sum(image.num_points3D for image in model.images.values())
+    if seen != sum(point.track.length() for point in model.points3D.values()):
+        why = "damaged (its images and points are not of one model)"
+        raise errors.StoreError(f"{option}{folder}: {why}; {_mend(folder)}")
+    if fault := "" if is_ours else why_unusable(model, needs_poses=needs_poses):
         raise errors.StoreError(f"{option}{folder}: {fault}; {_mend(folder)}")
     return model
 
@@ -251,7 +254,7 @@ def _read_text(folder: Path, option: str, wanted: str) -> pycolmap.Reconstructio
         raise errors.OptionError(f"{option}{folder}: {why}") from error
 
 
-def _fault(model: pycolmap.Reconstruction, *, needs_poses: bool) -> str:
+def why_unusable(model: pycolmap.Reconstruction, *, needs_poses: bool = True) -> str:
     """Return why nothing can be computed with a model, empty where there is no reason."""
     names = Counter(image.name for image in model.images.values())
     if twice := sorted(name for name, count in names.items() if count > 1):
@@ -276,9 +279,25 @@ def _fault(model: pycolmap.Reconstruction, *, needs_poses: bool) -> str:
     return ""
 
 
+def refuse_panoramas(model: pycolmap.Reconstruction, what: str) -> None:
+    """Refuse a model with cameras that look all around, which have no focal length.
+
+    Args:
+        model: any model.
+        what: cannot be done with it, to begin the line of the OptionError.
+    """
+    for camera_id, camera in sorted(model.cameras.items()):
+        if not len(camera.focal_length_idxs()):
+            raise errors.OptionError(
+                f"{what}: camera {camera_id} looks all around ({camera.model_name}) and has no "
+                "focal length; use the model of perspective views of the panoramas"
+            )
+
+
 def _is_usable(camera: pycolmap.Camera) -> bool:
     """Return whether a camera has a size, finite parameters and a focal length, if it has one."""
-    params, sides = np.asarray(camera.params, np.float64), (camera.width, camera.height)
+    params = np.asarray(camera.params, np.float64)
+    sides = (camera.width, camera.height)
     has_size = all(0 < side <= MAX_SIDE_PX for side in sides)
     focals = params[list(camera.focal_length_idxs())]
     return bool(has_size and (np.abs(params) < FAR).all() and (focals > 0.0).all())
@@ -295,9 +314,36 @@ def num_long_tracks(model: pycolmap.Reconstruction, same_view: Mapping[int, int]
 
     ``same_view``: of images that show the view of another one, the id of that.
     """
-    tracks = ({e.image_id for e in point.track.elements} for point in model.points3D.values())
-    long = (images for images in tracks if len({same_view.get(i, i) for i in images}) > 2)
-    return Counter(image_id for images in long for image_id in images)
+    found = Counter[int]()
+    for images in _long_tracks(model):
+        if len({same_view.get(image_id, image_id) for image_id in images}) > 2:
+            found.update(images)
+    return found
+
+
+def all_see_long_tracks(
+    model: pycolmap.Reconstruction, image_ids: Iterable[int], least: int
+) -> bool:
+    """Return whether each of some images sees so many points of three images or more."""
+    missing = dict.fromkeys(image_ids, least)
+    for images in _long_tracks(model):
+        for image_id in images & missing.keys():
+            missing[image_id] -= 1
+            if missing[image_id] <= 0:
+                del missing[image_id]
+        if not missing:
+            return True
+    return not missing
+
+
+def _long_tracks(model: pycolmap.Reconstruction) -> Iterator[set[int]]:
+    """Return the ids of the images of each point that three or more see."""
+    for point in model.points3D.values():
+        if point.track.length() <= 2:
+            continue
+        images = {element.image_id for element in point.track.elements}
+        if len(images) > 2:
+            yield images
 
 
 def seen_points(image: pycolmap.Image) -> Indices:

@@ -28,7 +28,8 @@ def flat_values(options: Any) -> dict[str, Any]:
 
 def differences(options: Any, default: Any, named: Collection[str] = ()) -> dict[str, Plain]:
     """Return what is ``named``, or differs from options of the same class, by dotted key."""
-    others, values = _plain_values(default), _plain_values(options)
+    others = _plain_values(default)
+    values = _plain_values(options)
     return {key: value for key, value in values.items() if key in named or value != others[key]}
 
 
@@ -47,10 +48,12 @@ def resolve(
     Of keys sections may be left out where a name exists once. OptionError, which begins with
     ``flag``, names a key that is unknown, ambiguous, or ``owned``, or has a wrong value.
     """
-    known, plain = flat_values(options), _plain_values(options)
+    known = flat_values(options)
+    plain = _plain_values(options)
     keys = {_full_key(text, known, flag): text for text in given}
     for key, text in keys.items():
-        where, value = f"{flag} {text}", given[text]
+        where = f"{flag} {text}"
+        value = given[text]
         if reason := owned.get(_name(key)):
             raise OptionError(f"{where}: cannot be changed here; {reason}")
         kind = type(known[key])

@@ -8,10 +8,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL
 from colmap_affrect.colmap.database import fill_descriptors, open_database
 from colmap_affrect.colmap.database_copy import copy_database, read_names
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import new_results, temporary_folder
+from colmap_affrect.project.paths import PathLike, as_path
 from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.workspace import Workspace
 
 MAPPER_OPTIONS = (
     "--Mapper.tri_ignore_two_view_tracks 0 --Mapper.init_min_num_inliers 50 "
@@ -23,14 +25,34 @@ LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)  # that COLMAP 3.8 h
 FILL = Path(__file__).with_name("colmap_3_8.sql")  # makes the tables, from an attached ``new``
 
 
-def export_database(source: Path, target: Path, features: FeatureStore | None = None) -> int:
-    """Write a database as COLMAP 3.8 makes them; ids stay, and the source is only read.
+def export_database(path: PathLike, database_path: PathLike, *, descriptors: bool = False) -> int:
+    """Write a database as COLMAP 3.8 makes them; ids stay, and the old one is only read.
 
-    Rigs and descriptors of networks are left out, but those of ``features`` are written as 8-bit
-    SIFT. Returns how many images have descriptors. Positions are those of the priors, latitude,
-    longitude and altitude, or in metres. DatabaseError when the source cannot be used or has a
-    camera model that COLMAP 3.8 does not know, OptionError when the target exists.
+    Rigs and descriptors of networks are left out. Positions are those of the priors, latitude,
+    longitude and altitude, or in metres.
+
+    Args:
+        path: a database, or the output folder of a run.
+        database_path: the database to make.
+        descriptors: write those of ``features.h5`` in the folder, as 8-bit SIFT.
+
+    Returns:
+        How many images have descriptors.
+
+    Raises:
+        DatabaseError: when the old one cannot be used or has a camera model that COLMAP 3.8 does
+            not know.
+        OptionError: when the new one exists, or the folder has no features.
     """
+    path = as_path(path, "path")
+    workspace = Workspace(path) if path.is_dir() else Workspace.beside(path)
+    if descriptors and not workspace.features.exists():
+        raise OptionError(f"--descriptors: {path} is no output folder with features.h5")
+    features = FeatureStore(workspace.features) if descriptors else None
+    return _write(workspace.database, as_path(database_path, "database_path"), features)
+
+
+def _write(source: Path, target: Path, features: FeatureStore | None) -> int:
     with (
         new_results(target, names=read_names(source)) as (old,),
         temporary_folder(old.parent) as folder,  # in which no name is the user's

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.regular_files import NotAFileError, read_regular, require_regular
 
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
@@ -30,7 +31,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
 
     Without a write-ahead log or a journal as immutable: SQLite makes no files beside it then.
     """
-    wal, journal, index = (path.with_name(path.name + end) for end in ("-wal", "-journal", "-shm"))
+    wal, journal, index = (Path(f"{path}{end}") for end in ("-wal", "-journal", "-shm"))
     for file in (path, wal, journal, index):
         try:
             require_regular(file)
@@ -39,7 +40,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     if not path.is_file():
         raise OptionError(f"{path}: no such file; give a COLMAP database")
     mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
-    address = f"{path.resolve().as_uri()}?{mode}"
+    address = f"{resolved(path).as_uri()}?{mode}"
     try:
         with closing(sqlite3.connect(address, uri=True)) as connection:
             connection.execute("PRAGMA trusted_schema = OFF")  # no code of the file
@@ -84,7 +85,8 @@ class Tables:
     def summary(self) -> str:
         """Return the numbers of what there is."""
         features = sum(rows for rows, _ in self.keypoints.values())
-        images, cameras = len(self.names), len(self.cameras)
+        images = len(self.names)
+        cameras = len(self.cameras)
         return (
             f"{images} image{'s' * (images != 1)}, {cameras} camera{'s' * (cameras != 1)}, "
             f"{features} keypoints, {self.num_matched} matched and {self.num_verified} verified "

@@ -13,8 +13,12 @@ from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.epipolar import EpipolarModel, HomographyModel, PairModel, common_sign
-from colmap_affrect.geometry.significance import log10_bayes_factor, log10_false_alarms, shuffled
-from colmap_affrect.geometry.tilts import of_unit_area, vary_singly
+from colmap_affrect.geometry.significance import (
+    log10_bayes_factor,
+    log10_false_alarms,
+    random_matches,
+)
+from colmap_affrect.geometry.tilts import are_individual_shapes, of_unit_area
 
 Cameras = tuple[pycolmap.Camera, pycolmap.Camera]  # of the two images
 Keypoints = tuple[Floats, Floats]  # (N, 2, 4 or 6) of each image, as in the database
@@ -45,7 +49,8 @@ def pair_model(
         return HomographyModel(np.asarray(geometry.H, np.float64), (points1, points2))
     if geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
         return None
-    essential, fundamental = geometry.E, geometry.F
+    essential = geometry.E
+    fundamental = geometry.F
     is_calibrated = geometry.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
     if is_calibrated and essential is not None and np.any(essential):
         matrices = [camera.calibration_matrix() for camera in cameras]
@@ -99,7 +104,7 @@ def significance(
             return math.inf
         rows = np.arange(len(keypoints[0]))
         inliers = rows[model.errors(rows, rows) <= max_error_px]
-        hits = model.errors(*shuffled(len(rows))) <= max_error_px
+        hits = model.errors(*random_matches(len(rows))) <= max_error_px
         chance = max(float(hits.mean()), 1.0 / len(hits))
         alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
         first, second = map(_telling_shapes, keypoints)
@@ -120,13 +125,13 @@ def _telling_shapes(keypoints: Floats) -> Array | None:
     if parts.shape[1] == 2:
         shapes = parts[:, 0, None, None] * rotation(parts[:, 1])
     alike = np.ptp(of_unit_area(shapes), axis=0).max() < MIN_VARIETY
-    return None if alike or not vary_singly(shapes) else shapes
+    return None if alike or not are_individual_shapes(shapes) else shapes
 
 
 def _frame_evidence(model: PairModel, inliers: Indices, shapes: tuple[Array, Array]) -> float:
     """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
     cosines = model.cosines(inliers, inliers, shapes)
-    first, second = shuffled(len(inliers))
+    first, second = random_matches(len(inliers))
     by_chance = model.cosines(inliers[first], inliers[second], shapes)
     limit = math.cos(math.radians(MAX_FRAME_ANGLE_DEG))
     signs = (1.0, -1.0) if model.has_sign else (1.0,)

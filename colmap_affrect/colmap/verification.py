@@ -16,7 +16,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import significance
 from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
-from colmap_affrect.geometry.parallax import line_of_writing
+from colmap_affrect.geometry.parallax import text_line_matches
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -34,10 +34,12 @@ class VerificationOptions(PresetOptions):
     """Two-view geometry, by default the sparse preset (names as in pycolmap)."""
 
     max_error_px: Annotated[float, within(0.01, 1000.0)] = 3.0
+    """Largest error of an inlier."""
     scale_max_error: bool = True
     """Whether ``max_error_px`` counts pixels of photographs as they were when features were
     extracted, shrunk to ``max_image_size_px`` of the recipe; else those of the files."""
     min_num_inliers: Annotated[int, within(5, 1_000_000)] = 15
+    """Fewest inliers of a verified pair."""
     min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.0
     """Share of the raw matches; those that are wrong say little about the others."""
     min_significance: Annotated[float, within(0.0, 1e9)] = 5.0
@@ -46,8 +48,11 @@ class VerificationOptions(PresetOptions):
     frames agree with the geometry. With 5, all pairs of 450 unrelated photographs have about one. 0
     accepts what COLMAP accepts."""
     max_num_trials: Annotated[int, within(1, 100_000_000)] = 10000
+    """Most samples that RANSAC draws for a pair."""
     ransac_min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.10
+    """Smallest share of inliers that RANSAC draws enough samples for."""
     random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
+    """Of the samples; -1: another one each time."""
 
     COLMAP: ClassVar[Mapping[str, Any]] = {
         "max_error_px": 4.0,
@@ -120,7 +125,7 @@ def estimate_geometry(
     inliers = np.asarray(geometry.inlier_matches)[:, 0]
     if options.min_significance:
         sizes = [(camera.width, camera.height) for camera in cameras]
-        written = line_of_writing(points1[inliers], points2[inliers], (sizes[0], sizes[1]))
+        written = text_line_matches(points1[inliers], points2[inliers], (sizes[0], sizes[1]))
         if written.mean() > MAX_WRITTEN_SHARE:
             scene = np.delete(matches, inliers[written], axis=0)
             return estimate_geometry(sides, scene, options, extracted_px)
@@ -230,7 +235,7 @@ def verify_pairs(
         return ids, estimate_geometry(sides, matches, options, of_pair(extracted_px, ids))
 
     tasks = (
-        ((one, two), (side(one), side(two)), database.read_matches(one, two))
+        ((one, two), (side(one), side(two)), _each_once(database.read_matches(one, two)))
         for one, two in map(tuple, pairs)
     )
     found = map_ordered(estimate, tasks, available_cores())
@@ -240,6 +245,12 @@ def verify_pairs(
                 database.write_two_view_geometry(*ids, geometry)
         if advance:
             advance(len(batch))
+
+
+def _each_once(matches: Matches) -> Matches:
+    """Leave out repetitions: each match is evidence once, and would agree with its own copies."""
+    _, first = np.unique(matches, axis=0, return_index=True)
+    return matches if len(first) == len(matches) else matches[np.sort(first)]
 
 
 class PairVerifier:

@@ -8,10 +8,10 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
-from colmap_affrect.comparison.method_run import CompareOptions, MethodRun
+from colmap_affrect.comparison.method_run import CompareKeywords, CompareOptions, MethodRun
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, pose_scores
@@ -20,74 +20,86 @@ from colmap_affrect.comparison.worker import run_alone
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.options import digest_of
+from colmap_affrect.options import digest_of, require_bools, takes_fields_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
-from colmap_affrect.progress import SILENT, Progress, show
+from colmap_affrect.progress import GivenProgress, Progress, show
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Inputs
 
 NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
+PAIRS_PER_IMAGE = 4  # that take roughly as long as an image, for the forecast
 
 
+@takes_fields_of(CompareOptions)
 def compare(
     image_path: PathLike,
     output_path: PathLike,
     options: CompareOptions | None = None,
     *,
     overwrite: bool = False,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
+    **keywords: Unpack[CompareKeywords],
 ) -> Comparison:
-    """Find out how many photographs each method registers, and which; go on after a stop.
+    """Find out how many photographs each method registers, and which.
 
-    Each method runs in a process of its own; one that fails is reported, and the others go on. With
-    ``overwrite`` methods run again. Writes ``comparison.json`` and ``report.html``, too. Raises
-    AffrectError for anything that the caller can mend, before any method is run.
+    Each method runs in a process of its own; one that fails is reported, and the others go on.
+    Writes ``comparison.json`` and ``report.html``, too. A comparison that was stopped goes on.
+
+    Args:
+        image_path: folder of the photographs, searched with its sub-folders.
+        output_path: folder for all results, made if missing.
+        options: options to begin with; None for the usual ones.
+        overwrite: run methods again that have results.
+        progress: True shows it on standard error, False nowhere; None where somebody looks at it,
+            on a terminal or in a notebook.
+        keywords: fields of :class:`CompareOptions`, as ``methods=["sift", "default"]``.
+
+    Returns:
+        What each method registers, and how long it takes.
+
+    Raises:
+        OptionError: for wrong arguments, by their names.
+        AffrectError: for anything else that the caller can mend, before any method is run.
     """
-    image_path, output_path = as_path(image_path), as_path(output_path)
-    options = options or CompareOptions()
-    Workspace(output_path).require_own(image_path)
-    Workspace(output_path).refuse_run()
+    image_path = as_path(image_path, "image_path")
+    output_path = as_path(output_path, "output_path")
+    options = CompareOptions.with_keywords(options, keywords)
+    require_bools(overwrite=overwrite)
+    return _compare(image_path, output_path, options, Progress.given(progress), again=overwrite)
+
+
+def _compare(
+    image_path: Path, output_path: Path, options: CompareOptions, progress: Progress, *, again: bool
+) -> Comparison:
+    """Compare with checked arguments; ``again``: also methods that have results."""
+    workspace = Workspace(output_path)
+    workspace.require_own(image_path)
+    workspace.refuse_run()
     methods = parse_methods(options.methods)
-    inputs, names = _checked(image_path, options)
-    listed = options.pairs.match_list_path
-    pairs = list(read_pairs(Path(listed), names, image_path)) if listed else exhaustive_pairs(names)
+    inputs, names = _checked_inputs(image_path, options)
+    pairs = _pairs(image_path, names, options.pairs)
     truth = _ground_truth(options.ground_truth_path, names)
-    options = replace(options, mapping=MAPPERS.make(options.mapping).options)
-    same = _same_for_all(inputs, names, pairs, options)
-    given = output_path.resolve(), image_path.resolve(), options, same
-    runs = [MethodRun(method, *given) for method in methods]
-    recipes = [run.method.recipe for run in runs if overwrite or not run.finished()]
-    keys = {key for recipe in recipes if recipe for key in recipe.required_weights}
-    resolve(sorted(keys), options.resources.weights_path, progress=progress)
-    with Workspace(output_path).locked():
-        for run in runs:
-            run.begin(overwrite=overwrite)
-        results, units, pace, start_s = [], len(names) + len(pairs) / 4, 1.0, time.monotonic()
-        left = {run.method.label: units * run.seconds for run in runs if not run.finished()}
-        total = sum(left.values())
-        for number, run in enumerate(runs, 1):
-            title = f"method {number} of {len(runs)}, {run.method.label}: "
-            if run.method.label in left and progress.stream:
-                minutes = max(1.0, pace * sum(left.values()) / 60)
-                show(f"{title}about {minutes:.0f} min left for all", file=progress.stream)
-            failed = "" if run.finished() else run_alone(run, title, progress)
-            if left.pop(run.method.label, 0.0):
-                pace = (time.monotonic() - start_s) / (total - sum(left.values()))
-            found = run.finished() or replace(run.result, seeds=())
-            results.append(replace(found, failed=failed or found.failed))
+    options = options.changed(mapping=MAPPERS.make(options.mapping).options)
+    common = _common_record(inputs, names, pairs, options)
+    folders = (resolved(output_path), resolved(image_path))
+    runs = [MethodRun(method, *folders, options, common) for method in methods]
+    _resolve_weights(runs, options, progress, overwrite=again)
+    with workspace.locked():
+        num_images = len(names) + len(pairs) / PAIRS_PER_IMAGE
+        results = _run_methods(runs, num_images, progress, overwrite=again)
         if truth:
-            results = [_measured(result, output_path, truth, names) for result in results]
+            results = [_scored(result, output_path, truth, names) for result in results]
         comparison = Comparison(
             image_names=tuple(names),
-            image_path=str(image_path.resolve()),
+            image_path=str(resolved(image_path)),
             methods=tuple(results),
             seeds=tuple(options.seeds),
             num_pairs=len(pairs),
-            settings=_settings(same, options),
+            settings=_settings(common, options),
             versions=installed_versions(),
         )
         replace_text(output_path / "comparison.json", to_json(comparison))
@@ -95,7 +107,66 @@ def compare(
     return comparison
 
 
-def _checked(image_path: Path, options: CompareOptions) -> tuple[Inputs, list[str]]:
+def _pairs(image_path: Path, names: Sequence[str], options: PairOptions) -> list[Pair]:
+    """Return the listed pairs, or all."""
+    if options.match_list_path:
+        return list(read_pairs(Path(options.match_list_path), names, image_path))
+    return exhaustive_pairs(names)
+
+
+def _resolve_weights(
+    runs: Sequence[MethodRun], options: CompareOptions, progress: Progress, *, overwrite: bool
+) -> None:
+    """Find or download the weights of all methods that are to be run."""
+    keys: set[str] = set()
+    for run in runs:
+        is_to_be_run = overwrite or not run.finished()
+        if is_to_be_run and run.method.recipe:
+            keys.update(run.method.recipe.required_weights)
+    resolve(sorted(keys), options.resources.weights_path, progress=progress)
+
+
+def _run_methods(
+    runs: Sequence[MethodRun], num_images: float, progress: Progress, *, overwrite: bool
+) -> list[MethodResult]:
+    """Run the methods that are not finished.
+
+    Args:
+        runs: of all methods.
+        num_images: a measure of the work; a pair counts as part of an image.
+        progress: where to show it, and how long all methods take by the pace of those before.
+        overwrite: discard what is there.
+
+    Returns:
+        The result of each method.
+    """
+    for run in runs:
+        run.begin(overwrite=overwrite)
+    left_s = {}  # by the label of a method that is to be run, as estimated
+    for run in runs:
+        if not run.finished():
+            left_s[run.method.label] = num_images * run.seconds_per_image
+    total_s = sum(left_s.values())
+    pace = 1.0  # seconds that pass in an estimated one
+    start_s = time.monotonic()
+    results = []
+    for number, run in enumerate(runs, 1):
+        label = run.method.label
+        title = f"method {number} of {len(runs)}, {label}: "
+        failed = ""
+        if label in left_s:
+            if progress.stream:
+                minutes = max(1.0, pace * sum(left_s.values()) / 60)
+                show(f"{title}about {minutes:.0f} min left for all", file=progress.stream)
+            failed = run_alone(run, title, progress)
+            del left_s[label]
+            pace = (time.monotonic() - start_s) / (total_s - sum(left_s.values()))
+        result = run.finished() or replace(run.result, seeds=())
+        results.append(replace(result, failed=failed or result.failed))
+    return results
+
+
+def _checked_inputs(image_path: Path, options: CompareOptions) -> tuple[Inputs, list[str]]:
     """Return the photographs and their names; refuse what cannot work before anything is done."""
     if not options.seeds or len(set(options.seeds)) < len(options.seeds):
         raise OptionError(f"--seeds {','.join(map(str, options.seeds))}: give different seeds")
@@ -114,26 +185,33 @@ def _checked(image_path: Path, options: CompareOptions) -> tuple[Inputs, list[st
     return inputs, names
 
 
-def _same_for_all(
+def _common_record(
     inputs: Inputs, names: Sequence[str], pairs: Sequence[Pair], options: CompareOptions
 ) -> dict[str, Any]:
     """Return what all methods begin with, for the record; digests stand for the files."""
-    files = {name: inputs.photographs.files(name) for name in names}
-    files[""] = inputs.camera_files
-    but_seeds: dict[str, Any] = {"mode": "json", "exclude_none": True, "exclude": {"random_seed"}}
+    digests = {}
+    for name in names:
+        digests[name] = content_of(inputs.photographs.files(name)).digest[:NUM_DIGITS]
+    digests[""] = content_of(inputs.camera_files).digest[:NUM_DIGITS]
+    without_seeds: dict[str, Any] = {
+        "mode": "json",
+        "exclude_none": True,
+        "exclude": {"random_seed"},
+    }
     return {
-        "photographs": {k: content_of(paths).digest[:NUM_DIGITS] for k, paths in files.items()},
+        "photographs": digests,
         "pairs": {"number": len(pairs), "sha256": digest_of(pairs)},
         "camera": options.cameras.to_mapping(),
         "masks": {key: bool(path) for key, path in options.masks.to_mapping().items()},
-        "verification": options.verification.model_dump(**but_seeds),
-        "mapping": options.mapping.model_dump(**but_seeds),
+        "verification": options.verification.model_dump(**without_seeds),
+        "mapping": options.mapping.model_dump(**without_seeds),
     }
 
 
-def _settings(same: Mapping[str, Any], options: CompareOptions) -> dict[str, Any]:
+def _settings(common: Mapping[str, Any], options: CompareOptions) -> dict[str, Any]:
+    """Return what ``comparison.json`` says of the options of all methods."""
     return {
-        **{key: value for key, value in same.items() if key != "photographs"},
+        **{key: value for key, value in common.items() if key != "photographs"},
         "image_list_path": str(options.image_list_path or ""),
         "from_database": str(options.from_database or ""),
         "ground_truth_path": str(options.ground_truth_path or ""),
@@ -143,6 +221,7 @@ def _settings(same: Mapping[str, Any], options: CompareOptions) -> dict[str, Any
 
 
 def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
+    """Read the true poses; AffrectError where they are of other photographs."""
     if path is None:
         return None
     truth = read_poses(path)
@@ -154,10 +233,8 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
     return truth
 
 
-def _measured(
-    result: MethodResult, folder: Path, truth: Poses, names: Sequence[str]
-) -> MethodResult:
-    """Add the scores of the models against ground truth."""
+def _scored(result: MethodResult, folder: Path, truth: Poses, names: Sequence[str]) -> MethodResult:
+    """Add the scores of the models of all seeds against ground truth."""
     seeds = []
     for seed in result.seeds:
         poses = read_poses(folder / seed.model_path) if seed.model_path else {}

@@ -6,6 +6,7 @@
 COLMAP's own SIFT goes another way to features and matches.
 """
 
+import itertools
 import json
 import math
 import shutil
@@ -15,9 +16,9 @@ from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
@@ -25,27 +26,29 @@ from colmap_affrect.colmap.database import image_ids, open_database, unverified_
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.comparison import DEFAULT_METHODS
-from colmap_affrect.comparison.methods import SIFT_COLMAP, Method
+from colmap_affrect.comparison.methods import SIFT_COLMAP, GivenMethods, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
-from colmap_affrect.errors import AffrectError, StoreError
+from colmap_affrect.errors import AffrectError, ConflictError, damage
 from colmap_affrect.escalation.climb import climb
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database, read_summaries
+from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.lists import Pair, read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
-from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_bytes, replace_text
 from colmap_affrect.project.outputs import new_results, remove_own, temporary_folder
+from colmap_affrect.project.paths import GivenPath, PathLike
 from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import Recipe
+from colmap_affrect.recipes import AnyMapper, Recipe
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.database_export import add_images
+from colmap_affrect.session.run_options import InputKeywords, InputOptions
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
@@ -58,16 +61,28 @@ from colmap_affrect.stages.verify import verify_matches
 def extract_sift(
     database_path: Path, image_path: Path, image_names: Sequence[str], masks: MaskOptions
 ) -> dict[str, str]:
-    """Extract SIFT features of images of a database; those that have some are kept.
+    """Extract SIFT features of images of a database by COLMAP's default options.
 
-    Images and masks that claim more pixels than photographs have are passed over: COLMAP takes
-    memory for whatever a header claims. Options are COLMAP's defaults. Returns the images without
-    features, with the reason.
+    Features that are there are kept. Images and masks that claim more pixels than photographs have
+    are left out: COLMAP takes memory for whatever a header claims.
+
+    Args:
+        database_path: the database, which has the images.
+        image_path: folder of the images.
+        image_names: of the images.
+        masks: where masks are.
+
+    Returns:
+        The images without features, with the reason.
     """
     photographs = Photographs(image_path, masks)
-    impossible = {name: why for name in image_names if (why := photographs.why_impossible(name))}
-    usable = [name for name in image_names if name not in impossible]
-    with _masks_for_colmap(photographs, usable) as mask_path:
+    failures = {}
+    for name in image_names:
+        why = photographs.why_impossible(name)
+        if why:
+            failures[name] = why
+    usable = [name for name in image_names if name not in failures]
+    with masks_for_colmap(photographs, usable) as mask_path:
         reader = pycolmap.ImageReaderOptions(
             mask_path=mask_path, camera_mask_path=masks.camera_path
         )
@@ -75,15 +90,17 @@ def extract_sift(
             pycolmap.extract_features(database_path, image_path, usable, reader_options=reader)
     ids = image_ids(database_path)
     with open_database(database_path) as database:
-        failed = [name for name in usable if not database.exists_keypoints(ids[name])]
-    return impossible | dict.fromkeys(failed, "COLMAP cannot read it or its mask")
+        for name in usable:
+            if not database.exists_keypoints(ids[name]):
+                failures[name] = "COLMAP cannot read it or its mask"
+    return failures
 
 
 @contextmanager
-def _masks_for_colmap(photographs: Photographs, names: Sequence[str]) -> Iterator[str]:
+def masks_for_colmap(photographs: Photographs, names: Sequence[str]) -> Iterator[str]:
     """Yield a folder of masks that has those of alpha channels, too: COLMAP does not look there."""
-    own = {name: photographs.own_mask(name) for name in names}
-    alphas = photographs.alpha_masks([name for name in names if not own[name]])
+    mask_paths = {name: photographs.own_mask(name) for name in names}
+    alphas = photographs.alpha_masks([name for name in names if not mask_paths[name]])
     if not alphas:
         yield photographs.masks.path
         return
@@ -91,24 +108,31 @@ def _masks_for_colmap(photographs: Photographs, names: Sequence[str]) -> Iterato
         for name in names:
             target = Path(folder) / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
+            mask_path = mask_paths[name]
             if name in alphas:
                 replace_bytes(target, reading.encode_mask(alphas[name]))
-            elif path := own[name]:
-                shutil.copy(path, target)
+            elif mask_path:
+                shutil.copy(mask_path, target)
         yield folder
 
 
 def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
-    """Match pairs of images, or all, by COLMAP's defaults, without verification.
+    """Match pairs of images by COLMAP's defaults, without verification.
 
-    AffrectError for listed names with spaces, which COLMAP's lists of pairs cannot hold.
+    Args:
+        database_path: the database, which has the features.
+        pairs: of image names; None for all.
+
+    Raises:
+        AffrectError: a listed name has a space, which COLMAP's lists of pairs cannot hold.
     """
     options = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True)
     if pairs is None:
         pycolmap.match_exhaustive(database_path, matching_options=options)
         return
-    if spaced := [name for pair in pairs for name in pair if " " in name]:
-        raise AffrectError(f"{spaced[0]}: COLMAP matches no listed names with spaces; rename it")
+    for name in itertools.chain.from_iterable(pairs):
+        if " " in name:
+            raise AffrectError(f"{name}: COLMAP matches no listed names with spaces; rename it")
     with temporary_folder(database_path.parent) as folder:
         list_path = folder / "pairs.txt"
         replace_text(list_path, "".join(f"{first} {second}\n" for first, second in pairs))
@@ -117,31 +141,52 @@ def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
 
 
 METHODS = "methods"  # folder of all methods
-RESULT = TypeAdapter(MethodResult)  # from and to JSON
+RESULT_JSON = TypeAdapter(MethodResult)
+# Rough seconds of an image with its share of the pairs: a forecast begins with them, and goes on by
+# the pace of the methods that are done.
+SIFT_SECONDS = 0.5
+RECIPE_SECONDS = 1.5
+ESCALATION_SECONDS = 6.0
 
 
-@dataclass(frozen=True, kw_only=True)
 class CompareOptions(InputOptions):
-    """Everything a comparison depends on beside its images and its output folder."""
+    """Everything a comparison depends on beside its images and its output folder.
 
-    methods: Sequence[str | Method] = DEFAULT_METHODS  # also by name, as the command line has them
-    seeds: Sequence[int] = (0, 1, 2)  # of verification and mapping, which run once for each
-    ground_truth_path: Path | None = None  # of a COLMAP model with true poses, in any frame
+    Options of a part, as ``cameras``, may be a dictionary, and ``mapping`` a name.
+    """
+
+    mapping: AnyMapper = SparseOptions()
+    """The mapper and its options, the same for all methods."""
+    methods: GivenMethods = DEFAULT_METHODS
+    """``sift-colmap``, ``sift``, or recipes, as ``NAME`` or ``LABEL=NAME:OPTION=VALUE``."""
+    seeds: Annotated[tuple[int, ...], Field(strict=False)] = (0, 1, 2)
+    """Of verification and mapping, which run once for each."""
+    ground_truth_path: GivenPath | None = None
+    """COLMAP model with true poses, in any frame."""
+
+
+class CompareKeywords(InputKeywords, total=False):
+    """The fields of :class:`CompareOptions` as keywords of a function."""
+
+    methods: str | Sequence[str | Method]
+    seeds: Sequence[int]
+    ground_truth_path: PathLike | None
 
 
 @dataclass
 class MethodRun:
-    """A method, where its results are, and how it is run."""
+    """Runs a method, and keeps what it has done in a folder."""
 
     method: Method
-    output_path: Path  # of the comparison
+    output_path: Path  # folder of the comparison
     image_path: Path
     options: CompareOptions
     inputs: Mapping[str, Any]  # what all methods begin with, for the record
     progress: Progress = SILENT
 
     def __post_init__(self) -> None:
-        self.verification, self.mapping = self.options.verification, self.options.mapping
+        self.verification = self.options.verification
+        self.mapping = self.options.mapping
         if self.method.label == SIFT_COLMAP:  # all of it as COLMAP does it
             self.verification = VerificationOptions.preset("colmap")
             self.mapping = Recipe().mapper_options("colmap")
@@ -149,15 +194,18 @@ class MethodRun:
         self.database = self.workspace.database
 
     @property
-    def seconds(self) -> float:
-        """What an image, or four pairs, take about; of COLMAP's SIFT, a recipe, one of levels."""
-        return 6.0 if self.method.escalates else 1.5 if self.method.recipe else 0.5
+    def seconds_per_image(self) -> float:
+        """What an image takes with its share of the pairs, about."""
+        if self.method.escalates:
+            return ESCALATION_SECONDS
+        return RECIPE_SECONDS if self.method.recipe else SIFT_SECONDS
 
     @property
     def result(self) -> MethodResult:
         """What is done of the method, as it is on disk."""
-        with suppress(FileNotFoundError, ValidationError):  # of a version before: features stay
-            return RESULT.validate_json(read_regular(self.workspace.path / "result.json"))
+        # A result of an older version is not valid: then features stay, and models are made again.
+        with suppress(FileNotFoundError, ValidationError):
+            return RESULT_JSON.validate_json(read_regular(self.workspace.path / "result.json"))
         return MethodResult(
             self.method.label,
             summary=self.method.summary,
@@ -173,16 +221,19 @@ class MethodRun:
 
     def begin(self, *, overwrite: bool) -> None:
         """Make the folder; StoreError where the method was run there on something else."""
-        folder, record = self.workspace.path, self.workspace.path / "inputs.json"
+        folder = self.workspace.path
+        record = folder / "inputs.json"
         if overwrite:
             remove_own([folder])
         asked = {**self.inputs, **self.method.options}
-        if self.method.escalates:  # verification of this seed decides
+        if self.method.escalates:  # verification with this seed decides what is matched again
             asked["seed"] = self.options.seeds[0]
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
-        known = json.loads(read_regular(record)) if record.exists() else {}
-        if folder.exists() and (difference := first_difference(known, asked)):
-            raise StoreError(
+        with damage(record, "use --overwrite to redo the methods that are named"):
+            known = json.loads(read_regular(record)) if record.exists() else {}
+            difference = first_difference(known, asked)
+        if folder.exists() and difference:
+            raise ConflictError(
                 f"{folder}: {self.method.label} was run there with {difference}; use "
                 "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
                 "or another --output-path"
@@ -195,8 +246,9 @@ class MethodRun:
         self.keep(failed="")
         if not self.result.wall_s:  # time that a killed run took does not count
             watch = Stopwatch()
-            find = self._match_recipe if self.method.recipe else self._match_sift
-            self.keep(failures=find(watch), wall_s=watch.seconds)
+            extract_and_match = self._match_recipe if self.method.recipe else self._match_sift
+            failures = extract_and_match(watch)
+            self.keep(failures=failures, wall_s=watch.seconds)
         done = {result.seed: result for result in self.result.seeds}
         for seed in self.options.seeds:
             if seed not in done:
@@ -205,35 +257,42 @@ class MethodRun:
         self.keep(seeds=tuple(done[seed] for seed in self.options.seeds))
 
     def keep(self, **values: Any) -> None:
-        """Put what is new of the result on disk."""
+        """Change fields of the result on disk."""
         peak = max(self.result.peak_memory_bytes, peak_memory_bytes())
         result = replace(self.result, peak_memory_bytes=peak, **values)
-        replace_bytes(self.workspace.path / "result.json", RESULT.dump_json(result, indent=1))
+        replace_bytes(self.workspace.path / "result.json", RESULT_JSON.dump_json(result, indent=1))
 
     def _match_sift(self, watch: Stopwatch) -> dict[str, str]:
         """Extract and match as COLMAP does; return why images cannot be used."""
         inputs = self.options.inputs(self.image_path)
-        names, progress = inputs.names(), self.progress
-        with watch.step("extract"), progress.stage("extract", len(names), "images") as advance:
-            failures = add_images(self.workspace, ViewGraph(self.database), inputs, names)
-            taken = [name for name in names if name not in failures]
-            if not taken:
+        names = inputs.names()
+        stage = self.progress.stage
+        graph = ViewGraph(self.database)
+        with watch.step("extract"), stage("extract", len(names), "images") as advance:
+            failures = add_images(self.workspace, graph, inputs, names)
+            usable = [name for name in names if name not in failures]
+            if not usable:
                 raise AffrectError(f"COLMAP cannot use any of the {len(names)} images")
-            failures |= extract_sift(self.database, self.image_path, taken, self.options.masks)
+            failures |= extract_sift(self.database, self.image_path, usable, self.options.masks)
             advance(len(names))
-        taken, pairs = list(image_ids(self.database)), None
-        if listed := self.options.pairs.match_list_path:
-            known = read_pairs(Path(listed), names, self.image_path)
-            pairs = [pair for pair in known if set(taken) >= set(pair)]
-        num_pairs = math.comb(len(taken), 2) if pairs is None else len(pairs)
-        with watch.step("match"), progress.stage("match", num_pairs, "pairs") as advance:
+        known = set(image_ids(self.database))
+        pairs = None
+        num_pairs = math.comb(len(known), 2)
+        list_path = self.options.pairs.match_list_path
+        if list_path:
+            listed = read_pairs(Path(list_path), names, self.image_path)
+            pairs = [pair for pair in listed if known.issuperset(pair)]
+            num_pairs = len(pairs)
+        with watch.step("match"), stage("match", num_pairs, "pairs") as advance:
             match_sift(self.database, pairs)
             advance(num_pairs)
         return failures
 
     def _match_recipe(self, watch: Stopwatch) -> dict[str, str]:
+        """Extract, match and match again by a recipe; return why images cannot be used."""
         context = Context(self.workspace, self.options.resources, None, self.progress)
-        inputs, recipe = self.options.inputs(self.image_path), self.method.recipe or Recipe()
+        inputs = self.options.inputs(self.image_path)
+        recipe = self.method.recipe or Recipe()
         self.keep(lacks=context.resources.how_to_complete(recipe.extraction))
         with watch.step("extract"):
             failures = extract(context, inputs, recipe).failures
@@ -241,9 +300,10 @@ class MethodRun:
         with watch.step("match"):
             match(context)
         if self.method.escalates:
-            verification = self.verification.changed(random_seed=self.options.seeds[0])
+            seed = self.options.seeds[0]
+            verification = self.verification.changed(random_seed=seed)
             verify_matches(replace(context, progress=SILENT), verification)
-            mapper = MAPPERS.make(self.mapping.changed(random_seed=self.options.seeds[0]))
+            mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))
             with watch.step("escalate"):
                 climb(context, mapper, recipe)
         return failures
@@ -252,12 +312,13 @@ class MethodRun:
         """Verify and map a copy of the database of the method, in a folder of the seed."""
         folder = self.workspace.path / f"seed-{seed}"
         remove_own([folder])
+        watch = Stopwatch()
+        progress = copy(self.progress)
+        progress.title += f"seed {seed}, "
         with new_results(folder) as (new,):  # gets its name when all is done
             new.mkdir()
-            database_path, watch = new / "database.db", Stopwatch()
+            database_path = new / "database.db"
             copy_database(self.database, database_path)
-            progress = copy(self.progress)
-            progress.title += f"seed {seed}, "
             models = self._models(seed, new, watch, progress)
             verified = verified_pairs(database_path, self.verification.min_num_inliers)
         largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
@@ -277,6 +338,7 @@ class MethodRun:
     def _map_recipe(
         self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
     ) -> Sequence[ModelSummary]:
+        """Verify and map as a run does."""
         context = Context(self.workspace.branch(folder), self.options.resources, None, progress)
         with watch.step("verify"):
             verify_matches(context, self.verification.changed(random_seed=seed))
@@ -287,7 +349,17 @@ class MethodRun:
     def _models(
         self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
     ) -> Sequence[ModelSummary]:
-        """Verify and map a copy of the database; escalation has done so with the first seed."""
+        """Verify and map a copy of the database; escalation has done so with the first seed.
+
+        Args:
+            seed: of verification and mapping.
+            folder: of the seed, which has the copy.
+            watch: takes the seconds of both.
+            progress: where to show it.
+
+        Returns:
+            The models, which are in the folder, the largest first.
+        """
         if self.method.escalates and seed == self.options.seeds[0]:
             self.workspace.branch(folder)
             shutil.copytree(self.workspace.sparse, folder / "sparse")
@@ -300,14 +372,20 @@ class MethodRun:
     def _map_sift(
         self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
     ) -> Sequence[ModelSummary]:
-        path, options = folder / "database.db", self.verification.changed(random_seed=seed)
-        num_pairs, num_images = len(unverified_pairs(path)), len(image_ids(path))
+        """Verify and map as COLMAP does."""
+        path = folder / "database.db"
+        options = self.verification.changed(random_seed=seed)
+        num_pairs = len(unverified_pairs(path))
+        num_images = len(image_ids(path))
         with watch.step("verify"), progress.stage("verify", num_pairs, "pairs") as advance:
             verify(path, options, advance=advance)
         shutil.copy(self.workspace.cameras, folder)
-        cameras = read_camera_records(self.workspace.cameras)
-        may_share = self.options.inputs(self.image_path).may_share
         mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))
-        task = MappingTask(path, self.image_path, cameras=cameras, may_share=may_share)
+        task = MappingTask(
+            path,
+            self.image_path,
+            cameras=read_camera_records(self.workspace.cameras),
+            may_share=self.options.inputs(self.image_path).may_share,
+        )
         with watch.step("map"), progress.stage("map", num_images, "images") as advance:
             return map_database(mapper, task, folder / "sparse", advance)

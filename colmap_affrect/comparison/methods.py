@@ -2,16 +2,20 @@
 
 import re
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import suggestion
 from colmap_affrect.recipes import Recipe, load_recipe, recipe_names
 
-SIFT_COLMAP, SIFT = "sift-colmap", "sift"
+SIFT_COLMAP = "sift-colmap"  # COLMAP's SIFT, verification and mapping
+SIFT = "sift"  # COLMAP's SIFT, with our verification and mapping
 SIFT_SUMMARIES = {
     SIFT_COLMAP: "SIFT, verification and mapping as COLMAP does them by default",
     SIFT: "COLMAP's SIFT with its default options",
@@ -20,10 +24,10 @@ SIFT_SUMMARIES = {
 
 @dataclass(frozen=True)
 class Method:
-    """A recipe under the name it has in the results; None for COLMAP's SIFT."""
+    """What is compared: features and raw matches, by a recipe or by COLMAP's SIFT."""
 
-    label: str
-    recipe: Recipe | None
+    label: str  # its name in the results
+    recipe: Recipe | None  # None for COLMAP's SIFT
 
     @property
     def summary(self) -> str:
@@ -43,40 +47,75 @@ class Method:
     @property
     def folder_name(self) -> str:
         """Name of the folder of its results, different for every label."""
-        plain = re.sub(r"[^\w-]+", "_", self.label)
-        return plain if plain == self.label else f"{plain}-{zlib.crc32(self.label.encode()):08x}"
+        name = re.sub(r"[^\w-]+", "_", self.label)
+        if name == self.label:
+            return name
+        return f"{name}-{zlib.crc32(self.label.encode()):08x}"
+
+
+def _as_tuple(given: Any) -> Any:
+    return (given,) if isinstance(given, str) else given
+
+
+GivenMethods = Annotated[tuple[str | Method, ...], BeforeValidator(_as_tuple), Field(strict=False)]
+"""Field of options that takes what :func:`parse_methods` takes, a single text too."""
 
 
 def parse_methods(
     given: Iterable[str | Method], depth_settings: Sequence[str] = ()
 ) -> tuple[Method, ...]:
-    """Read methods as :func:`parse_method` takes them, several separated by commas.
+    """Read methods.
 
-    What follows a colon belongs to the last of a text. OptionError for none, or two of one name.
+    Args:
+        given: methods, or texts with one or several of them, separated by commas, as
+            :func:`parse_method` takes them. What follows a colon belongs to the last of a text.
+        depth_settings: ``KEY=VALUE`` for recipes that use depth.
+
+    Returns:
+        The methods in the order given.
+
+    Raises:
+        OptionError: none is given, two have the same name, or one is not known.
     """
     methods: list[Method] = []
-    for text in given:
-        if isinstance(text, Method):
-            methods.append(text)
-            continue
-        head, colon, settings = text.partition(":")
-        *names, last = (name.strip() for name in head.split(","))
-        texts = [*names, last and last + colon + settings]
-        methods += [parse_method(each, depth_settings) for each in texts if each]
+    for method in given:
+        if isinstance(method, Method):
+            methods.append(method)
+        else:
+            methods += _parse_list(method, depth_settings)
     if not methods:
         raise OptionError("no method given")
-    labels = [method.label for method in methods]
-    if twice := [label for label in labels if labels.count(label) > 1]:
-        other = "give one another name, as in NAME=RECIPE"
-        raise OptionError(f"two methods are called '{twice[0]}'; {other}")
+    for label, count in Counter(method.label for method in methods).items():
+        if count > 1:
+            other = "give one another name, as in NAME=RECIPE"
+            raise OptionError(f"two methods are called '{label}'; {other}")
     return tuple(methods)
+
+
+def _parse_list(text: str, depth_settings: Sequence[str]) -> list[Method]:
+    """Read methods separated by commas; what follows a colon belongs to the last one."""
+    head, colon, settings = text.partition(":")
+    *names, last = (name.strip() for name in head.split(","))
+    methods = [parse_method(name, depth_settings) for name in names if name]
+    if last:
+        methods.append(parse_method(last + colon + settings, depth_settings))
+    return methods
 
 
 def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     """Read ``sift-colmap``, ``sift`` or ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
 
-    Commas inside of brackets belong to a value. The recipe is a name or the path of a TOML file;
-    one that uses depth gets the ``depth_settings`` too. OptionError for what is not known.
+    Commas inside of brackets belong to a value. The recipe is a name or the path of a TOML file.
+
+    Args:
+        text: the method.
+        depth_settings: ``KEY=VALUE`` for a recipe that uses depth.
+
+    Returns:
+        The method, with its recipe loaded.
+
+    Raises:
+        OptionError: something is not known.
     """
     if text in SIFT_SUMMARIES:
         return Method(text, None)
@@ -91,5 +130,6 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     recipe = load_recipe(name, changes)
     if recipe.extraction.uses_depth:
         recipe = load_recipe(name, [*changes, *depth_settings])
-    default_label = text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
-    return Method(label or default_label, recipe)
+    if not label:
+        label = text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
+    return Method(label, recipe)

@@ -7,7 +7,8 @@ from colmap_affrect.comparison.results import MAX_CORRECT_ERROR_DEG, Comparison,
 from colmap_affrect.comparison.tables import headline, notes, table
 from colmap_affrect.options import flat
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.report import page
+from colmap_affrect.report.page import Page
+from colmap_affrect.report.page import write_page as write_any_page
 from colmap_affrect.report.scene import read_view
 
 TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
@@ -17,8 +18,8 @@ TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
 class Mark:
     """What one method does with one photograph."""
 
-    state: str  # ``always``, ``sometimes`` or ``never`` registered, over the seeds
-    kind: str  # ``shared`` (nothing is the matter), ``uncertain`` or ``wrong``: names of colours
+    state: str  # with how many seeds it is registered: ``always``, ``sometimes`` or ``never``
+    kind: str  # name of a colour: ``shared`` (nothing is the matter), ``uncertain`` or ``wrong``
     text: str
 
 
@@ -32,61 +33,88 @@ class Card:
 
 
 def write_page(comparison: Comparison, output_path: Path, progress: Progress = SILENT) -> Path:
-    """Write ``report.html``, one file that loads nothing, and return its path.
+    """Write ``report.html``, one file that loads nothing.
 
-    What is missing, as an unreadable photograph, is said in its place. Raises WorkspaceError.
+    Where a photograph cannot be read, or there is no model, the page says so.
+
+    Args:
+        comparison: what is shown.
+        output_path: folder of the comparison, which has the models.
+        progress: where to show it.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        WorkspaceError: the page cannot be written.
     """
-    names, cards = comparison.image_names, cards_of(comparison)
-    shown = [method.shown_seed for method in comparison.finished]
-    views = [read_view(output_path / seed.model_path if seed else None) for seed in shown]
-    kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
-    content = {
-        "comparison": comparison,
-        "headline": headline(comparison),
-        "notes": notes(comparison),
-        "methods": comparison.finished,
-        "table": table(comparison),
-        "cards": cards,
-        "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
-        "flat": flat,
-        "views": views,
-    }
-    drawn, path = zip(views, kinds, strict=True), output_path / "report.html"
-    folder = Path(comparison.image_path)
-    return page.write_page(path, TEMPLATE, content, names, folder, drawn, progress)
+    cards = contact_sheet(comparison)
+    views = []
+    for number, method in enumerate(comparison.finished):
+        seed = method.shown_seed
+        kinds = {card.name: card.marks[number].kind for card in cards}
+        views.append(read_view(output_path / seed.model_path if seed else None, kinds))
+    page = Page(
+        template=TEMPLATE,
+        content={
+            "comparison": comparison,
+            "headline": headline(comparison),
+            "notes": notes(comparison),
+            "methods": comparison.finished,
+            "table": table(comparison),
+            "cards": cards,
+            "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
+            "flat": flat,
+            "views": views,
+        },
+        names=comparison.image_names,
+        image_path=Path(comparison.image_path),
+        views=views,
+    )
+    return write_any_page(output_path / "report.html", page, progress)
 
 
-def cards_of(comparison: Comparison) -> list[Card]:
-    """Return the contact sheet."""
-    methods, cards = comparison.finished, []
+def contact_sheet(comparison: Comparison) -> list[Card]:
+    """Return all photographs with what each method does with them."""
+    methods = comparison.finished
+    cards = []
     for name in comparison.image_names:
         marks = tuple(_mark(method, name) for method in methods)
+        states = {mark.state for mark in marks}
         kinds = {mark.kind for mark in marks}
-        registered = comparison.registered_by[name]
-        tests = {
+        num_registered = len(comparison.registered_by[name])
+        is_in_group = {
             "all": True,
-            "differ": 0 < len(registered) < len(methods),
-            "seeds": any(mark.state == "sometimes" for mark in marks),
+            "differ": 0 < num_registered < len(methods),
+            "seeds": "sometimes" in states,
             "wrong": "wrong" in kinds,
             "uncertain": "uncertain" in kinds,
-            "none": not registered,
+            "none": num_registered == 0,
         }
-        cards.append(Card(name, marks, tuple(group for group in tests if tests[group])))
+        groups = tuple(group for group, is_in in is_in_group.items() if is_in)
+        cards.append(Card(name, marks, groups))
     return cards
 
 
 def _mark(method: MethodResult, name: str) -> Mark:
+    """Return what a method does with a photograph, over all seeds."""
     registering = [seed for seed in method.seeds if name in seed.registered_names]
-    state, kind, text = "always", "shared", f"{method.name}: registered"
     if not registering:
-        return Mark("never", kind, f"{method.name}: not registered")
+        return Mark("never", "shared", f"{method.name}: not registered")
+    state = "always"
+    text = f"{method.name}: registered"
     if len(registering) < len(method.seeds):
         state = "sometimes"
         text += f" with {len(registering)} of {len(method.seeds)} seeds"
-    scores = [seed.scores for seed in registering if seed.scores]
-    num_correct = sum(name in each.correct_names for each in scores)
+    num_correct = 0
+    num_wrong = 0
+    for seed in registering:
+        if seed.scores:
+            num_correct += name in seed.scores.correct_names
+            num_wrong += name in seed.scores.wrong_names
     doubt = method.usually_doubted.get(name)
-    if any(name in each.wrong_names for each in scores):
+    kind = "shared"
+    if num_wrong:
         kind = "wrong"
         text += f", correctly with {num_correct}" if num_correct else ", wrongly"
     elif num_correct:

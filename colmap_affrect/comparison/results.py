@@ -12,6 +12,7 @@ from statistics import fmean, median
 from typing import Any, Self
 
 from colmap_affrect.colmap.model_files import Poses, pose_errors, relative_pose
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import Pair
 
 PairErrors = Mapping[Pair, tuple[float, float]]
@@ -19,45 +20,63 @@ PairErrors = Mapping[Pair, tuple[float, float]]
 and of the direction of the translation."""
 MAX_CORRECT_ERROR_DEG = 5.0
 """An image is registered correctly if its relative poses to at least half of the other registered
-images are off by at most this, in rotation and in translation direction."""
+images are off by at most this, in rotation and in translation direction. It is the limit of solved
+pairs in ``evaluation/truths``.
+"""
 
 
 @dataclass(frozen=True)
 class PoseScores:
-    """A model against ground truth, in the registered images that have a true pose."""
+    """Registered images that have a true pose, by whether they are registered correctly."""
 
     correct_names: tuple[str, ...]  # registered correctly (``MAX_CORRECT_ERROR_DEG``)
     wrong_names: tuple[str, ...]  # the others
-    median_rotation_error_deg: float | None  # of the pairs of these images; None without pairs
+    median_rotation_error_deg: float | None  # over the pairs of these images; None without pairs
 
 
 def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
     """Compute the errors of the relative poses of all pairs of images that both have."""
+    errors = {}
     names = sorted(estimated.keys() & truth.keys())
-    return {
-        (name1, name2): pose_errors(
+    for name1, name2 in itertools.combinations(names, 2):
+        errors[name1, name2] = pose_errors(
             relative_pose(estimated[name1], estimated[name2]),
             relative_pose(truth[name1], truth[name2]),
         )
-        for name1, name2 in itertools.combinations(names, 2)
-    }
+    return errors
 
 
 def correct_images(errors: PairErrors) -> tuple[str, ...]:
-    """Return the images in at least half of whose pairs both errors are at most the limit."""
-    right = (pair for pair, both in errors.items() if max(both) <= MAX_CORRECT_ERROR_DEG)
-    num_right = Counter(itertools.chain.from_iterable(right))
-    names = {name for pair in errors for name in pair}
-    return tuple(sorted(name for name in names if 2 * num_right[name] >= len(names) - 1))
+    """Return the images that at least half of their pairs with other images place correctly."""
+    num_correct: dict[str, int] = {}
+    for pair, (rotation_deg, direction_deg) in errors.items():
+        is_correct = max(rotation_deg, direction_deg) <= MAX_CORRECT_ERROR_DEG
+        for name in pair:
+            num_correct[name] = num_correct.get(name, 0) + is_correct
+    num_others = len(num_correct) - 1
+    return tuple(name for name in sorted(num_correct) if 2 * num_correct[name] >= num_others)
 
 
 def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> PoseScores:
-    """Measure the poses of registered images against ground truth, of the images given only."""
+    """Score the poses of registered images against ground truth.
+
+    Args:
+        estimated: poses of the registered images.
+        truth: true poses, in any world frame of any scale.
+        image_names: images that are scored; others may be in both models.
+
+    Returns:
+        Which images are registered correctly, and how far the others are off.
+    """
     errors = pair_errors(estimated, {name: truth[name] for name in truth.keys() & image_names})
     correct = correct_images(errors)
-    wrong = {name for pair in errors for name in pair} - set(correct)
-    rotations_deg = [rotation for rotation, _ in errors.values()]
-    return PoseScores(correct, tuple(sorted(wrong)), median(rotations_deg) if errors else None)
+    names = set(itertools.chain.from_iterable(errors))
+    rotations_deg = [rotation_deg for rotation_deg, _ in errors.values()]
+    return PoseScores(
+        correct,
+        tuple(sorted(names.difference(correct))),
+        median(rotations_deg) if errors else None,
+    )
 
 
 @dataclass(frozen=True)
@@ -83,12 +102,12 @@ class SeedResult:
     models: tuple[tuple[str, ...], ...]  # image names of each model, the largest first
     model_path: str  # the largest model, relative to the folder of the comparison; empty if none
     verified_pairs: int
-    # of the largest model, as all that follow
+    # what follows is of the largest model
     points3D: int
     mean_track_length: float  # images per point
     mean_reprojection_error_px: float
-    sure: tuple[str, ...] = ()  # images that the mapper is sure of
-    doubtful: Mapping[str, str] = field(default_factory=dict)  # images that may be wrong: why
+    sure: tuple[str, ...] = ()  # images of high confidence
+    doubtful: Mapping[str, str] = field(default_factory=dict)  # images of low confidence: why
     wall_s: Mapping[str, float] = field(default_factory=dict)  # seconds of ``verify`` and ``map``
     scores: PoseScores | None = None  # against ground truth; None where there is none
 
@@ -98,34 +117,57 @@ class SeedResult:
         return self.models[0] if self.models else ()
 
 
+Value = Callable[[SeedResult], float | None]
+
+
 @dataclass(frozen=True)
 class Measure:
     """A number of every seed, and how tables write it."""
 
     title: str  # of its column
-    of: Callable[[SeedResult], float | None]  # None where a seed has no such number
+    value: Value  # None where a seed has no such number
     digits: int = 1  # decimals, where not all values are whole
 
 
-def _of_model(name: str) -> Callable[[SeedResult], float | None]:
+def _of_model(name: str) -> Value:
+    """Return what tells a number of the largest model, where there is one."""
     return lambda seed: getattr(seed, name) if seed.models else None
+
+
+def _num_correct(seed: SeedResult) -> float | None:
+    return len(seed.scores.correct_names) if seed.scores else None
+
+
+def _median_rotation_error_deg(seed: SeedResult) -> float | None:
+    return seed.scores.median_rotation_error_deg if seed.scores else None
+
+
+def _num_sure(seed: SeedResult) -> float | None:
+    """Return how many images are sure, where no truth tells more."""
+    return None if seed.scores else len(seed.sure)
+
+
+def _num_doubtful(seed: SeedResult) -> float | None:
+    return None if seed.scores else len(seed.doubtful)
 
 
 MEASURES = {
     "registered": Measure("registered", lambda seed: len(seed.registered_names)),
-    "correct": Measure("correct", lambda s: len(s.scores.correct_names) if s.scores else None),
-    "num_sure": Measure("sure", lambda seed: None if seed.scores else len(seed.sure)),
-    "num_doubtful": Measure("doubtful", lambda seed: None if seed.scores else len(seed.doubtful)),
+    "correct": Measure("correct", _num_correct),
+    "num_sure": Measure("sure", _num_sure),
+    "num_doubtful": Measure("doubtful", _num_doubtful),
     "verified_pairs": Measure("pairs", lambda seed: seed.verified_pairs),
     "points3D": Measure("points", _of_model("points3D"), 0),
     "mean_track_length": Measure("track", _of_model("mean_track_length"), 2),
     "mean_reprojection_error_px": Measure("px", _of_model("mean_reprojection_error_px"), 2),
-    "median_rotation_error_deg": Measure(
-        "degrees", lambda seed: seed.scores.median_rotation_error_deg if seed.scores else None, 2
-    ),
+    "median_rotation_error_deg": Measure("degrees", _median_rotation_error_deg, 2),
 }
-"""Numbers of every seed, by their names in JSON. With ground truth it is correct that counts,
-without what the mapper is sure of."""
+"""Numbers of every seed, by their names in JSON."""
+
+
+def measured(seed: SeedResult) -> dict[str, float | None]:
+    """Return the values of ``MEASURES``, None where a seed has no such number."""
+    return {key: measure.value(seed) for key, measure in MEASURES.items()}
 
 
 @dataclass(frozen=True)
@@ -146,8 +188,11 @@ class MethodResult:
 
     def span(self, measure: str) -> Span | None:
         """Return one of ``MEASURES`` over the seeds that have it; None without any."""
-        values = [MEASURES[measure].of(seed) for seed in self.seeds]
-        known = [value for value in values if value is not None]
+        known = []
+        for seed in self.seeds:
+            value = measured(seed)[measure]
+            if value is not None:
+                known.append(value)
         return Span.of(known) if known else None
 
     @property
@@ -156,10 +201,12 @@ class MethodResult:
         return Span.of(len(seed.registered_names) for seed in self.seeds)
 
     @property
-    def right(self) -> Span:
-        """Images registered correctly; without ground truth those that the mapper is sure of."""
-        found = (s.scores.correct_names if s.scores else s.sure for s in self.seeds)
-        return Span.of(map(len, found))
+    def trusted(self) -> Span:
+        """Images registered correctly; without ground truth those of high confidence."""
+        counts = []
+        for seed in self.seeds:
+            counts.append(len(seed.scores.correct_names if seed.scores else seed.sure))
+        return Span.of(counts)
 
     @property
     def shown_seed(self) -> SeedResult | None:
@@ -169,13 +216,16 @@ class MethodResult:
     @cached_property
     def usually_registered(self) -> frozenset[str]:
         """Images that more than half of the seeds register."""
-        return _in_most([seed.registered_names for seed in self.seeds])
+        return frozenset(_in_most([seed.registered_names for seed in self.seeds]))
 
     @cached_property
     def usually_doubted(self) -> dict[str, str]:
-        """Images that are doubtful with more than half of the seeds, with a reason."""
-        reasons = {name: why for seed in self.seeds for name, why in seed.doubtful.items()}
-        return {n: reasons[n] for n in sorted(_in_most([[*s.doubtful] for s in self.seeds]))}
+        """Images of low confidence with more than half of the seeds, with the last reason."""
+        reasons: dict[str, str] = {}
+        for seed in self.seeds:
+            reasons.update(seed.doubtful)
+        names = _in_most([seed.doubtful for seed in self.seeds])
+        return {name: reasons[name] for name in names}
 
     @property
     def stage_seconds(self) -> dict[str, float]:
@@ -183,11 +233,10 @@ class MethodResult:
 
         The first seed of a recipe with levels has none: escalation has verified and mapped.
         """
-        stages = dict.fromkeys(stage for seed in self.seeds for stage in seed.wall_s)
-        means = {
-            stage: fmean(seed.wall_s.get(stage, 0.0) for seed in self.seeds) for stage in stages
-        }
-        return {**self.wall_s, **means}
+        seconds = dict(self.wall_s)
+        for stage in itertools.chain.from_iterable(seed.wall_s for seed in self.seeds):
+            seconds[stage] = fmean([seed.wall_s.get(stage, 0.0) for seed in self.seeds])
+        return seconds
 
     @property
     def total_s(self) -> float:
@@ -195,50 +244,69 @@ class MethodResult:
         return sum(self.stage_seconds.values())
 
 
-def _in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
-    """Return what more than half of the seeds name."""
-    counts = Counter(name for names in names_of_seeds for name in names)
-    return frozenset(name for name, count in counts.items() if 2 * count > len(names_of_seeds))
+def _in_most(names_by_seed: Sequence[Iterable[str]]) -> list[str]:
+    """Return the sorted names that more than half of the seeds have."""
+    counts = Counter(itertools.chain.from_iterable(names_by_seed))
+    return sorted(name for name, count in counts.items() if 2 * count > len(names_by_seed))
 
 
+@documented
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Summarized):
     """Several methods on one set of photographs."""
 
-    image_names: tuple[str, ...]  # all images given, sorted
+    image_names: tuple[str, ...]
+    """All images that were given, sorted."""
     image_path: str
+    """Folder of the photographs."""
     methods: tuple[MethodResult, ...]
+    """What each method found."""
     seeds: tuple[int, ...]
-    num_pairs: int  # that were to be matched
-    settings: Mapping[str, Any]  # cameras, masks, pair list, preset and mapper of all methods
+    """Seeds of verification and mapping."""
+    num_pairs: int
+    """Pairs that were to be matched."""
+    settings: Mapping[str, Any]
+    """Cameras, masks, pair list, preset and mapper of all methods."""
     versions: Mapping[str, str]
+    """Versions of Python and of the packages that decide results."""
+
+    def summary(self) -> str:
+        """Return the table of methods, and what it means."""
+        from colmap_affrect.comparison.tables import summary  # which imports this module
+
+        return summary(self)
 
     @property
     def finished(self) -> list[MethodResult]:
         """The methods that did not fail, most photographs first, of equals the fastest."""
-        methods = [method for method in self.methods if not method.failed]
-        return sorted(methods, key=lambda m: (-m.right.mean, -m.registered.mean, m.total_s))
+
+        def rank(method: MethodResult) -> tuple[float, float, float]:
+            return (-method.trusted.mean, -method.registered.mean, method.total_s)
+
+        return sorted([method for method in self.methods if not method.failed], key=rank)
 
     @property
     def has_ground_truth(self) -> bool:
-        """Whether models were measured against ground truth."""
-        return any(seed.scores for method in self.methods for seed in method.seeds)
+        """Whether models were scored against ground truth."""
+        seeds = itertools.chain.from_iterable(method.seeds for method in self.methods)
+        return any(seed.scores for seed in seeds)
 
     @cached_property
     def registered_by(self) -> dict[str, list[str]]:
         """Names of the methods that usually register each image."""
-        finished = self.finished
-        return {
-            name: [method.name for method in finished if name in method.usually_registered]
-            for name in self.image_names
-        }
+        registered_by: dict[str, list[str]] = {name: [] for name in self.image_names}
+        for method in self.finished:
+            for name in method.usually_registered.intersection(registered_by):
+                registered_by[name].append(method.name)
+        return registered_by
 
     @property
     def only_registered_by(self) -> dict[str, str]:
         """Image name to the one method that usually registers it."""
-        return {name: found[0] for name, found in self.registered_by.items() if len(found) == 1}
+        registered_by = self.registered_by.items()
+        return {name: methods[0] for name, methods in registered_by if len(methods) == 1}
 
     @property
     def registered_by_none(self) -> tuple[str, ...]:
         """Images that no method usually registers."""
-        return tuple(name for name, found in self.registered_by.items() if not found)
+        return tuple(name for name, methods in self.registered_by.items() if not methods)

@@ -7,15 +7,15 @@ from dataclasses import asdict
 from itertools import zip_longest
 
 from colmap_affrect.comparison.methods import SIFT, SIFT_COLMAP, SIFT_SUMMARIES
-from colmap_affrect.comparison.results import MEASURES, Comparison, Span
+from colmap_affrect.comparison.results import MEASURES, Comparison, Span, measured
 from colmap_affrect.errors import such_as
 from colmap_affrect.project.report import by_story
 
 BYTES_PER_MB = 1_000_000
 NOTHING = "-"  # where there is no number
-MIN_IMAGES = 3  # fewer are a pair, not a reconstruction
+MIN_IMAGES = 3  # of a reconstruction; two images are a pair
 MAX_NAMES = 6  # of photographs in a sentence
-WIDTH = 88  # of the verdict in the terminal
+WIDTH = 88  # columns of text in the terminal
 
 
 def table(comparison: Comparison) -> dict[str, list[str]]:
@@ -23,7 +23,8 @@ def table(comparison: Comparison) -> dict[str, list[str]]:
 
     Numbers are means over the seeds, with the range where seeds differ.
     """
-    methods, columns = comparison.finished, dict[str, list[str]]()
+    methods = comparison.finished
+    columns: dict[str, list[str]] = {}
     for key, measure in MEASURES.items():
         spans = [method.span(key) for method in methods]
         if any(spans):
@@ -41,11 +42,19 @@ def span_text(span: Span | None, digits: int = 1) -> str:
     """
     if span is None:
         return NOTHING
-    mean, low, high = (
-        f"{number:,.{0 if number == round(number) else digits}f}"
-        for number in (span.mean, span.min, span.max)
-    )
+    mean = number_text(span.mean, digits)
+    low = number_text(span.min, digits)
+    high = number_text(span.max, digits)
     return mean if low == high else f"{mean} ({low}-{high})"
+
+
+def number_text(number: float, digits: int) -> str:
+    """Write a number with some decimals, but for whole numbers.
+
+    >>> number_text(1234.5, 2), number_text(7.0, 2)
+    ('1,234.50', '7')
+    """
+    return f"{number:,.0f}" if number == round(number) else f"{number:,.{digits}f}"
 
 
 def verdict(comparison: Comparison) -> list[str]:
@@ -55,7 +64,8 @@ def verdict(comparison: Comparison) -> list[str]:
 
 def headline(comparison: Comparison) -> list[str]:
     """Say what COLMAP, our mapper with its SIFT, and our features get from the photographs."""
-    finished, total = comparison.finished, len(comparison.image_names)
+    finished = comparison.finished
+    total = len(comparison.image_names)
     if not finished:
         return ["No method finished."]
     most = max(method.registered.max for method in finished)
@@ -63,43 +73,67 @@ def headline(comparison: Comparison) -> list[str]:
         few = f"no method registers more than {most:g} of the {total} photographs"
         return [f"Nothing was reconstructed: {few}."]
     named = {method.name: method for method in finished}
-    others = [name for name in named if name not in SIFT_SUMMARIES]
-    ours = max(others, key=lambda name: named[name].right.mean, default="")
-    kinds = {SIFT_COLMAP: "COLMAP as it is", SIFT: "our mapper with SIFT", ours: "our features"}
-    what, texts = "correct" if comparison.has_ground_truth else "sure", list[str]()
-    for name in filter(named.get, kinds):
-        counts = span_text(named[name].registered), span_text(named[name].right)
-        texts.append(f"{kinds[name]} ({name}): {counts[0]} of {total}, {counts[1]} of them {what}")
-    return ["Photographs that are registered:", *texts]
+    ours = [method for method in finished if method.name not in SIFT_SUMMARIES]
+    best = max(ours, key=lambda method: method.trusted.mean, default=None)
+    kinds = {SIFT_COLMAP: "COLMAP as it is", SIFT: "our mapper with SIFT"}
+    if best:
+        kinds[best.name] = "our features"
+    trusted = "correct" if comparison.has_ground_truth else "sure"
+    texts = ["Photographs that are registered:"]
+    for name, kind in kinds.items():
+        method = named.get(name)
+        if method:
+            registered = f"{span_text(method.registered)} of {total}"
+            texts.append(
+                f"{kind} ({name}): {registered}, {span_text(method.trusted)} of them {trusted}"
+            )
+    return texts
 
 
 def notes(comparison: Comparison) -> list[str]:
     """Return what follows on the counts: what is missing or doubtful, and which methods failed."""
-    finished, texts = comparison.finished, list[str]()
-    for method in finished if len(finished) > 1 else ():
-        only = comparison.only_registered_by.items()
-        if names := [name for name, by in only if by == method.name]:
-            texts.append(f"Only {method.name} registers {such_as(names, MAX_NAMES)}.")
-    if finished and (missing := comparison.registered_by_none):
+    finished = comparison.finished
+    texts = []
+    if len(finished) > 1:
+        texts += _registered_alone(comparison)
+    missing = comparison.registered_by_none
+    if finished and missing:
         texts.append(f"Registered by no method: {such_as(missing, MAX_NAMES)}.")
-    lacking = "{} ran without some of its weights; get them, and compare again with --overwrite: {}"
-    texts += [lacking.format(method.name, method.lacks) for method in finished if method.lacks]
-    texts += [f"{m.name} failed: {m.failed}" for m in comparison.methods if m.failed]
+    for method in finished:
+        if method.lacks:
+            texts.append(
+                f"{method.name} ran without some of its weights; get them, and compare again with "
+                f"--overwrite: {method.lacks}"
+            )
+    for method in comparison.methods:
+        if method.failed:
+            texts.append(f"{method.name} failed: {method.failed}")
     if not comparison.has_ground_truth:
         for method in finished:
-            doubts = by_story(method.usually_doubted)
-            texts += [f"Doubtful in {method.name}: {line}." for line in doubts]
+            for line in by_story(method.usually_doubted):
+                texts.append(f"Doubtful in {method.name}: {line}.")
+    return texts
+
+
+def _registered_alone(comparison: Comparison) -> list[str]:
+    """Say which photographs one method alone registers."""
+    texts = []
+    only_registered_by = comparison.only_registered_by.items()
+    for method in comparison.finished:
+        names = [name for name, only in only_registered_by if only == method.name]
+        if names:
+            texts.append(f"Only {method.name} registers {such_as(names, MAX_NAMES)}.")
     return texts
 
 
 def summary(comparison: Comparison) -> str:
     """Return the table of methods, and the verdict under it."""
     columns = table(comparison)
-    names = [method.name for method in comparison.finished]
-    rows = [[name, *(cells[k] for cells in columns.values())] for k, name in enumerate(names)]
+    rows = [["method", *columns]]
+    for number, method in enumerate(comparison.finished):
+        rows.append([method.name, *(cells[number] for cells in columns.values())])
     rows += [[method.name, "failed"] for method in comparison.methods if method.failed]
-    lines = [aligned([["method", *columns], *rows])]
-    lines += ["", *headline(comparison)]
+    lines = [aligned(rows), "", *headline(comparison)]
     for paragraph in notes(comparison):
         lines += ["", *textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)]
     return "\n".join(lines)
@@ -113,29 +147,34 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     default       3
     """
     widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if number else cell.ljust(width)
-            for number, (cell, width) in enumerate(zip(row, widths, strict=False))
-        ).rstrip()
-        for row in rows
-    )
+    lines = []
+    for first, *others in rows:
+        cells = [first.ljust(widths[0])]
+        cells += [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=False)]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
 
 
 def to_json(comparison: Comparison) -> str:
     """Return ``comparison.json``: all results, and the verdict first."""
-    content = asdict(comparison)
-    for method, values in zip(comparison.methods, content["methods"], strict=True):
-        values |= {key: span and asdict(span) for key in MEASURES for span in [method.span(key)]}
+    methods = {}
+    for method in comparison.methods:
+        values = asdict(method)
+        for key in MEASURES:
+            span = method.span(key)
+            values[key] = asdict(span) if span else None
         values["registered_names"] = {str(s.seed): s.registered_names for s in method.seeds}
-        values |= {"total_s": method.total_s, "wall_s": method.stage_seconds}
+        values["total_s"] = method.total_s
+        values["wall_s"] = method.stage_seconds
         for seed, numbers in zip(method.seeds, values["seeds"], strict=True):
-            numbers |= {key: measure.of(seed) for key, measure in MEASURES.items()}
-    content["methods"] = {values.pop("name"): values for values in content["methods"]}
-    totals = {
+            numbers.update(measured(seed))
+        methods[values.pop("name")] = values
+    content = {
         "verdict": verdict(comparison),
         "images_total": len(comparison.image_names),
         "only_registered_by": comparison.only_registered_by,
         "registered_by_none": comparison.registered_by_none,
+        **asdict(comparison),
+        "methods": methods,
     }
-    return json.dumps({**totals, **content}, indent=2, ensure_ascii=False) + "\n"
+    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"

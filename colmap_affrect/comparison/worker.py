@@ -17,36 +17,51 @@ from colmap_affrect.progress import Progress
 
 
 def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
-    """Run a method in another process; return how that was lost, empty if it was not.
+    """Run a method in another process.
 
-    What it prints goes to ``run.log`` in its folder. It is killed where this raises, as for Ctrl-C.
+    What that prints goes to ``run.log`` in the folder of the method. The process is killed where
+    this function raises, as for Ctrl-C.
+
+    Args:
+        run: the method.
+        title: what its progress begins with.
+        progress: where to show it.
+
+    Returns:
+        How the process died; empty if it did not.
     """
     log_path = run.workspace.log
+    # -P and the path: the package is found as it was here, not in the current folder.
+    command = [sys.executable, "-P", "-m", __name__, str(os.getpid())]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with log_path.open("a", encoding="utf-8") as log:
         code = subprocess.run(  # noqa: S603  (this Python and this module)
-            # -P and the path: the package is found as it was here, not in the current folder.
-            [sys.executable, "-P", "-m", __name__, str(os.getpid())],
+            command,
             check=False,
             input=pickle.dumps((run, title)),  # too long for an argument, with many photographs
             stdout=progress.file_number,
             stderr=log,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env=environment,
             start_new_session=True,  # else Ctrl-C would reach it too
         ).returncode
     if not code:
         return ""
-    ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-    memory = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
-    return f"its process ended {ending}{memory}; {log_path} may say why"
+    if code == -signal.SIGKILL:
+        ending = "by SIGKILL (perhaps for want of memory)"
+    elif code < 0:
+        ending = f"by {signal.Signals(-code).name}"
+    else:
+        ending = f"with exit code {code}"
+    return f"its process ended {ending}; {log_path} may say why"
 
 
 def main() -> None:
-    """Run the method that is asked for: progress to stdout, all else that is printed to stderr."""
+    """Run the method that the parent sends; its progress goes to stdout, all else to stderr."""
     end_with(int(sys.argv[1]))
     shown = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what others print
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s")
-    run, title = pickle.load(sys.stdin.buffer)  # noqa: S301 (of our parent)
+    run, title = pickle.load(sys.stdin.buffer)  # noqa: S301 (from the parent)
     run.progress = Progress(shown, 1, title)
     try:
         with run.workspace.locked():

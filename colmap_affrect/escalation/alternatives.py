@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from colmap_affrect.errors import DAMAGE
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.policy import SMALL
 from colmap_affrect.mappers.base import Mapper
@@ -23,6 +24,7 @@ from colmap_affrect.mappers.mapping import copy_with_keypoints, model_folders, r
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write, replace_text
 from colmap_affrect.project.outputs import remove_own, temporary_folder
+from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import (
     CLIMBING,
@@ -39,6 +41,8 @@ from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.verify import verify_matches
 
 SCORE = "score.json"  # in the folder of the best models
+NOTHING_TO_GO_ON_FROM = 1.0
+"""Score of models below which not one relative pose is expected to be right."""
 
 
 def score(models: Sequence[ModelSummary]) -> float:
@@ -86,9 +90,9 @@ class LookedAt:
 
     @property
     def is_enough(self) -> bool:
-        """Whether nothing is left to try with them, or nothing is registered without."""
+        """Whether nothing is left to try with them, or nothing is there to go on from without."""
         is_better = self.score > self.score_without
-        return is_better and (self.is_sure or not self.score_without)
+        return is_better and (self.is_sure or self.score_without < NOTHING_TO_GO_ON_FROM)
 
 
 @dataclass(frozen=True)
@@ -227,7 +231,7 @@ def _take_over(context: Context, sparse_path: Path) -> None:
         new.mkdir()
         for folder in model_folders(sparse_path):
             copy_with_keypoints(folder, new / folder.name, workspace.database)
-    workspace.record_made_from(map=context.verified_digest())
+    workspace.record_mapped(context.verified_digest())
 
 
 # The best models so far
@@ -258,8 +262,11 @@ def best_score(context: Context) -> float:
     path = context.workspace.best / SCORE
     if not path.exists():
         return 0.0
-    of_set, found = json.loads(path.read_text(encoding="utf-8"))
-    return float(found) if of_set == _set_of(context) else 0.0
+    try:
+        of_set, found = json.loads(read_regular_text(path))
+        return float(found) if of_set == _set_of(context) else 0.0
+    except DAMAGE:
+        return 0.0
 
 
 def restore_best(escalation: Escalation) -> bool:

@@ -77,10 +77,10 @@ def _known() -> dict[str, LevelGain]:
 
 def kind_of(level: Level) -> str:
     """Return the kind of a level: whether its frames are measured, and its warps."""
-    warps = level.rectifier.name
+    warps = level.rectifier.warps
     if level.features.has_shapes:
-        return "measured, all tilts" if warps == "asift" else "measured, warps"
-    return LEARNED if warps == "identity" else "learned, warps"
+        return "measured, all tilts" if warps == "all tilts" else "measured, warps"
+    return LEARNED if warps == "none" else "learned, warps"
 
 
 def gain_of(level: Level) -> LevelGain:

@@ -5,21 +5,22 @@ pair is matched as a run of its two images alone would match it, with cameras un
 escalation the one with most inliers of COLMAP's verification counts.
 """
 
+import itertools
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean
 from threading import Lock
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
-from colmap_affrect.comparison.methods import Method, parse_methods
+from colmap_affrect.comparison.methods import GivenMethods, Method, parse_methods
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.evaluation import truths
 from colmap_affrect.evaluation.datasets import PROTOCOLS, EvaluationPair
@@ -28,12 +29,12 @@ from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
-from colmap_affrect.options import digest_of
+from colmap_affrect.options import Options, digest_of, require_bools, takes_fields_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
-from colmap_affrect.progress import SILENT, Progress, Stopwatch
+from colmap_affrect.progress import GivenProgress, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
@@ -43,17 +44,39 @@ from colmap_affrect.stages.one_image import prepare
 
 logger = logging.getLogger(__name__)
 
-NOTHING = np.zeros((0, 2)), np.zeros((0, 2))  # points of a pair that could not be matched
+NUM_DIGITS = 8  # of a digest in the name of a file of features
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
+@dataclass
+class _Matched:
+    """The matches of a pair at the level with most verified inliers."""
+
+    points: tuple[Array, Array] = (np.zeros((0, 2)), np.zeros((0, 2)))  # (M, 2) px, by image
+    num_keypoints: tuple[int, int] = (0, 0)
+    level: str = ""  # see ``PairResult``
+    failure: str = ""  # why the pair could not be matched
+
+
+class EvaluateOptions(Options):
     """Everything an evaluation depends on beside protocol, dataset and output folder."""
 
-    recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")  # also by name
-    max_num_keypoints: int | None = None  # of each image the strongest are matched; None: all
-    scores: ScoreOptions = field(default_factory=ScoreOptions)
-    resources: Resources = field(default_factory=Resources)
+    recipes: GivenMethods = ("unrectified-rootsift", "default")
+    """Recipes by name, or as ``LABEL=NAME:OPTION=VALUE``."""
+    max_num_keypoints: int | None = None
+    """Of each image the strongest are matched; None: all."""
+    scores: ScoreOptions = ScoreOptions()
+    """How models are estimated from matches."""
+    resources: Resources = Resources()
+    """Weights and device of networks."""
+
+
+class EvaluateKeywords(TypedDict, total=False):
+    """The fields of :class:`EvaluateOptions` as keywords of a function."""
+
+    recipes: str | Sequence[str | Method]
+    max_num_keypoints: int | None
+    scores: ScoreOptions | Mapping[str, Any]
+    resources: Resources | Mapping[str, Any]
 
 
 class RecipeRun:
@@ -67,29 +90,51 @@ class RecipeRun:
         inputs: Mapping[str, Any],
         options: EvaluateOptions,
     ) -> None:
-        """Find everything that the recipe needs; features depend on it and on ``inputs``."""
+        """Find everything that the recipe needs.
+
+        Args:
+            method: the recipe.
+            pairs: of the dataset.
+            output_path: folder of the evaluation, which keeps the features.
+            inputs: what features depend on beside the recipe.
+            options: of the evaluation.
+
+        Raises:
+            OptionError: the method is COLMAP's.
+        """
         if method.recipe is None:
             raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
-        self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
-        self._options, extraction = options, self.recipe.extraction
-        images = {name for pair in pairs for name in pair.images}
+        self.label = method.label
+        self.recipe = method.recipe
+        self._pairs = pairs
+        self._options = options
+        extraction = self.recipe.extraction
+        images = set(itertools.chain.from_iterable(pair.images for pair in pairs))
         self._extractor = prepare(extraction, options.resources, sorted(images))
-        made = digest_of([inputs, extraction.to_mapping(), digests(self._extractor.weights)])
-        features = output_path / "features" / f"{method.folder_name}-{made[:8]}.h5"
+        made_from = [inputs, extraction.to_mapping(), digests(self._extractor.weights)]
+        name = f"{method.folder_name}-{digest_of(made_from)[:NUM_DIGITS]}.h5"
+        features = output_path / "features" / name
         features.parent.mkdir(parents=True, exist_ok=True)
         self._store = FeatureStore(features)
-        self.failures: dict[str, str] = {}  # images that could not be used in this run: why
+        self.failures: dict[str, str] = {}  # images that cannot be used: why
         self._lock = Lock()  # of extraction and of the store
 
     def results(self, progress: Progress) -> list[PairResult]:
         """Match and score all pairs; images whose features are there are not read again."""
-        results, matchers = [], dict[int, CachedMatcher]()
-        given = self._options.resources, self._options.max_num_keypoints or 0
+        matchers = {}
         for level in self._extractor.extractors:
             chosen = self.recipe.extraction.levels[level]
-            options, kind = chosen.matching or self.recipe.matching, chosen.features.name
-            matching = Matching(self._store, options, level, chosen.base, kind, *given)
+            matching = Matching(
+                self._store,
+                chosen.matching or self.recipe.matching,
+                level,
+                chosen.base,
+                chosen.features.name,
+                self._options.resources,
+                self._options.max_num_keypoints or 0,
+            )
             matchers[level] = CachedMatcher(matching)
+        results = []
         with progress.stage(self.label, len(self._pairs), "pairs") as advance:
             work = partial(self._result, matchers)
             for result in map_ordered(work, self._pairs, available_cores()):
@@ -100,53 +145,68 @@ class RecipeRun:
     def _result(self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair) -> PairResult:
         """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
         watch = Stopwatch("extract", "match", "estimate")
-        found, points = self._matched(matchers, pair, watch)
+        matched = self._matched(matchers, pair, watch)
         try:
             with watch.step("estimate"):
-                score = pair.truth.score(*points, self._options.scores)
+                score = pair.truth.score(*matched.points, self._options.scores)
         except Exception as error:
             logger.exception("%s: %s cannot be scored", self.label, pair.name)
-            score = pair.truth.score(*NOTHING, self._options.scores)
-            found = {"failure": f"{type(error).__name__}: {error}"}
-        if "failure" not in found:
-            found |= {"seconds": sum(watch.seconds.values()), "seconds_by_step": watch.seconds}
-        return PairResult(**vars(score), name=pair.name, category=pair.category, **found)
+            matched = _Matched(failure=f"{type(error).__name__}: {error}")
+            score = pair.truth.score(*matched.points, self._options.scores)
+        seconds_by_step = {} if matched.failure else watch.seconds
+        return PairResult(
+            **vars(score),
+            name=pair.name,
+            category=pair.category,
+            num_matches=len(matched.points[0]),
+            num_keypoints=matched.num_keypoints,
+            seconds=sum(seconds_by_step.values(), 0.0),
+            seconds_by_step=seconds_by_step,
+            level=matched.level,
+            failure=matched.failure,
+        )
 
     def _matched(
         self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair, watch: Stopwatch
-    ) -> tuple[dict[str, Any], tuple[Array, Array]]:
-        """Return what a result says of matches, and (M, 2) and (M, 2) points, of the best level.
-
-        Of a pair with an image that cannot be used that is the failure.
-        """
-        found, points, most = dict[str, Any](), NOTHING, 0
+    ) -> _Matched:
+        """Match a pair, level by level, until it has many verified inliers."""
+        best: _Matched | None = None
+        most = 0
         for level, matcher in matchers.items():
             with self._lock, watch.step("extract"):
-                images = zip(pair.images, pair.paths, pair.intrinsics, strict=True)
-                usable = [self._extract(*image, level) for image in images]
-                if not all(usable):
+                if not self._extract_pair(pair, level):
                     break
                 first, second = map(matcher.prepared, pair.images)
             with watch.step("match"):
                 rows1, rows2 = matcher.matcher.match(first.content, second.content).indices.T
-                frames = first.frames[rows1], second.frames[rows2]
-                count, decided = 0, ""
+                lafs = (first.frames[rows1], second.frames[rows2])
+                num_inliers = 0
+                name = ""
                 if len(matchers) > 1:
-                    count = self._verified_inliers(pair, frames, level)
-                    decided = self.recipe.extraction.levels[level].name if count else "none"
-            if count > most or not most:
-                most, points = count, (frames[0][:, :, 2], frames[1][:, :, 2])
-                num_keypoints = len(first.frames), len(second.frames)
-                found = {"num_matches": len(rows1), "num_keypoints": num_keypoints}
-                found["level"] = decided
+                    num_inliers = self._verified_inliers(pair, lafs, level)
+                    name = self.recipe.extraction.levels[level].name if num_inliers else "none"
+            if num_inliers > most or not most:
+                most = num_inliers
+                points = (lafs[0][:, :, 2], lafs[1][:, :, 2])
+                best = _Matched(points, (len(first.frames), len(second.frames)), name)
             if most >= max(1, self.recipe.escalate.strong_num_inliers):
                 break
-        failures = filter(None, (self.failures.get(name) for name in pair.images))
-        return found or {"failure": "; ".join(failures)}, points
+        if best is None:
+            failures = [self.failures[name] for name in pair.images if name in self.failures]
+            best = _Matched(failure="; ".join(failures))
+        return best
+
+    def _extract_pair(self, pair: EvaluationPair, level: int) -> bool:
+        """Extract what the images of a pair lack of a level; tell whether both can be used."""
+        image1, image2 = zip(pair.images, pair.paths, pair.intrinsics, strict=True)
+        is_usable1 = self._extract(*image1, level)
+        is_usable2 = self._extract(*image2, level)
+        return is_usable1 and is_usable2
 
     def _extract(self, name: str, path: Path, intrinsics: Array | None, level: int) -> bool:
         """Extract what an image lacks of a level; tell whether it can be used."""
-        store, base = self._store, self.recipe.extraction.levels[level].base
+        store = self._store
+        base = self.recipe.extraction.levels[level].base
         there = store.level_ranges(name) if name in store.names() else {}
         for missing in sorted({0, base, level} - there.keys()):
             if name in self.failures:
@@ -165,24 +225,37 @@ class RecipeRun:
                 store.write(name, found.features, found.image_size)
         return True
 
-    def _verified_inliers(self, pair: EvaluationPair, frames: Sequence[Floats], level: int) -> int:
-        """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it."""
-        with self._lock:
-            sizes = [self._store.image_size(name) for name in pair.images]
-        # What COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus.
-        # The id matters: two images of one camera are verified in another way.
-        model, make = "SIMPLE_RADIAL", pycolmap.Camera.create_from_model_name
-        focal_px = [DEFAULT_FOCAL_RATIO * max(size) for size in sizes]
-        first, second = (
-            Side(make(k + 1, model, focal_px[k], *sizes[k]), colmap_keypoints(frames[k]))
-            for k in (0, 1)
+    def _verified_inliers(
+        self, pair: EvaluationPair, lafs: tuple[Floats, Floats], level: int
+    ) -> int:
+        """Return the number of inliers of COLMAP's two-view geometry; 0 if a run would not take it.
+
+        Args:
+            pair: the images.
+            lafs: (M, 2, 3) of the matched features, by image.
+            level: of the features.
+        """
+        sides = []
+        for number, name in enumerate(pair.images):
+            with self._lock:
+                width, height = self._store.image_size(name)
+            # COLMAP's camera of an image without EXIF. Each image has one of its own, since two
+            # images of one camera are verified in another way.
+            camera = pycolmap.Camera.create_from_model_name(
+                number + 1, "SIMPLE_RADIAL", DEFAULT_FOCAL_RATIO * max(width, height), width, height
+            )
+            sides.append(Side(camera, colmap_keypoints(lafs[number])))
+        indices = np.arange(len(lafs[0]))
+        geometry = estimate_geometry(
+            (sides[0], sides[1]),
+            np.stack([indices, indices], axis=1),
+            VerificationOptions(random_seed=0),
+            self.recipe.extraction.levels[level].max_image_size_px,
         )
-        rows = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
-        options = VerificationOptions(random_seed=0)
-        extracted_px = self.recipe.extraction.levels[level].max_image_size_px
-        return len(estimate_geometry((first, second), rows, options, extracted_px).inlier_matches)
+        return len(geometry.inlier_matches)
 
 
+@takes_fields_of(EvaluateOptions)
 def evaluate(
     protocol: str,
     dataset_path: PathLike,
@@ -190,41 +263,49 @@ def evaluate(
     options: EvaluateOptions | None = None,
     *,
     overwrite: bool = False,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
+    **keywords: Unpack[EvaluateKeywords],
 ) -> Evaluation:
-    """Score recipes on a dataset by one of ``PROTOCOLS``.
+    """Score recipes on a dataset, and write ``evaluation.json``, too.
 
-    A pair with an image that cannot be used counts as failed. Features that are there are used
-    again, unless ``overwrite`` discards those of these recipes. Writes ``evaluation.json``, too.
-    AffrectError for what the caller can mend, before any image is worked on.
+    A pair with an image that cannot be used counts as failed. AffrectError for what the caller can
+    mend, before any image is worked on.
+
+    Args:
+        protocol: one of ``PROTOCOLS``.
+        dataset_path: folder of the dataset.
+        output_path: folder for all results; features that are there are used again.
+        options: options to begin with; None for the usual ones.
+        overwrite: discard the features of these recipes.
+        progress: True, False, or None for where somebody looks at it.
+        keywords: fields of :class:`EvaluateOptions`, as ``recipes=["default"]``.
     """
-    dataset_path, output_path = as_path(dataset_path), as_path(output_path)
+    dataset_path = as_path(dataset_path, "dataset_path")
+    output_path = as_path(output_path, "output_path")
     if protocol not in PROTOCOLS:
         raise OptionError(f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}")
-    options = options or EvaluateOptions()
+    options = EvaluateOptions.with_keywords(options, keywords)
+    require_bools(overwrite=overwrite)
+    progress = Progress.given(progress)
     methods = parse_methods(options.recipes)
-    if options.max_num_keypoints is not None and options.max_num_keypoints < 1:
-        raise OptionError(f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1")
-    if options.scores.random_seed < 0:
-        raise OptionError(f"--random-seed {options.scores.random_seed}: must be at least 0")
-    if not dataset_path.is_dir():
-        raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
+    _check(options, dataset_path)
     Workspace(output_path).require_own(dataset_path)
-    inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
+    inputs = {"protocol": protocol, "dataset_path": str(resolved(dataset_path))}
     with Workspace(output_path).locked():
         pairs = PROTOCOLS[protocol](dataset_path)
         runs = [RecipeRun(method, pairs, output_path, inputs, options) for method in methods]
         for method in methods if overwrite else ():
-            remove_own(output_path.glob(f"features/{method.folder_name}-????????.h5"))
+            pattern = f"features/{method.folder_name}-{'?' * NUM_DIGITS}.h5"
+            remove_own(output_path.glob(pattern))
         results = {run.label: run.results(progress) for run in runs}
         evaluation = Evaluation(
             protocol=protocol,
             dataset_path=inputs["dataset_path"],
             settings={
-                "scores": asdict(options.scores),
+                "scores": options.scores.to_mapping(),
                 "max_num_keypoints": options.max_num_keypoints,
             },
-            recipes=tuple(_summed(run, results[run.label]) for run in runs),
+            recipes=tuple(_recipe_result(run, results[run.label]) for run in runs),
             published=published(protocol),
             versions=installed_versions(),
         )
@@ -232,7 +313,18 @@ def evaluate(
     return evaluation
 
 
-def _summed(run: RecipeRun, results: Sequence[PairResult]) -> RecipeResult:
+def _check(options: EvaluateOptions, dataset_path: Path) -> None:
+    """Refuse options out of range, and a dataset that is not there; OptionError."""
+    if options.max_num_keypoints is not None and options.max_num_keypoints < 1:
+        raise OptionError(f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1")
+    if options.scores.random_seed < 0:
+        raise OptionError(f"--random-seed {options.scores.random_seed}: must be at least 0")
+    if not dataset_path.is_dir():
+        raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
+
+
+def _recipe_result(run: RecipeRun, results: Sequence[PairResult]) -> RecipeResult:
+    """Sum up the results of all pairs."""
     return RecipeResult(
         name=run.label,
         summary=truths.columns(results),

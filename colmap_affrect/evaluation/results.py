@@ -11,24 +11,26 @@ from pydantic import TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
 from colmap_affrect.evaluation.truths import PairResult
+from colmap_affrect.options import Summarized, documented
 
 DATA = Path(__file__).with_name("published.toml")
 SECONDS = "seconds"  # the column of all time that a recipe took
 
 
 def published(protocol: str) -> dict[str, dict[str, float]]:
-    """Return what the paper says of methods by a protocol: columns, called as ours, by row."""
-    return {
-        f"paper: {method} ({table['label']})": dict(zip(table["columns"], row, strict=True))
-        for table in tomllib.loads(DATA.read_text(encoding="utf-8"))["tables"]
-        if table["protocol"] == protocol
-        for method, row in table["values"].items()
-    }
+    """Return the rows of the paper's tables for a protocol; columns have the names of ours."""
+    rows = {}
+    for table in tomllib.loads(DATA.read_text(encoding="utf-8"))["tables"]:
+        if table["protocol"] == protocol:
+            for method, values in table["values"].items():
+                name = f"paper: {method} ({table['label']})"
+                rows[name] = dict(zip(table["columns"], values, strict=True))
+    return rows
 
 
 @dataclass(frozen=True)
 class RecipeResult:
-    """What one recipe reached."""
+    """The scores of one recipe."""
 
     name: str  # its label
     summary: Mapping[str, Mapping[str, float]]  # columns of tables, by the kind of truth
@@ -39,16 +41,23 @@ class RecipeResult:
     pairs: tuple[PairResult, ...]  # in the order of the dataset; failed ones among them
 
 
+@documented
 @dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Summarized):
     """All recipes on the pairs of one dataset."""
 
     protocol: str
+    """Name of the protocol."""
     dataset_path: str
-    settings: Mapping[str, Any]  # everything that decides scores
+    """Folder of the dataset."""
+    settings: Mapping[str, Any]
+    """Everything that decides scores."""
     recipes: tuple[RecipeResult, ...]
-    published: Mapping[str, Mapping[str, float]]  # rows of the paper's tables for the protocol
+    """What each recipe reached."""
+    published: Mapping[str, Mapping[str, float]]
+    """Rows of the paper's tables for the protocol."""
     versions: Mapping[str, str]
+    """Versions of Python and of the packages that decide results."""
 
     def to_json(self) -> str:
         """Return everything as JSON, recipes by name; infinite errors are null."""
@@ -58,20 +67,31 @@ class Evaluation:
 
     def summary(self) -> str:
         """Return a table for each kind of truth with the paper's numbers, and costs."""
-        parts = [f"{self.protocol}: {len(self.recipes[0].pairs)} pairs"]
-        for kind, columns in self.recipes[0].summary.items():
-            rows = {r.name: {**r.summary[kind], SECONDS: r.costs[SECONDS]} for r in self.recipes}
-            papers = {k: row for k, row in self.published.items() if row.keys() & columns.keys()}
-            parts.append(_table(kind, [*columns, SECONDS], {**rows, **papers}))
+        first = self.recipes[0]
+        parts = [f"{self.protocol}: {len(first.pairs)} pairs"]
+        for kind, columns in first.summary.items():
+            rows: dict[str, Mapping[str, float]] = {}
+            for recipe in self.recipes:
+                rows[recipe.name] = {**recipe.summary[kind], SECONDS: recipe.costs[SECONDS]}
+            for name, row in self.published.items():
+                if row.keys() & columns.keys():
+                    rows[name] = row
+            parts.append(_table(kind, [*columns, SECONDS], rows))
         costs = {recipe.name: recipe.costs for recipe in self.recipes}
-        return "\n\n".join([*parts, _table("recipe", self.recipes[0].costs, costs)])
+        parts.append(_table("recipe", first.costs, costs))
+        return "\n\n".join(parts)
 
 
 def _table(title: str, columns: Iterable[str], rows: Mapping[str, Mapping[str, float]]) -> str:
     """Format rows with two decimals, but for whole numbers; what a row lacks is empty."""
+    lines = [[title, *columns]]
+    for name, row in rows.items():
+        cells = [_cell(row.get(column)) for column in columns]
+        lines.append([name, *cells])
+    return aligned(lines)
 
-    def cell(value: float | None) -> str:
-        return "" if value is None else f"{value:.{0 if value == round(value) else 2}f}"
 
-    lines = [[name, *(cell(row.get(column)) for column in columns)] for name, row in rows.items()]
-    return aligned([[title, *columns], *lines])
+def _cell(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.0f}" if value == round(value) else f"{value:.2f}"

@@ -1,16 +1,18 @@
-"""The three kinds of truth: scores of matches by them, and the columns of their tables.
+"""The three kinds of ground truth: scores of matches by them, and the columns of their tables.
 
-A truth scores (M, 2) and (M, 2) matched points, pixel-centre px of the stored images; its repr has
-all that it knows. Results of failed pairs have infinite errors.
+A truth scores (M, 2) and (M, 2) matched points, pixel-centre px of the images as they are stored.
+Results of failed pairs have infinite errors. Protocols are those of V. Vávra, D. Mishkin and
+J. Matas, *Matching with AffNet based rectifications*, 2022, called "the paper" here, and of
+D. Mishkin et al., *WxBS: Wide Baseline Stereo Generalizations*, 2015.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean, median_low
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -24,30 +26,36 @@ from colmap_affrect.geometry.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
 from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 from colmap_affrect.images.reading import read_gray
+from colmap_affrect.options import Options, within
 
 Points = Floats
 Sides = tuple[Floats, Floats]  # points or rays of both images
 Size = tuple[int, int]  # (width, height) in px
 
 CONFIDENCE = 0.9999  # at which estimators may end before all iterations
-NUM_ESTIMATES = 5  # orders of the matches, of which the one of median error counts
-MIN_POSE_MATCHES = 6  # five leave several essential matrices, none of which another supports
-MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices
-CORRECT_PX = 3.0  # of correct matches: transfer error in image 2, or Sampson distance from a pose
-GRID_STEP_PX = 4
-MAX_ERROR_PX, MAX_ERROR_DEG = 5.0, 5.0  # homographies and rotations of solved pairs are better
+NUM_ESTIMATES = 5  # with other orders of the matches; the one of median error counts
+MIN_HOMOGRAPHY_MATCHES = 4  # determine a homography
+MIN_FUNDAMENTAL_MATCHES = 8  # determine a fundamental matrix linearly
+MIN_POSE_MATCHES = 6  # five determine several essential matrices, without support for any of them
+MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices; judged
+CORRECT_PX = 3.0  # largest transfer error or Sampson distance of a correct match; judged
+GRID_STEP_PX = 4  # in x and y, of the pixels over which the error of a homography is a mean
+MAX_ERROR_PX = 5.0  # of the homography of a solved pair; a column of the paper's table on EVD
+MAX_ERROR_DEG = 5.0  # of the rotation of a solved pair: the paper's limit
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
-MAX_AUC_ERROR_DEG = 10.0
+MAX_AUC_ERROR_DEG = 10.0  # of the area under the curve of recall; that of the IMC
 NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
 
 
-@dataclass(frozen=True)
-class ScoreOptions:
-    """How models are estimated from matches; the seed is of the order that these are taken in."""
+class ScoreOptions(Options):
+    """How models are estimated from matches."""
 
-    threshold_px: float = 0.5  # of an inlier of plain RANSAC, for homographies and poses
-    max_num_iterations: int = 100_000  # as the paper says; its numbers of poses are those of 1000
+    threshold_px: Annotated[float, within(0.01, 1000.0)] = 0.5
+    """Largest error of an inlier of plain RANSAC, for homographies and poses."""
+    max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
+    """As the paper says; its numbers of poses are those of 1000."""
     random_seed: int = 0
+    """Of the order in which matches are taken."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +64,9 @@ class PairScore:
 
     error: float  # of the protocol, px or degrees; infinite where no model was found
     num_inliers: int  # of the model that was estimated
-    num_correct: int | None = None  # matches that agree with the truth; None where it cannot say
-    direction_error_deg: float = math.inf  # of poses, beside the error of the rotation
-    solved: float = 0.0  # how far it counts as matched: 1 or 0 where there is a threshold
+    num_correct: int | None = None  # matches that agree with the truth; None where it cannot tell
+    direction_error_deg: float = math.inf  # of the translation of poses
+    solved: float = 0.0  # from 0 to 1; 1 or 0 where the protocol has a threshold
     kind: str = ""  # of the truth, as tables name it; empty without one
 
 
@@ -73,7 +81,9 @@ class PairResult(PairScore):
     seconds: float = 0.0
     # ``extract`` (of images that no other pair had before), ``match``, ``estimate``
     seconds_by_step: Mapping[str, float] = field(default_factory=dict)
-    level: str = ""  # of escalation, that decided: its rectifier, ``none`` if none was verified
+    # the rectifier of the level that was scored, ``none`` if no level was verified; empty for a
+    # recipe of one level
+    level: str = ""
     failure: str = ""  # why the pair counts as failed, with an infinite error
 
 
@@ -83,70 +93,117 @@ Results = Sequence[PairResult]
 def estimate_matrix(
     find: Any, points: Sides, method: int, threshold_px: float, options: ScoreOptions
 ) -> tuple[Array | None, int]:
-    """Estimate a (3, 3) homography or fundamental matrix, x2 ~ H x1, x2' F x1 = 0, and its inliers.
+    """Estimate a homography, x2 ~ H x1, or a fundamental matrix, x2' F x1 = 0.
 
-    ``find`` and ``method`` are OpenCV's; the seed is of the order of the matches, as OpenCV draws
-    the same samples every time.
+    Args:
+        find: ``cv2.findHomography`` or ``cv2.findFundamentalMat``.
+        points: (M, 2) px, by image.
+        method: OpenCV's constant.
+        threshold_px: of inliers.
+        options: iterations, and the seed of the order of the matches: OpenCV draws the same
+            samples every time.
+
+    Returns:
+        The (3, 3) matrix, None where there is none, and the number of its inliers.
     """
     count = len(points[0])
-    if count < (4 if find is cv2.findHomography else 8):
+    is_homography = find is cv2.findHomography
+    if count < (MIN_HOMOGRAPHY_MATCHES if is_homography else MIN_FUNDAMENTAL_MATCHES):
         return None, 0
     order = np.random.default_rng(options.random_seed).permutation(count)
     first, second = (np.asarray(side, dtype=np.float64)[order] for side in points)
-    limits = dict(confidence=CONFIDENCE, maxIters=options.max_num_iterations)
-    matrix, inliers = find(first, second, method, threshold_px, **limits)
+    matrix, inliers = find(
+        first,
+        second,
+        method,
+        threshold_px,
+        confidence=CONFIDENCE,
+        maxIters=options.max_num_iterations,
+    )
     if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None, 0
     return np.asarray(matrix, dtype=np.float64), int(np.count_nonzero(inliers))
 
 
 def estimate_pose(rays: Sides, threshold: float, options: ScoreOptions) -> tuple[Pose | None, int]:
-    """Estimate camera2_from_camera1, |t| = 1, from five-point samples, and count its inliers.
+    """Estimate a relative pose by RANSAC of five-point samples.
 
-    ``rays`` are (M, 2) x/z, y/z in front of each camera, the threshold in focal lengths; rays that
-    are not finite are never inliers. For the seed see :func:`estimate_matrix`.
+    Args:
+        rays: (M, 2) x/z, y/z in front of each camera; those that are not finite are never inliers.
+        threshold: of inliers, in focal lengths.
+        options: iterations, and the seed as in :func:`estimate_matrix`.
+
+    Returns:
+        camera2_from_camera1 with |t| = 1, None where there is none, and the number of its inliers.
     """
     usable = np.flatnonzero(np.isfinite(np.hstack(rays)).all(axis=1))
     if len(usable) < MIN_POSE_MATCHES:
         return None, 0
     order = np.random.default_rng(options.random_seed).permutation(usable)
     first, second = (np.ascontiguousarray(side[order]) for side in rays)
-    limits = CONFIDENCE, threshold, options.max_num_iterations
-    essential, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, *limits)
+    essential, mask = cv2.findEssentialMat(
+        first,
+        second,
+        np.eye(3),
+        cv2.RANSAC,
+        CONFIDENCE,
+        threshold,
+        options.max_num_iterations,
+    )
     if essential is None or essential.shape != (3, 3):
         return None, 0
-    inliers = mask.ravel() != 0
-    if inliers.sum() < MIN_POSE_MATCHES:
-        return None, int(inliers.sum())
-    _, turn, move, _ = cv2.recoverPose(essential, first[inliers], second[inliers], np.eye(3))
-    return (np.asarray(turn, np.float64), np.ravel(move).astype(np.float64)), int(inliers.sum())
+    is_inlier = mask.ravel() != 0
+    num_inliers = int(is_inlier.sum())
+    if num_inliers < MIN_POSE_MATCHES:
+        return None, num_inliers
+    _, rotation, translation, _ = cv2.recoverPose(
+        essential, first[is_inlier], second[is_inlier], np.eye(3)
+    )
+    pose = (np.asarray(rotation, np.float64), np.ravel(translation).astype(np.float64))
+    return pose, num_inliers
 
 
 @dataclass(frozen=True, eq=False)
 class TrueHomography:
-    """The (3, 3) image2_from_image1 of pixel-centre px, > 0 where visible; sizes of images."""
+    """The homography of a pair."""
 
+    # (3, 3) image2_from_image1 of pixel-centre px; its third coordinates are > 0 where image 1 is
+    # visible in image 2
     matrix: Array
-    size1: Size
-    size2: Size
+    size1: Size  # of image 1
+    size2: Size  # of image 2
 
     @classmethod
-    def of(cls, matrix: Array, paths: Sequence[Path], what: str) -> "TrueHomography":
-        """Return the truth of two image files, of a (3, 3) matrix of any scale and sign.
+    def from_files(cls, matrix: Array, paths: Sequence[Path], what: str) -> "TrueHomography":
+        """Return the truth of two image files.
 
-        ImageError when one cannot be read, AffrectError when image 2 shows no part of image 1.
+        Args:
+            matrix: (3, 3) image2_from_image1 of pixel-centre px, of any scale and sign.
+            paths: of both images, whose sizes are read.
+            what: an error begins with it.
+
+        Raises:
+            ImageError: an image cannot be read.
+            AffrectError: image 2 shows no part of image 1.
         """
-        size1, size2 = ((gray.shape[1], gray.shape[0]) for gray in map(read_gray, paths))
-        both = [cls(sign * matrix, size1, size2) for sign in (1.0, -1.0)]
-        found = max(both, key=lambda truth: len(truth.visible))
-        if not len(found.visible):
+        sizes = []
+        for path in paths:
+            height, width = read_gray(path).shape
+            sizes.append((width, height))
+        truth = cls(matrix, *sizes)
+        opposite = cls(-1.0 * matrix, *sizes)
+        if len(opposite.visible) > len(truth.visible):
+            truth = opposite
+        if not len(truth.visible):
             raise AffrectError(f"{what} shows no part of image 1 in image 2")
-        return found
+        return truth
 
     @cached_property
     def visible(self) -> Points:
         """(N, 2) pixel centres of image 1 that image 2 shows, each ``GRID_STEP_PX`` in x and y."""
-        columns, rows = (np.arange(0, extent, GRID_STEP_PX) for extent in self.size1)
+        width, height = self.size1
+        columns = np.arange(0, width, GRID_STEP_PX)
+        rows = np.arange(0, height, GRID_STEP_PX)
         points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
         points = points[third_coordinates(self.matrix, points) > 0]
         return points[is_inside(project(self.matrix, points), self.size2)]
@@ -154,7 +211,7 @@ class TrueHomography:
     def error_px(self, estimate: Array | None) -> float:
         """Return the mean distance in image 2 between truth and estimate, over the visible part.
 
-        Infinite without an estimate, or when its horizon runs through that part.
+        It is infinite without an estimate, or when its horizon runs through that part.
         """
         if estimate is None:
             return math.inf
@@ -163,87 +220,154 @@ class TrueHomography:
         return float(transfer_errors(signed, self.visible, target).mean())
 
     def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
-        """Score by the paper's RANSAC, in px."""
-        given = cv2.findHomography, (points1, points2), cv2.RANSAC, options.threshold_px
-        matrix, num_inliers = estimate_matrix(*given, options)
+        """Score matches by the paper's RANSAC.
+
+        Args:
+            points1: (M, 2) px in image 1.
+            points2: (M, 2) px in image 2.
+            options: of RANSAC.
+
+        Returns:
+            The score; its error is :meth:`error_px`.
+        """
+        matrix, num_inliers = estimate_matrix(
+            cv2.findHomography,
+            (points1, points2),
+            cv2.RANSAC,
+            options.threshold_px,
+            options,
+        )
         error = self.error_px(matrix)
-        num_correct = int((transfer_errors(self.matrix, points1, points2) < CORRECT_PX).sum())
-        solved = float(error < MAX_ERROR_PX)
-        return PairScore(error, num_inliers, num_correct, solved=solved, kind="homographies")
+        is_correct = transfer_errors(self.matrix, points1, points2) < CORRECT_PX
+        return PairScore(
+            error,
+            num_inliers,
+            int(is_correct.sum()),
+            solved=float(error < MAX_ERROR_PX),
+            kind="homographies",
+        )
 
 
 def transfer_errors(matrix: Array, points1: Points, points2: Points) -> Array:
-    """Return the (N,) distances in image 2, in px, of (N, 2) points 1 carried over to points 2."""
+    """Return the distances in image 2 of points from where a homography has them.
+
+    Args:
+        matrix: (3, 3) image2_from_image1.
+        points1: (N, 2) px in image 1.
+        points2: (N, 2) px in image 2.
+
+    Returns:
+        (N,) px, infinite behind the horizon.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = np.linalg.norm(project(matrix, points1) - points2, axis=1)
     return np.where(third_coordinates(matrix, points1) > 0, distances, np.inf)
 
 
 def third_coordinates(homography: Array, points: Points) -> Array:
-    """Return the (N,) third coordinates of (N, 2) points carried over, before the division."""
+    """Return the (N,) third coordinates of (N, 2) points that a (3, 3) homography maps."""
     return np.asarray(points @ homography[2, :2] + homography[2, 2])
 
 
 @dataclass(frozen=True, eq=False)
 class TruePose:
-    """The cameras of a pair, which are COLMAP's, and its true camera2_from_camera1."""
+    """The cameras and the relative pose of a pair."""
 
     cameras: tuple[pycolmap.Camera, pycolmap.Camera]
-    pose: Pose
+    pose: Pose  # camera2_from_camera1
 
     def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
-        """Score by the paper's RANSAC: the error is that of the rotation, in degrees.
+        """Score matches by the paper's RANSAC.
 
-        ``direction_error_deg`` is the angle between the directions of the translations. Matches
-        within ``CORRECT_PX`` of the true epipolar lines are correct, wrong ones by chance among
-        them. Distances are in px by the mean focal length of the two cameras.
+        Matches within ``CORRECT_PX`` of the true epipolar lines count as correct, also wrong ones
+        that are there by chance. Distances are in px by the mean focal length of the two cameras.
+
+        Args:
+            points1: (M, 2) px in image 1.
+            points2: (M, 2) px in image 2.
+            options: of RANSAC.
+
+        Returns:
+            The score. Its error is the angle of the rotations, ``direction_error_deg`` that of the
+            directions of the translations, in degrees.
         """
-        both = rays(self.cameras[0], points1), rays(self.cameras[1], points2)
-        focal_px = float(np.mean([camera.mean_focal_length() for camera in self.cameras]))
+        camera1, camera2 = self.cameras
+        both = (rays(camera1, points1), rays(camera2, points2))
+        focal_px = float(np.mean([camera1.mean_focal_length(), camera2.mean_focal_length()]))
         pose, num_inliers = estimate_pose(both, options.threshold_px / focal_px, options)
-        error, direction = (math.inf, math.inf) if pose is None else pose_errors(pose, self.pose)
+        rotation_deg = math.inf
+        direction_deg = math.inf
+        if pose is not None:
+            rotation_deg, direction_deg = pose_errors(pose, self.pose)
         distances_px = focal_px * sampson_errors(essential_matrix(*self.pose), *both)
-        has_baseline = self.pose[1].any()  # without, distances are not defined
-        num_correct = int((distances_px < CORRECT_PX).sum()) if has_baseline else 0
-        solved = float(error < MAX_ERROR_DEG)
-        return PairScore(error, num_inliers, num_correct, direction, solved, "poses")
+        _, translation = self.pose
+        has_baseline = translation.any()  # else distances are not defined
+        return PairScore(
+            rotation_deg,
+            num_inliers,
+            int((distances_px < CORRECT_PX).sum()) if has_baseline else 0,
+            direction_deg,
+            solved=float(rotation_deg < MAX_ERROR_DEG),
+            kind="poses",
+        )
 
 
 def rays(camera: pycolmap.Camera, points: Points) -> Points:
-    """Turn (N, 2) pixel-centre points into (N, 2) x/z, y/z; NaN for what a lens cannot produce."""
+    """Return (N, 2) x/z, y/z of (N, 2) pixel-centre points; NaN for what a lens cannot produce."""
     pixels = colmap_from_pixel(np.asarray(points, dtype=np.float64).reshape(-1, 2))
     return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """(N, 4) points that correspond, x1, y1, x2, y2 in pixel-centre px."""
+    """Points of a pair that a person has marked."""
 
-    points: Points
+    points: Points  # (N, 4) x1, y1, x2, y2 in pixel-centre px
 
     def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
-        """Score by the fundamental matrix of OpenCV's USAC_MAGSAC, as WxBS does.
+        """Score matches by the fundamental matrix of OpenCV's USAC_MAGSAC, as WxBS does.
 
-        ``error`` is the median of the symmetric epipolar distances of the correspondences, in px.
-        The pair is solved as far as :func:`wxbs_score` says.
+        Args:
+            points1: (M, 2) px in image 1.
+            points2: (M, 2) px in image 2.
+            options: of the estimates; the one of median error is scored.
+
+        Returns:
+            The score. Its error is the median of the symmetric epipolar distances of the
+            correspondences in px, and the pair is solved as far as :func:`wxbs_score` says.
         """
-        given = cv2.findFundamentalMat, (points1, points2), cv2.USAC_MAGSAC, MAX_EPIPOLAR_NOISE_PX
-        found = []
+        estimates = []  # error, number of inliers, seed, distances; seeds differ
         for seed in range(options.random_seed, options.random_seed + NUM_ESTIMATES):
-            matrix, count = estimate_matrix(*given, replace(options, random_seed=seed))
+            matrix, num_inliers = estimate_matrix(
+                cv2.findFundamentalMat,
+                (points1, points2),
+                cv2.USAC_MAGSAC,
+                MAX_EPIPOLAR_NOISE_PX,
+                options.changed(random_seed=seed),
+            )
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
-            found.append((float(np.median(distances)), count, seed, distances))
-        error, count, _, distances = median_low(found)
-        return PairScore(error, count, solved=wxbs_score(distances), kind="correspondences")
+            estimates.append((float(np.median(distances)), num_inliers, seed, distances))
+        error, num_inliers, _, distances = median_low(estimates)
+        return PairScore(error, num_inliers, solved=wxbs_score(distances), kind="correspondences")
 
 
 def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2: Points) -> Array:
-    """Return (N,) sqrt(d1^2 + d2^2) from epipolar lines, px; infinite if undefined."""
+    """Return sqrt(d1^2 + d2^2) of the distances of points from epipolar lines.
+
+    Args:
+        matrix: (3, 3) fundamental matrix, x2' F x1 = 0, or None.
+        points1: (N, 2) px in image 1.
+        points2: (N, 2) px in image 2.
+
+    Returns:
+        (N,) px, infinite where they are not defined.
+    """
     if matrix is None:
         return np.full(len(points1), np.inf)
     lines1, lines2 = epipolar_lines(matrix, points1, points2)
     residuals = (homogeneous(points2) * lines2).sum(axis=1)
-    slopes1, slopes2 = (np.square(lines[:, :2]).sum(axis=1) for lines in (lines1, lines2))
+    slopes1 = np.square(lines1[:, :2]).sum(axis=1)
+    slopes2 = np.square(lines2[:, :2]).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = np.abs(residuals) * np.sqrt(1.0 / slopes1 + 1.0 / slopes2)
     return np.asarray(np.nan_to_num(distances, nan=np.inf))
@@ -258,32 +382,46 @@ def columns(results: Results) -> dict[str, dict[str, float]]:
     """Return the columns of a table for each kind of truth; results without a truth are in none."""
     makers = {
         "homographies": homography_columns,
-        "correspondences": lambda own: {"WxBS score": fmean(result.solved for result in own)},
+        "correspondences": correspondence_columns,
         "poses": pose_columns,
     }
-    by_kind = {kind: [result for result in results if result.kind == kind] for kind in makers}
-    return {kind: makers[kind](own) for kind, own in by_kind.items() if own}
+    columns = {}
+    for kind, make in makers.items():
+        of_kind = [result for result in results if result.kind == kind]
+        if of_kind:
+            columns[kind] = make(of_kind)
+    return columns
 
 
 def homography_columns(results: Results) -> dict[str, float]:
-    """Count the pairs whose error is below each limit."""
-    return {
-        f"< {limit:g} px": float(sum(result.error < limit for result in results))
-        for limit in HOMOGRAPHY_LIMITS_PX
-    }
+    """Return the number of pairs whose error is below each limit."""
+    errors_px = np.array([result.error for result in results])
+    columns = {}
+    for limit_px in HOMOGRAPHY_LIMITS_PX:
+        columns[f"< {limit_px:g} px"] = float(np.count_nonzero(errors_px < limit_px))
+    return columns
+
+
+def correspondence_columns(results: Results) -> dict[str, float]:
+    """Return the mean score of WxBS."""
+    return {"WxBS score": fmean(result.solved for result in results)}
 
 
 def pose_columns(results: Results) -> dict[str, float]:
-    """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
+    """Return how many rotations are right, and how exact poses are.
 
-    And the area under the curve of recall over the larger of rotation and direction error, up to
-    10 degrees, as a share of 1.
+    Returns:
+        The shares of pairs whose rotation error is below ``MAX_ERROR_DEG``, by category and of
+        all. Then the area under the curve of recall over the larger of rotation and direction
+        error, up to ``MAX_AUC_ERROR_DEG``, as a share of 1.
     """
-    titles = dict.fromkeys([*(result.category for result in results if result.category), "all"])
-    shares = {
-        title: fmean(one.error < MAX_ERROR_DEG for one in results if title in ("all", one.category))
-        for title in titles
-    }
-    largest = [max(result.error, result.direction_error_deg) for result in results]
-    area = fmean(max(0.0, 1.0 - error / MAX_AUC_ERROR_DEG) for error in largest)
-    return {**shares, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": area}
+    by_title: dict[str, list[bool]] = {}
+    areas = []
+    for result in results:
+        if result.category:
+            by_title.setdefault(result.category, []).append(result.error < MAX_ERROR_DEG)
+        error_deg = max(result.error, result.direction_error_deg)
+        areas.append(max(0.0, 1.0 - error_deg / MAX_AUC_ERROR_DEG))
+    by_title["all"] = [result.error < MAX_ERROR_DEG for result in results]
+    shares = {title: fmean(is_right) for title, is_right in by_title.items()}
+    return {**shares, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": fmean(areas)}

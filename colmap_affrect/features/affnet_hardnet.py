@@ -1,7 +1,8 @@
 """Features ``affnet-hardnet``: DoG, AffNet, OriNet and a learned descriptor.
 
-The chain of the paper (Sec. 3): an upright patch round each keypoint gives its affine shape (of the
-same area), the patch of that shape its orientation, the patch of both its descriptor.
+The chain of the paper (Sec. 3): AffNet reads the affine shape of a keypoint, of the same area, from
+the upright patch around it. OriNet reads its orientation from the patch of that shape. The
+descriptor is of the patch of that shape and orientation.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.arrays import Array, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.geometry.tilts import frames_from_affnet
+from colmap_affrect.geometry.tilts import shapes_from_affnet
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-MAX_TILT = 20.0  # more is degenerate; AffNet's shapes on photographs stay under 6 (Graffiti).
-PATCH_SIGMAS = 12.0  # half width of a patch in units of the feature's sigma, as in the paper
+MAX_TILT = 20.0
+"""Largest tilt of a shape; more is degenerate. AffNet's shapes on photographs stay below 6 (judged
+on Graffiti)."""
+PATCH_SIGMAS = 12.0  # half width of a patch in units of the feature's sigma (the paper)
 BATCH_SIZE = 256  # patches that go through a network at once
 BATCH_MULTIPLE = 64
 """Batches are padded to multiples of this many patches: other sizes change the last bits of the
@@ -37,6 +40,7 @@ class AffNetHardNetOptions(DogOptions):
 
     name: Literal["affnet-hardnet"] = "affnet-hardnet"
     descriptor: Literal["hardnet", "hardtfeat"] = "hardnet"
+    """Network that describes patches."""
 
     @property
     def weights(self) -> tuple[str, ...]:
@@ -45,7 +49,7 @@ class AffNetHardNetOptions(DogOptions):
 
 
 class AffNetHardNet:
-    """Learned features; the networks are loaded here, from files found beforehand."""
+    """Learned features; the networks are loaded from files that were found beforehand."""
 
     Options = AffNetHardNetOptions
     descriptor_size = 128
@@ -54,8 +58,10 @@ class AffNetHardNet:
         """Load the networks; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features import networks
 
-        weights, device = network.weights, network.device
-        self.options, self.device = options, networks.resolve_device(device)
+        weights = network.weights
+        device = network.device
+        self.options = options
+        self.device = networks.resolve_device(device)
         self.affnet = networks.OnPatches(networks.load_affnet(weights["affnet"], device))
         self.orinet = networks.load_orinet(weights["orinet"], device)
         name = options.descriptor
@@ -69,75 +75,102 @@ class AffNetHardNet:
     def describe(
         self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
     ) -> list[LocalFeatures]:
-        """Estimate shape, orientation and descriptor of features, a list element for each image.
+        """Estimate shape, orientation and descriptor of features.
 
-        Of the frames given, in px, centre and scale count. Features whose shape is degenerate or
-        whose descriptor is not finite are left out; the others keep their order.
+        Only centre and scale of the given LAFs count. Features whose shape is degenerate or whose
+        descriptor is not finite are left out; the others keep their order.
+
+        Args:
+            images: (H, W) uint8 images.
+            detected: features of each image, LAFs in its px.
+
+        Returns:
+            Described features of each image.
         """
         counts = [len(features) for features in detected]
         if not sum(counts):
             return [LocalFeatures.empty(self.descriptor_size) for _ in detected]
         import torch
 
-        found = union(list(detected))
+        features = union(list(detected))
         with torch.inference_mode():
-            shapes, descriptors = self._describe(_sampler(images, counts, self.device), found)
+            sampler = _sampler(images, counts, self.device)
+            shapes, descriptors = self._shapes_and_descriptors(sampler, features)
+        # The squared Frobenius norm of a shape of determinant 1 and tilt t is t + 1 / t.
+        square_norms = (shapes**2).sum(axis=(1, 2))
+        is_sound = square_norms <= MAX_TILT + 1.0 / MAX_TILT
         lengths = np.linalg.norm(descriptors, axis=1)
-        # The squared Frobenius norm of a shape of tilt t is t + 1 / t.
-        is_sound = (shapes**2).sum(axis=(1, 2)) <= MAX_TILT + 1.0 / MAX_TILT
-        valid = is_sound & np.isfinite(lengths) & (lengths > 0.0)
-        found, shapes = found.select(valid), shapes[valid]
-        frames = _frames(shapes, found.scales, found.keypoints)
-        unit_rows = descriptors[valid] / lengths[valid, None]
-        described = replace(found, lafs=frames, descriptors=unit_rows)
-        numbers = np.repeat(np.arange(len(detected)), counts)[valid]  # of the images
-        return [described.select(numbers == number) for number in range(len(detected))]
+        is_valid = is_sound & np.isfinite(lengths) & (lengths > 0.0)
+        features = features.select(is_valid)
+        lafs = _lafs(shapes[is_valid], features.scales, features.keypoints)
+        unit_rows = descriptors[is_valid] / lengths[is_valid, None]
+        described = replace(features, lafs=lafs, descriptors=unit_rows)
+        image_numbers = np.repeat(np.arange(len(detected)), counts)[is_valid]
+        return [described.select(image_numbers == number) for number in range(len(detected))]
 
-    def _describe(
-        self, sample: Callable[[Array], Tensor], found: LocalFeatures
+    def _shapes_and_descriptors(
+        self, sample: Callable[[Array], Tensor], features: LocalFeatures
     ) -> tuple[Array, Singles]:
         """Return (N, 2, 2) shapes of determinant 1 or NaN, (N, 128) descriptors of any length."""
-        half_widths_px = PATCH_SIGMAS / MEASUREMENT_SIGMAS * found.scales
-        shapes = np.tile(np.eye(2), (len(found), 1, 1))
-        upright = sample(_frames(shapes, half_widths_px, found.keypoints))
-        shapes = frames_from_affnet(self._run(self.affnet, upright))
+        half_widths_px = PATCH_SIGMAS / MEASUREMENT_SIGMAS * features.scales
+        centers = features.keypoints
+        circles = np.tile(np.eye(2), (len(features), 1, 1))
+        upright_patches = sample(_lafs(circles, half_widths_px, centers))
+        shapes = shapes_from_affnet(self._run(self.affnet, upright_patches))
         areas = shapes[:, 0, 0] * shapes[:, 1, 1]
-        shapes /= np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]
-        unturned = sample(_frames(shapes, half_widths_px, found.keypoints))
+        valid_areas = np.where(areas > 0.0, areas, np.nan)
+        shapes /= np.sqrt(valid_areas)[:, None, None]
+        shape_patches = sample(_lafs(shapes, half_widths_px, centers))
+        angles = self._run(self.orinet, shape_patches).astype(np.float64)
         # kornia's angles are of the opposite sense to those of our rotation().
-        shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))
-        turned = sample(_frames(shapes, half_widths_px, found.keypoints))
-        return shapes, self._run(self.descriptor, turned)
+        shapes = shapes @ rotation(-angles)
+        oriented_patches = sample(_lafs(shapes, half_widths_px, centers))
+        return shapes, self._run(self.descriptor, oriented_patches)
 
     def _run(self, network: nn.Module, patches: Tensor) -> Singles:
+        """Return the outputs of a network on (N, 1, 32, 32) patches."""
         import torch
         from torch.nn.functional import pad
 
         outputs = []
         for batch in torch.split(patches, BATCH_SIZE):
-            filled = pad(batch, (0, 0, 0, 0, 0, 0, 0, -len(batch) % BATCH_MULTIPLE))
-            outputs.append(network(filled)[: len(batch)].float())
+            num_missing = -len(batch) % BATCH_MULTIPLE
+            padded = pad(batch, (0, 0, 0, 0, 0, 0, 0, num_missing))
+            outputs.append(network(padded)[: len(batch)].float())
         return np.asarray(torch.cat(outputs).cpu().numpy())
 
 
 def _sampler(
     images: Sequence[GrayImage], counts: Sequence[int], device: torch.device
 ) -> Callable[[Array], Tensor]:
-    """Return what samples (N, 1, 32, 32) patches of (N, 2, 3) frames, so many of each image."""
+    """Return a function that samples the patches of LAFs of several images.
+
+    Args:
+        images: (H, W) uint8 images.
+        counts: LAFs of each image.
+        device: where patches are sampled.
+
+    Returns:
+        Function of (N, 2, 3) LAFs, image by image, to (N, 1, 32, 32) patches.
+    """
     import torch
 
     from colmap_affrect.features.networks import PatchSampler
 
-    grays = (image.astype(np.float32) / np.float32(255) for image in images)
-    samplers = [PatchSampler(gray, device) for gray in grays]
+    samplers = []
+    for image in images:
+        gray = image.astype(np.float32) / np.float32(255)
+        samplers.append(PatchSampler(gray, device))
+    starts = np.cumsum(counts)[:-1]
 
     def sample(lafs: Array) -> Tensor:
-        parts = np.split(lafs, np.cumsum(counts)[:-1])
-        return torch.cat([s.sample(part) for s, part in zip(samplers, parts, strict=True)])
+        parts = np.split(lafs, starts)
+        patches = [sampler.sample(part) for sampler, part in zip(samplers, parts, strict=True)]
+        return torch.cat(patches)
 
     return sample
 
 
-def _frames(shapes: Array, radii_px: Array, centers: Array) -> Array:
-    """Return (N, 2, 3) frames of shapes of determinant 1, geometric mean radii and centres."""
+def _lafs(shapes: Array, radii_px: Array, centers: Array) -> Array:
+    """Return (N, 2, 3) LAFs of shapes of determinant 1, geometric mean radii and centres."""
     return np.concatenate([radii_px[:, None, None] * shapes, centers[:, :, None]], axis=2)

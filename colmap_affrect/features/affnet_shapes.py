@@ -1,9 +1,11 @@
 """Shape source ``affnet``: affine shapes from a network, on all blocks or on patches of keypoints.
 
-AffNet (Mishkin, Radenovic, Matas 2018) reads the shape of a feature off a 32 x 32 patch. Without
-the final pooling, fully convolutional, it gives one every 4 px: the paper's DenseAffNet (Sec. 3).
+AffNet (Mishkin, Radenovic, Matas 2018) reads the shape of a feature from a 32 x 32 patch. Without
+the final pooling it is fully convolutional and gives a shape every 4 px: the paper's DenseAffNet
+(Sec. 3).
 
-The three outputs o of the network make a frame L; shapes are the unit metrics of L^-1.
+The three outputs of the network make the shape L of a LAF; affine shapes are the unit metrics of
+L^-1.
 """
 
 from __future__ import annotations
@@ -37,9 +39,12 @@ PAPER_CROP_PX = (-LEAD_PX) % STEP_PX  # puts the patches of all cells round whol
 PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX  # blocks before the first with a patch
 CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9  # cell i depends on rows 4 i - 11...4 i + 39
 STRIP_CELLS = 64  # rows of cells that are computed at once, to bound the memory
-WINDOW_PX = 33  # surroundings whose mean and deviation normalise a pixel
-DEVIATION_FLOOR = 0.01 * 255  # added to deviations, gray values: blank surroundings stay blank
-MAX_NORMALISED = 6.0  # as in the AffNet authors' own fully convolutional network
+WINDOW_PX = 33  # surroundings whose mean and deviation normalize a pixel: about a patch
+DEVIATION_FLOOR = 0.01 * 255
+"""Gray values added to deviations, so that surroundings without texture stay so; judged."""
+PAPER_DEVIATION_FLOOR = 1e-6  # added to the deviation of the whole image (the authors' value)
+MAX_NORMALIZED = 6.0
+"""Largest normalized value, as in the fully convolutional network of AffNet's authors."""
 PATCH_SIGMAS = 12.0  # half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
 BATCH_SIZE = 256  # patches that go through the network at once
 
@@ -98,64 +103,77 @@ class AffNet:
             logs = self._paper_logs(image)
             textured = np.ones(logs.shape[:2], dtype=bool)
         else:
-            logs, textured = self._mean_logs(image), _textured(image, self.options.min_deviation)
+            logs = self._mean_logs(image)
+            textured = _textured_blocks(image, self.options.min_deviation)
             logs[~textured] = 0.0
         return ShapeGrid(tilts.metrics_from_log(logs), textured, ORIGIN_PX, STEP_PX)
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
         lafs = self.detect(image).lafs[: self.options.max_num_keypoints]  # by falling response
-        shapes = _frames(self._patch_outputs(image, lafs))
-        valid = np.isfinite(shapes).all(axis=(1, 2)) & (determinants(shapes) > 0)
-        return ShapeSamples(lafs[valid, :, 2], tilts.rectifying_metrics(shapes[valid]))
+        shapes = _shapes(self._patch_outputs(image, lafs))
+        is_finite = np.isfinite(shapes).all(axis=(1, 2))
+        is_valid = is_finite & (determinants(shapes) > 0)
+        metrics = tilts.rectifying_metrics(shapes[is_valid])
+        return ShapeSamples(lafs[is_valid, :, 2], metrics)
 
     def _mean_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics, the mean over all sizes of the image."""
-        size = image.shape[::-1]
-        resized = [shrink_to(image, round(max(size) * scale)) for scale in self.options.scales]
-        largest = max(min(level.shape) for level in resized)
-        levels = [level for level in resized if min(level.shape) >= min(PATCH_SIZE_PX, largest)]
-        mean = np.zeros((ceil(size[1] / STEP_PX), ceil(size[0] / STEP_PX), 2), dtype=np.float32)
+        height, width = image.shape
+        mean = np.zeros((ceil(height / STEP_PX), ceil(width / STEP_PX), 2), dtype=np.float32)
+        levels = self._levels(image)
         for level in levels:
-            around, deviation = _mean_and_deviation(level)
-            normalised = (level - around) / (deviation + DEVIATION_FLOOR)
-            clipped = np.clip(normalised, -MAX_NORMALISED, MAX_NORMALISED).astype(np.float32)
-            logs = self._dense_logs(_with_reflected_border(clipped))
-            matrix = conventions.resized_from_original((size[0], size[1]), level.shape[::-1])
-            mean += _read_grid(logs, matrix, mean.shape[:2]) / len(levels)
+            local_mean, deviation = _mean_and_deviation(level)
+            normalized = (level - local_mean) / (deviation + DEVIATION_FLOOR)
+            clipped = np.clip(normalized, -MAX_NORMALIZED, MAX_NORMALIZED)
+            logs = self._dense_logs(_with_reflected_border(clipped.astype(np.float32)))
+            level_size = (level.shape[1], level.shape[0])
+            level_from_image = conventions.resized_from_original((width, height), level_size)
+            mean += _interpolated(logs, level_from_image, mean.shape[:2]) / len(levels)
         return mean
+
+    def _levels(self, image: GrayImage) -> list[GrayImage]:
+        """Return the sizes of the image that have a whole patch, or else the largest."""
+        resized = []
+        for scale in self.options.scales:
+            size_px = round(max(image.shape) * scale)
+            resized.append(shrink_to(image, size_px))
+        largest_px = max(min(level.shape) for level in resized)
+        min_px = min(PATCH_SIZE_PX, largest_px)
+        return [level for level in resized if min(level.shape) >= min_px]
 
     def _paper_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics as in the paper, border cells replicated."""
         values = image.astype(np.float32)
-        normalised = (values - values.mean()) / (values.std() + 1e-6)
-        logs = self._dense_logs(normalised[PAPER_CROP_PX:, PAPER_CROP_PX:])
-        below, right = (
-            ceil(length / STEP_PX) - PAPER_LEAD_CELLS - count
-            for length, count in zip(image.shape, logs.shape[:2], strict=True)
-        )
-        widths = ((PAPER_LEAD_CELLS, below), (PAPER_LEAD_CELLS, right), (0, 0))
+        normalized = (values - values.mean()) / (values.std() + PAPER_DEVIATION_FLOOR)
+        logs = self._dense_logs(normalized[PAPER_CROP_PX:, PAPER_CROP_PX:])
+        num_rows = ceil(image.shape[0] / STEP_PX)
+        num_columns = ceil(image.shape[1] / STEP_PX)
+        num_below = num_rows - PAPER_LEAD_CELLS - logs.shape[0]
+        num_right = num_columns - PAPER_LEAD_CELLS - logs.shape[1]
+        widths = ((PAPER_LEAD_CELLS, num_below), (PAPER_LEAD_CELLS, num_right), (0, 0))
         return np.pad(logs, widths, mode="edge")
 
-    def _dense_logs(self, normalised: Singles) -> Singles:
+    def _dense_logs(self, normalized: Singles) -> Singles:
         """Return (R, C, 2) logarithms of the metrics that the network sees in a float image."""
         import torch
 
-        image = torch.from_numpy(normalised)[None, None]
-        num_rows = ceil(len(normalised) / STEP_PX) - PATCH_SIZE_PX // STEP_PX + 1
+        image = torch.from_numpy(normalized)[None, None]
+        num_rows = ceil(len(normalized) / STEP_PX) - PATCH_SIZE_PX // STEP_PX + 1
         strips = []
         for first in range(0, num_rows, STRIP_CELLS):
             last = min(first + STRIP_CELLS, num_rows)
             begin = max(first - CELLS_SEEN_BEFORE, 0)
             strip = image[:, :, STEP_PX * begin : STEP_PX * (last + CELLS_SEEN_AFTER)]
             with torch.inference_mode():
-                outputs = self.layers(strip.to(self.device))[0, :, first - begin : last - begin]
-            metrics = tilts.rectifying_metrics(_frames(outputs.permute(1, 2, 0)))
+                (outputs,) = self.layers(strip.to(self.device))
+            outputs = outputs[:, first - begin : last - begin]
+            metrics = tilts.rectifying_metrics(_shapes(outputs.permute(1, 2, 0)))
             strips.append(tilts.log_metrics(metrics))
         return np.concatenate(strips)
 
     def _patch_outputs(self, image: GrayImage, lafs: Array) -> torch.Tensor:
-        """Return the (N, 3) outputs of the network on the patches of (N, 2, 3) frames."""
+        """Return the (N, 3) outputs of the network on the patches of (N, 2, 3) LAFs."""
         import torch
 
         from colmap_affrect.features.networks import PatchSampler, standardized
@@ -163,51 +181,78 @@ class AffNet:
         wide = lafs.copy()
         wide[:, :, :2] *= PATCH_SIGMAS / conventions.MEASUREMENT_SIGMAS
         patches = PatchSampler(image.astype(np.float32), self.device).sample(wide)
+        outputs = [patches.new_empty((0, 3))]
         with torch.inference_mode():
-            batches = (batch for batch in torch.split(patches, BATCH_SIZE) if len(batch))
-            outputs = [self.layers(standardized(batch))[:, :, 0, 0] for batch in batches]
-            return torch.cat([patches.new_empty((0, 3)), *outputs])
+            for batch in torch.split(patches, BATCH_SIZE):
+                if len(batch):
+                    outputs.append(self.layers(standardized(batch))[:, :, 0, 0])
+            return torch.cat(outputs)
 
 
-def _frames(outputs: torch.Tensor) -> Array:
-    """Return (..., 2, 2) frames L of (..., 3) outputs."""
-    return tilts.frames_from_affnet(outputs.cpu().numpy().astype(np.float64))
+def _shapes(outputs: torch.Tensor) -> Array:
+    """Return (..., 2, 2) shapes L of (..., 3) outputs of the network."""
+    return tilts.shapes_from_affnet(outputs.cpu().numpy().astype(np.float64))
 
 
 def _mean_and_deviation(image: GrayImage) -> tuple[Array, Array]:
-    """Return (H, W) mean and standard deviation of the window round each pixel."""
-    window, border = (WINDOW_PX, WINDOW_PX), cv2.BORDER_REFLECT_101
+    """Return (H, W) mean and standard deviation of the window around each pixel."""
+    window = (WINDOW_PX, WINDOW_PX)
+    border = cv2.BORDER_REFLECT_101
     mean = np.asarray(cv2.boxFilter(image, cv2.CV_64F, window, borderType=border), np.float64)
     mean_square = cv2.sqrBoxFilter(image, cv2.CV_64F, window, borderType=border)
-    return mean, np.sqrt(np.maximum(mean_square - mean**2, 0.0))
+    variance = np.maximum(mean_square - mean**2, 0.0)
+    return mean, np.sqrt(variance)
 
 
 def _with_reflected_border(values: Floats) -> Floats:
     """Add a border so that the cells of the network are the 4 x 4 blocks of the image."""
-    bottom, right = (LEAD_PX + -length % STEP_PX for length in values.shape)
-    return np.asarray(
-        cv2.copyMakeBorder(values, LEAD_PX, bottom, LEAD_PX, right, cv2.BORDER_REFLECT_101)
-    )
+    height, width = values.shape
+    bottom = LEAD_PX + -height % STEP_PX
+    right = LEAD_PX + -width % STEP_PX
+    bordered = cv2.copyMakeBorder(values, LEAD_PX, bottom, LEAD_PX, right, cv2.BORDER_REFLECT_101)
+    return np.asarray(bordered)
 
 
-def _textured(image: GrayImage, min_deviation: float) -> Mask:
-    """Tell in which blocks gray values deviate by more than ``min_deviation`` round the middle."""
-    deviation = _with_reflected_border(_mean_and_deviation(image)[1])
+def _textured_blocks(image: GrayImage, min_deviation: float) -> Mask:
+    """Tell in which blocks gray values deviate by more than ``min_deviation``."""
+    _, deviation = _mean_and_deviation(image)
+    bordered = _with_reflected_border(deviation)
     middle = LEAD_PX + STEP_PX // 2
-    return np.asarray(deviation[middle:-LEAD_PX:STEP_PX, middle:-LEAD_PX:STEP_PX] > min_deviation)
+    middle_deviation = bordered[middle:-LEAD_PX:STEP_PX, middle:-LEAD_PX:STEP_PX]
+    return np.asarray(middle_deviation > min_deviation)
 
 
-def _read_grid(values: Singles, level_from_image: Array, cells: tuple[int, int]) -> Singles:
-    """Interpolate (r, c, D) values at the blocks of a resized image at (R, C) cells of the image.
+def _interpolated(values: Singles, level_from_image: Array, cells: tuple[int, int]) -> Singles:
+    """Interpolate values at the blocks of a resized image at the blocks of the image.
 
-    The map (3, 3) is of pixel-centre px; beyond the outermost centres their values count.
+    Beyond the outermost blocks their values count.
+
+    Args:
+        values: (r, c, D) at the blocks of the resized image.
+        level_from_image: (3, 3) map of pixel-centre px, which only scales and shifts.
+        cells: numbers R and C of rows and columns of blocks of the image.
+
+    Returns:
+        (R, C, D) float32.
     """
-    weights = []
-    for axis, (count, length) in enumerate(zip(cells, values.shape[:2], strict=True)):
-        scale, shift = level_from_image[1 - axis, [1 - axis, 2]]
-        centers = ORIGIN_PX + STEP_PX * np.arange(count)
-        indices = (scale * centers + shift - ORIGIN_PX) / STEP_PX
-        distances = np.clip(indices, 0, length - 1)[:, None] - np.arange(length)
-        weights.append(np.maximum(1.0 - np.abs(distances), 0.0).astype(np.float32))
-    by_row, by_column = weights
-    return np.stack([by_row @ channel @ by_column.T for channel in np.moveaxis(values, -1, 0)], -1)
+    num_rows, num_columns, num_channels = values.shape
+    scale_x, shift_x = level_from_image[0, [0, 2]]
+    scale_y, shift_y = level_from_image[1, [1, 2]]
+    row_weights = _linear_weights(scale_y, shift_y, cells[0], num_rows)
+    column_weights = _linear_weights(scale_x, shift_x, cells[1], num_columns)
+    channels = []
+    for number in range(num_channels):
+        channels.append(row_weights @ values[:, :, number] @ column_weights.T)
+    return np.stack(channels, -1)
+
+
+def _linear_weights(scale: float, shift: float, num_cells: int, num_values: int) -> Singles:
+    """Return (num_cells, num_values) weights of linear interpolation along one axis.
+
+    Scale and shift map px of the image to px of the resized one.
+    """
+    centers = ORIGIN_PX + STEP_PX * np.arange(num_cells)
+    positions = (scale * centers + shift - ORIGIN_PX) / STEP_PX
+    inside = np.clip(positions, 0, num_values - 1)
+    distances = inside[:, None] - np.arange(num_values)
+    return np.maximum(1.0 - np.abs(distances), 0.0).astype(np.float32)

@@ -1,7 +1,7 @@
-"""What a feature extractor and a source of affine shapes are.
+"""The protocols of feature extractors and of sources of affine shapes, and their registries.
 
-Entry points are in the groups ``colmap_affrect.features`` and ``colmap_affrect.shapes``. Several
-threads may call the same object at once.
+Those of other packages are entry points of the groups ``colmap_affrect.features`` and
+``colmap_affrect.shapes``. Several threads may call one object.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,9 @@ PATCH_SIZE_PX = 32  # side of the patches that all networks take
 
 @dataclass(frozen=True)
 class NetworkContext:
-    """What networks run with."""
+    """Files of weights and the device of networks."""
 
-    weights: Mapping[str, Path] = field(default_factory=dict)  # files by key, found beforehand
+    weights: Mapping[str, Path] = field(default_factory=dict)  # files by key; all exist
     device: str = "cpu"  # or ``cuda``, ``cuda:1``, ``mps``
 
 
@@ -43,7 +43,7 @@ class FeatureOptions(NetworkOptions):
     bytes_per_px: ClassVar[int] = 256
     """Memory of the extraction of one image, roughly."""
     has_shapes: ClassVar[bool] = True
-    """Whether frames were measured one by one, so that they can tell right matches from wrong."""
+    """Whether LAFs were measured one by one, so that they can tell right matches from wrong."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 8192
     """Most features of the image itself, by response."""
     max_num_rectified_features: Annotated[int, within(1, 1_000_000)] = 6144
@@ -56,14 +56,22 @@ class FeatureExtractor(Protocol):
     descriptor_size: int  # D, also of an image without features
 
     def detect(self, view: View) -> LocalFeatures:
-        """Return features of one view, frames in its px; descriptors may still be (N, 0)."""
+        """Return features of one view, LAFs in its px; descriptors may still be (N, 0)."""
 
     def describe(
         self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
     ) -> list[LocalFeatures]:
-        """Describe the features of :meth:`detect`, a list element for each image.
+        """Describe the features of :meth:`detect`.
 
-        Images together and one by one give the same. By default they are described already.
+        Images described together and one by one have the same descriptors. By default features are
+        described already.
+
+        Args:
+            images: (H, W) uint8 images.
+            detected: features of each image.
+
+        Returns:
+            Described features of each image, some of which may be left out.
         """
         del images
         return list(detected)
@@ -78,6 +86,8 @@ EXTRACTORS: Registry[FeatureExtractor] = Registry(
         "aliked": "colmap_affrect.features.learned:Aliked",
     },
     default="rootsift",
+    protocol=FeatureExtractor,
+    options_base=FeatureOptions,
 )
 
 
@@ -107,4 +117,6 @@ SHAPES: Registry[ShapeSource] = Registry(
         "affnet": "colmap_affrect.features.affnet_shapes:AffNet",
     },
     default="second-moment",
+    protocol=ShapeSource,
+    options_base=ShapeOptions,
 )

@@ -1,6 +1,6 @@
 """Features ``aliked``: a network that detects and describes in one pass.
 
-Frames are upright circles of RADIUS_PX in the view, which a warp makes ellipses in the image.
+LAFs are upright circles of ``RADIUS_PX`` in the view; those of a warp are ellipses in the image.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 RADIUS_PX = 12.0
-"""Radius of all frames: a sigma of 2 px, within which the network finds a point again, so
-that a point that warps show again is known as the same."""
+"""Radius of all LAFs, of a sigma of 2 px: judged on photographs, the network finds a point again
+within so much, so that the same point of several warps is recognized as one."""
 
 
 class AlikedOptions(FeatureOptions):
@@ -45,9 +45,10 @@ class AlikedOptions(FeatureOptions):
 
 
 class Aliked(FeatureExtractor):
-    """ALIKED: maxima of a score map to parts of a pixel, descriptors from places round them.
+    """ALIKED: maxima of a score map with subpixel positions, descriptors of deformable patches.
 
-    ``n16`` finds points where they are, ``n16rot`` up to 1 px below, by what there is.
+    The positions of ``n16`` have no bias; those of ``n16rot`` are up to 1 px too low, depending on
+    the content of the image.
     """
 
     Options = AlikedOptions
@@ -57,32 +58,39 @@ class Aliked(FeatureExtractor):
         """Load the network; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import load_extractor, resolve_device
 
-        self.options, self.device = options, resolve_device(context.device)
+        self.options = options
+        self.device = resolve_device(context.device)
         (key,) = options.weights
-        path, threshold = context.weights[key], options.score_threshold
-        self.network: Any = load_extractor(key, threshold, path, context.device)
+        path = context.weights[key]
+        self.network: Any = load_extractor(key, options.score_threshold, path, context.device)
 
     def detect(self, view: View) -> LocalFeatures:
-        """Detect and describe, by falling response; the mask chooses, its edge is no feature."""
+        """Detect and describe, by falling response.
+
+        The mask selects features after detection, so that its edge makes none.
+        """
         image, mask = view
         if not is_searchable(image, mask):
             return LocalFeatures.empty(self.descriptor_size)
         import torch
 
-        allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
+        is_allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
         with torch.inference_mode():
-            maps, score_map = self.network.extract_dense_map(_pixels(image).to(self.device))
-            (places,), (scores,), _ = self.network.dkd(score_map)  # places from -1 to 1
-            size = places.new_tensor([image.shape[1] - 1, image.shape[0] - 1])
-            pixels = (places + 1) / 2 * size
-            kept = np.flatnonzero(in_mask(allowed, _array(pixels)))
+            pixels = _pixels(image).to(self.device)
+            feature_map, score_map = self.network.extract_dense_map(pixels)
+            (normalized,), (scores,), _ = self.network.dkd(score_map)  # positions in [-1, 1]
+            last_pixel = normalized.new_tensor([image.shape[1] - 1, image.shape[0] - 1])
+            points = (normalized + 1) / 2 * last_pixel
+            kept = np.flatnonzero(in_mask(is_allowed, _array(points)))
             order = np.argsort(-_array(scores)[kept], kind="stable")
             strongest = kept[order[: self.options.max_num_features]]
-            best = torch.from_numpy(strongest).to(self.device)
-            described = self.network.desc_head(maps, [places[best]])[0][0]
-            found = pixels[best], scores[best], described
-        points, responses, descriptors = (_array(values) for values in found)
-        lafs = lafs_from_keypoints(points, np.full(len(points), RADIUS_PX), np.zeros(len(points)))
+            rows = torch.from_numpy(strongest).to(self.device)
+            described = self.network.desc_head(feature_map, [normalized[rows]])
+            descriptors = _array(described[0][0])
+            keypoints = _array(points[rows])
+            responses = _array(scores[rows])
+        radii_px = np.full(len(keypoints), RADIUS_PX)
+        lafs = lafs_from_keypoints(keypoints, radii_px, np.zeros(len(keypoints)))
         return LocalFeatures(lafs, responses, descriptors)
 
 

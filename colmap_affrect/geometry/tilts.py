@@ -22,11 +22,18 @@ from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
 
 STEP_PX = 4  # dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
-MAX_TANH = 0.999  # where logarithms end: of a metric, tilt 45
-MIN_DISTINCT_SHARE = 0.5  # of frames that were measured one by one nearly all differ
-SHAPE_STEP = 1e-4  # shapes of unit area that are this close are one; rounding of 32 bits is less
-GRID_TILTS = np.geomspace(2.0, 6.21970, 6)  # of candidates for 1.7-balls up to tilt 5.8 (paper)
-GRID_NUM_ANGLES = 32
+MAX_TANH = 0.999  # where logarithms of metrics are cut off: a tilt of 45
+SMALLEST_NORM = 1e-12  # of deviators that are divided by their norm
+SMALLEST_LOG = 1e-9  # below it sinh(x) / x is 1 in float64
+MIN_DISTINCT_RATIO = 0.5
+"""Shapes that differ, as a share of all, where they were measured one by one: then nearly all do;
+judged."""
+SHAPE_STEP = 1e-4  # shapes of unit area that are this close are equal; float32 rounding is less
+GRID_TILTS = np.geomspace(2.0, 6.21970, 6)  # candidates for 1.7-balls up to tilt 5.8 (the paper)
+GRID_NUM_ANGLES = 32  # candidates of each tilt (the paper)
+NEAR_OPTIMAL_RINGS = ((2.61757, 0.398032, 8), (5.18168, 0.198314, 16))
+"""Tilts, steps of the angle in radians and numbers of maps (Rodriguez, Delon, Morel 2018, constants
+for r = 1.7)."""
 IDENTITY_LABEL = -1
 UNCOVERED_LABEL = -2
 
@@ -34,18 +41,21 @@ UNCOVERED_LABEL = -2
 def unit_metrics(matrices: Floats) -> Array:
     """Return (..., 3) metrics (S11, S22, S12) of S = M^T M / |det M| for (..., 2, 2) maps."""
     gram = np.swapaxes(matrices, -1, -2) @ matrices
-    determinant = np.abs(np.linalg.det(matrices))
-    parts = np.stack([gram[..., 0, 0], gram[..., 1, 1], gram[..., 0, 1]], -1)
-    return np.asarray(parts / determinant[..., None], dtype=np.float64)
+    entries = np.stack([gram[..., 0, 0], gram[..., 1, 1], gram[..., 0, 1]], -1)
+    areas = np.abs(np.linalg.det(matrices))
+    return np.asarray(entries / areas[..., None], dtype=np.float64)
 
 
-def frames_from_affnet(outputs: Floats) -> Array:
-    """Return (..., 2, 2) frames, image from patch up to scale, of (..., 3) outputs of AffNet."""
-    frames = np.zeros((*outputs.shape[:-1], 2, 2))
-    frames[..., 0, 0] = 1.0 + outputs[..., 0]
-    frames[..., 1, 0] = outputs[..., 1]
-    frames[..., 1, 1] = 1.0 + outputs[..., 2]
-    return frames
+def shapes_from_affnet(outputs: Floats) -> Array:
+    """Return the shapes of LAFs, image from patch up to scale, of outputs of AffNet.
+
+    (..., 3) outputs become (..., 2, 2) lower triangular shapes.
+    """
+    shapes = np.zeros((*outputs.shape[:-1], 2, 2))
+    shapes[..., 0, 0] = 1.0 + outputs[..., 0]
+    shapes[..., 1, 0] = outputs[..., 1]
+    shapes[..., 1, 1] = 1.0 + outputs[..., 2]
+    return shapes
 
 
 def of_unit_area(shapes: Floats) -> Array:
@@ -54,17 +64,18 @@ def of_unit_area(shapes: Floats) -> Array:
     return np.asarray(shapes / np.sqrt(areas)[:, None, None], np.float64)
 
 
-def vary_singly(shapes: Floats) -> bool:
-    """Whether (N, 2, 2) shapes of features were measured one by one.
+def are_individual_shapes(shapes: Floats) -> bool:
+    """Tell whether (N, 2, 2) shapes of features were measured one by one.
 
-    Those without a shape are circles, which a warp turns into one ellipse for all its features.
+    Features without a shape are circles, which a warp maps to one ellipse for all of them.
     """
-    cells = np.rint(of_unit_area(shapes) / SHAPE_STEP).reshape(-1, 4)
-    return len(np.unique(cells, axis=0)) > max(1.0, MIN_DISTINCT_SHARE * len(shapes))
+    rounded = np.rint(of_unit_area(shapes) / SHAPE_STEP).reshape(-1, 4)
+    num_distinct = len(np.unique(rounded, axis=0))
+    return num_distinct > max(1.0, MIN_DISTINCT_RATIO * len(shapes))
 
 
 def rectifying_metrics(shapes: Floats) -> Array:
-    """Return (..., 3) unit metrics of L^-1, the rectifying maps of (..., 2, 2) frames L.
+    """Return (..., 3) unit metrics of L^-1, the rectifying maps of (..., 2, 2) shapes L.
 
     The metric of L^-1 is the inverse of L L^T, which of unit determinant is its adjugate.
     """
@@ -77,34 +88,41 @@ def log_metrics(metrics: Floats) -> Singles:
 
     For S = m I + D with trace-free D the logarithm is atanh(|D| / m) D / |D|.
     """
-    mean = (metrics[..., 0] + metrics[..., 1]) / 2
-    deviator = np.stack([(metrics[..., 0] - metrics[..., 1]) / 2, metrics[..., 2]], -1)
-    norm = np.maximum(np.linalg.norm(deviator, axis=-1), 1e-12)
-    ratio = np.minimum(norm / np.maximum(mean, 1e-12), MAX_TANH)
-    return np.asarray((np.arctanh(ratio) / norm)[..., None] * deviator, dtype=np.float32)
+    s11, s22, s12 = np.moveaxis(metrics, -1, 0)
+    mean = (s11 + s22) / 2
+    deviator = np.stack([(s11 - s22) / 2, s12], -1)
+    norm = np.maximum(np.linalg.norm(deviator, axis=-1), SMALLEST_NORM)
+    ratio = np.minimum(norm / np.maximum(mean, SMALLEST_NORM), MAX_TANH)
+    factor = np.arctanh(ratio) / norm
+    return np.asarray(factor[..., None] * deviator, dtype=np.float32)
 
 
 def metrics_from_log(logs: Floats) -> Array:
     """Invert :func:`log_metrics`: (..., 3) unit metrics by the exponential."""
     logs = logs.astype(np.float64)
     norm = np.linalg.norm(logs, axis=-1)
-    factor = np.where(norm > 1e-9, np.sinh(norm) / np.maximum(norm, 1e-9), 1.0)
+    quotient = np.sinh(norm) / np.maximum(norm, SMALLEST_LOG)
+    factor = np.where(norm > SMALLEST_LOG, quotient, 1.0)
     cosh = np.cosh(norm)
-    diagonal, off = factor * logs[..., 0], factor * logs[..., 1]
-    return np.stack([cosh + diagonal, cosh - diagonal, off], -1)
+    diagonal, off_diagonal = np.moveaxis(factor[..., None] * logs, -1, 0)
+    return np.stack([cosh + diagonal, cosh - diagonal, off_diagonal], -1)
 
 
 def metrics_from_tilts(tilts: ArrayLike, angles_rad: ArrayLike) -> Array:
     """Return (..., 3) unit metrics of the classes (tilt, angle) of diag(t, 1) R(phi)."""
-    tilts, angles = (np.asarray(values, np.float64) for values in (tilts, angles_rad))
-    cos, sin = np.cos(angles), np.sin(angles)
-    s11, s22 = tilts * cos**2 + sin**2 / tilts, tilts * sin**2 + cos**2 / tilts
-    return np.stack([s11, s22, (1.0 / tilts - tilts) * cos * sin], -1)
+    tilts = np.asarray(tilts, np.float64)
+    angles = np.asarray(angles_rad, np.float64)
+    cos = np.cos(angles)
+    sin = np.sin(angles)
+    s11 = tilts * cos**2 + sin**2 / tilts
+    s22 = tilts * sin**2 + cos**2 / tilts
+    s12 = (1.0 / tilts - tilts) * cos * sin
+    return np.stack([s11, s22, s12], -1)
 
 
 def tilts_from_metrics(metrics: Floats) -> tuple[Array, Array]:
     """Return tilts >= 1 and angles in [0, pi) of (..., 3) unit metrics."""
-    s11, s22, s12 = metrics[..., 0], metrics[..., 1], metrics[..., 2]
+    s11, s22, s12 = np.moveaxis(metrics, -1, 0)
     cosh = np.maximum((s11 + s22) / 2.0, 1.0)
     tilts = cosh + np.sqrt(cosh**2 - 1.0)
     angles = np.mod(0.5 * np.arctan2(-2.0 * s12, s11 - s22), np.pi)
@@ -124,8 +142,8 @@ def ball_threshold(radius: float) -> float:
 
 def covering_grid() -> Array:
     """Return the paper's 192 candidate centres as (192, 2) rows (tilt, angle_rad)."""
-    angles = np.arange(GRID_NUM_ANGLES) * np.pi / GRID_NUM_ANGLES
-    tilts, angles = np.meshgrid(GRID_TILTS, angles, indexing="ij")
+    ring = np.arange(GRID_NUM_ANGLES) * np.pi / GRID_NUM_ANGLES
+    tilts, angles = np.meshgrid(GRID_TILTS, ring, indexing="ij")
     return np.stack([tilts.ravel(), angles.ravel()], axis=1)
 
 
@@ -135,20 +153,24 @@ def asift_covering() -> Array:
     Tilts 2^(k/2), k = 1...6; 4, 5, 7, 10, 14, 20 angles (Morel & Yu 2009, whose program rounds
     5 t to an even number and halves it; Sec. 2.3 of the paper counts 61 with the identity).
     """
-    tilts = [2.0 ** (level / 2.0) for level in range(1, 7)]
-    counts = [(round(5.0 * tilt) + 1) // 2 for tilt in tilts]
-    rings = zip(tilts, counts, strict=True)
-    return np.array([(tilt, k * np.pi / count) for tilt, count in rings for k in range(count)])
+    rows = []
+    for level in range(1, 7):
+        tilt = 2.0 ** (level / 2.0)
+        num_angles = (round(5.0 * tilt) + 1) // 2
+        rows += [(tilt, index * np.pi / num_angles) for index in range(num_angles)]
+    return np.array(rows)
 
 
 def near_optimal_covering() -> Array:
     """Return the 24 maps that, with the identity, cover all tilts to 5.8 by 1.7-balls.
 
-    As (24, 2) rows (tilt, angle_rad). Source: Rodriguez, Delon, Morel 2018, constants for
-    r = 1.7: two rings of 8 and 16 maps, which together show 6.1 image areas.
+    They are (24, 2) rows (tilt, angle_rad). Both rings of :data:`NEAR_OPTIMAL_RINGS` show 6.1 image
+    areas together.
     """
-    rings = [(2.61757, 0.398032, 8), (5.18168, 0.198314, 16)]
-    return np.array([(tilt, step * index) for tilt, step, count in rings for index in range(count)])
+    rows = []
+    for tilt, angle_step, num_angles in NEAR_OPTIMAL_RINGS:
+        rows += [(tilt, angle_step * index) for index in range(num_angles)]
+    return np.array(rows)
 
 
 @dataclass(frozen=True)
@@ -168,27 +190,36 @@ def cover_shapes(
     covered_frac: float,
     max_num_centers: int,
 ) -> Cover:
-    """Choose centres greedily until their r-balls hold enough shapes, then partition.
+    """Choose centres greedily until their r-balls hold enough shapes, then partition the shapes.
 
-    Shapes, (N, 3) metrics of rectifying maps with (N,) votes >= 0, count as covered from the start
-    in the r-ball of the identity, r > 1 being a tilt ratio; those of a tilt above ``max_tilt``
-    neither vote nor count. Every shape then goes to the nearest of the centres and the identity if
-    it lies in that r-ball (Sec. 2.4 of the paper). Candidates are those of :func:`covering_grid`;
-    ``covered_frac`` of the votes are to be covered.
+    Candidates are those of :func:`covering_grid`. Shapes in the r-ball of the identity are covered
+    from the start. In the end every shape belongs to the nearest of the centres and the identity,
+    if it lies in that r-ball (Sec. 2.4 of the paper).
+
+    Args:
+        metrics: (N, 3) metrics of the rectifying maps of the shapes.
+        weights: (N,) votes >= 0.
+        radius: r > 1, a tilt ratio.
+        max_tilt: shapes of a larger tilt neither vote nor need to be covered.
+        covered_frac: share of the votes that are to be covered.
+        max_num_centers: centres, at most.
+
+    Returns:
+        The centres, and to which of them each shape belongs.
     """
     candidates = covering_grid()
     threshold = ball_threshold(radius)
     identity_cosh = metrics[:, :2].sum(axis=1) / 2.0
     votes = np.where(identity_cosh <= ball_threshold(max_tilt), weights, 0.0)
-    allowed = (1.0 - covered_frac) * votes.sum()
+    max_uncovered = (1.0 - covered_frac) * votes.sum()
     votes = np.where(identity_cosh < threshold, 0.0, votes)
-    open_shapes = np.flatnonzero(votes)
-    votes = votes[open_shapes].astype(np.float32)
+    voters = np.flatnonzero(votes)
+    votes = votes[voters].astype(np.float32)
     candidate_metrics = metrics_from_tilts(candidates[:, 0], candidates[:, 1])
-    in_ball = cosh_distances(candidate_metrics, metrics[open_shapes]) < threshold
+    in_ball = cosh_distances(candidate_metrics, metrics[voters]) < threshold
     ballots = in_ball.astype(np.float32)
     chosen: list[int] = []
-    while votes.sum() > allowed and len(chosen) < max_num_centers:
+    while votes.sum() > max_uncovered and len(chosen) < max_num_centers:
         totals = ballots @ votes
         best = int(np.argmax(totals))
         if totals[best] <= 0.0:
@@ -200,10 +231,20 @@ def cover_shapes(
 
 
 def nearest_centers(metrics: Floats, centers: Floats, radius: float) -> NDArray[np.int32]:
-    """Label (N, 3) metrics with the nearest of the identity and (K, 2) centres, within r."""
-    tilts, angles = np.concatenate([[[1.0, 0.0]], centers]).T
+    """Label metrics with the nearest of the centres and the identity.
+
+    Args:
+        metrics: (N, 3).
+        centers: (K, 2) rows (tilt, angle_rad).
+        radius: a tilt ratio; metrics outside of all balls of this radius are uncovered.
+
+    Returns:
+        (N,) labels as in :class:`Cover`.
+    """
+    identity = [[1.0, 0.0]]
+    tilts, angles = np.concatenate([identity, centers]).T
     distances = cosh_distances(metrics_from_tilts(tilts, angles), np.asarray(metrics))
     nearest = np.argmin(distances, axis=0)
     labels = np.where(nearest == 0, IDENTITY_LABEL, nearest - 1)
-    inside = distances.min(axis=0) < ball_threshold(radius)
-    return np.where(inside, labels, UNCOVERED_LABEL).astype(np.int32)
+    is_inside = distances.min(axis=0) < ball_threshold(radius)
+    return np.where(is_inside, labels, UNCOVERED_LABEL).astype(np.int32)

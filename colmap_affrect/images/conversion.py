@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image, UnidentifiedImageError
 
-from colmap_affrect.errors import ImageError
+from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import (
@@ -24,23 +24,31 @@ from colmap_affrect.images.photographs import (
     require_folder,
 )
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, PNG, pages
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.options import Summarized, documented
+from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import LONGEST_NAME, fitting_name, new_results
+from colmap_affrect.project.paths import PathLike, as_path
 
 AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
 JPEG = b"\xff\xd8"
 
 
+@documented
 @dataclass
-class ConversionReport:
+class ConversionReport(Summarized):
     """What became of the files of a folder, by their names."""
 
-    written: dict[str, list[str]] = field(default_factory=dict)  # files made, by the converted one
-    copied: list[str] = field(default_factory=list)  # files that COLMAP can read as they are
-    renamed: dict[str, str] = field(default_factory=dict)  # new names, by those that were taken
-    failures: dict[str, str] = field(default_factory=dict)  # why files cannot be read
-    left_out: dict[str, str] = field(default_factory=dict)  # why folders were passed over
+    written: dict[str, list[str]] = field(default_factory=dict)
+    """Files that were made, by the one that was converted."""
+    copied: list[str] = field(default_factory=list)
+    """Files that COLMAP can read as they are."""
+    renamed: dict[str, str] = field(default_factory=dict)
+    """New names, by those that were taken already."""
+    failures: dict[str, str] = field(default_factory=dict)
+    """Why files cannot be read."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Why folders were passed over."""
 
     def summary(self) -> str:
         """Return one line, and one for each file that failed or has another name than usual."""
@@ -54,7 +62,7 @@ class ConversionReport:
 
 
 def convert_images(
-    image_path: Path, output_path: Path, progress: Progress = SILENT
+    image_path: PathLike, output_path: PathLike, progress: GivenProgress = None
 ) -> ConversionReport:
     """Make a new folder with the photographs of another one, all in formats that COLMAP reads.
 
@@ -64,7 +72,7 @@ def convert_images(
     Args:
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder to be made.
-        progress: where to show progress.
+        progress: True, False, or None for where somebody looks at it.
 
     Returns:
         What became of each file.
@@ -74,6 +82,9 @@ def convert_images(
         OptionError: their folder is not there, or the new one is there already or inside it.
         WorkspaceError: the new folder cannot be written.
     """
+    image_path = as_path(image_path, "image_path")
+    output_path = as_path(output_path, "output_path")
+    progress = Progress.given(progress)
     require_folder(image_path)
     with suppress(ImportError):  # of the extra "heic"
         from pillow_heif import register_heif_opener
@@ -81,7 +92,7 @@ def convert_images(
         register_heif_opener()
     names = photograph_files(image_path)
     if not names:
-        raise ImageError(f"{image_path}: holds no photographs")
+        raise OptionError(f"{image_path}: holds no photographs")
     with (
         new_results(output_path, names=names) as (folder,),
         progress.stage("convert", len(names), "images") as advance,

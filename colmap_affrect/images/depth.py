@@ -50,14 +50,15 @@ class DepthMaps:
     """Depth maps in a folder; values that are not finite or not positive are unknown."""
 
     def __init__(self, options: DepthOptions) -> None:
-        self._options, self._path = options, Path(options.path)
+        self._options = options
+        self._path = Path(options.path)
 
     def require_some(self, names: Sequence[str]) -> None:
-        """Raise DepthError when no image has a map, OptionError when there is no folder."""
+        """Refuse a folder that is not there, or has no map of any image; OptionError."""
         if not self._path.is_dir():
             raise OptionError(f"{self._path}: no such folder; give the folder of the depth maps")
         if not any(self._options.file(name) for name in names):
-            raise DepthError(
+            raise OptionError(
                 f"{self._path}: holds no depth map of any of the {len(names)} images; "
                 f"{self._places(names[0])}"
             )
@@ -88,7 +89,8 @@ class DepthMaps:
             raise DepthError(
                 f"{what}: 8 bits are a preview, too coarse for depth; give 16 bits, or .npy"
             )
-        (height, width), size = values.shape, photograph.size
+        (height, width) = values.shape
+        size = photograph.size
         if abs(log(width / height) - log(size[0] / size[1])) > log(MAX_ASPECT_RATIO):
             raise DepthError(
                 f"{what}: is {width} x {height} px, the photograph {size[0]} x {size[1]} (width x "

@@ -24,7 +24,9 @@ MAX_CONTRADICTION = 1.15  # ratio of focal lengths that still agree: equivalents
 MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
 SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)  # photographs of another shape may have been cropped
 MAX_THUMBNAIL_PX = 160  # longer side of the thumbnails of cameras, often with black bars
-RESOLUTION, EQUIVALENT, SENSOR = "focal-plane resolution", "35 mm equivalent", "known sensor"
+RESOLUTION = "focal-plane resolution"
+EQUIVALENT = "35 mm equivalent"
+SENSOR = "known sensor"
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,10 @@ def read_camera_tags(path: Path) -> CameraTags | None:
 
 
 def _tags_of_file(file: BinaryIO) -> CameraTags:
-    image, tag = opened(file), ExifTags.Base
-    size, tags = stored_size(image), dict[int, Any]()
+    image = opened(file)
+    tag = ExifTags.Base
+    size = stored_size(image)
+    tags = dict[int, Any]()
     if image.format != "PNG" or "exif" in image.info:  # else Pillow reads the pixels
         with suppress(Exception):  # damaged tags raise nearly anything in Pillow
             exif = image.getexif()
@@ -91,8 +95,10 @@ def _tags_of_file(file: BinaryIO) -> CameraTags:
         return value.strip(" \t\r\n\0") if isinstance(value, str) else ""
 
     unit = MM_PER_UNIT.get(int(_positive(tags.get(tag.FocalPlaneResolutionUnit)) or 0))
-    across, down = number(tag.FocalPlaneXResolution), number(tag.FocalPlaneYResolution)
-    width, height = number(tag.ExifImageWidth), number(tag.ExifImageHeight)
+    across = number(tag.FocalPlaneXResolution)
+    down = number(tag.FocalPlaneYResolution)
+    width = number(tag.ExifImageWidth)
+    height = number(tag.ExifImageHeight)
     return CameraTags(
         size,
         (text(tag.Make), text(tag.Model), text(tag.BodySerialNumber)),
@@ -147,7 +153,8 @@ def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFo
 
 
 def _sizes(tags: CameraTags) -> str:
-    size, original = tags.size, tags.original_size or tags.size
+    size = tags.size
+    original = tags.original_size or tags.size
     return f"{size[0]} x {size[1]} px, when taken {original[0]} x {original[1]}"
 
 

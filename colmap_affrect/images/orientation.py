@@ -14,7 +14,9 @@ from colmap_affrect.images.reading import PNG, opened, read_header, stand_uprigh
 from colmap_affrect.project.atomic_files import replace_bytes
 
 UPRIGHT = 1  # EXIF's number
-JPEG_START, JPEG_EXIF, JPEG_XMP = b"\xff\xd8", b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"
+JPEG_START = b"\xff\xd8"
+JPEG_EXIF = b"Exif\0\0"
+JPEG_XMP = b"http://ns.adobe.com/xap/1.0/\0"
 JPEG_PIXELS = 0xDA  # the segment that begins them; metadata come before
 JPEG_LONE = {0x01, *range(0xD0, 0xD9)}  # segments without content
 XMP_ORIENTATION = re.compile(rb"(tiff:Orientation\s*(?:=\s*[\"']|>)\s*)[2-8]")
@@ -83,7 +85,8 @@ def _change_png(data: bytearray) -> None:
     position = len(PNG)
     while position + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)
-        start, end = position + 8, position + 8 + length
+        start = position + 8
+        end = position + 8 + length
         if kind == b"eXIf":
             _change_exif(data, start, end)
         elif kind in (b"iTXt", b"tEXt"):

@@ -18,6 +18,7 @@ from colmap_affrect.images import reading
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.outputs import is_output_folder
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.stores import pair_key
 
@@ -38,8 +39,13 @@ class CameraOptions(Options):
     """How images share cameras (COLMAP's camera modes, models and parameters)."""
 
     mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
+    """Which images share a camera. ``auto``: as ``cameras_path`` says, else those of one body,
+    lens, focal length and size by EXIF; without EXIF each has its own, unless matches show that
+    images of one size share one."""
     model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the camera model."""
     params: str = ""
+    """Known intrinsics in COLMAP's order, separated by commas; empty if they are not known."""
     default_focal_length_factor: Annotated[float, within(0.01, 100.0)] = 1.2
     """Focal length in units of the longer side where EXIF has none."""
     ignore_exif: bool = False
@@ -47,9 +53,10 @@ class CameraOptions(Options):
     cameras_path: str = ""
     """COLMAP model, or CSV table by image name, with cameras that are known; empty for none."""
     focal_length_px: Annotated[float, within(0.0, 1e7)] = 0.0
-    """Of all images that ``cameras_path`` does not name; 0 if it is not known."""
+    """Focal length of all images that ``cameras_path`` does not name; 0 if it is not known."""
     focal_mm: Annotated[float, within(0.0, 1e5)] = 0.0
-    """Of the lens of all images whose focal length nothing else says; 0 if it is not known."""
+    """Focal length of the lens of all images of which nothing else tells one; 0 if it is not
+    known. Needs ``film_width_mm``."""
     film_width_mm: Annotated[float, within(0.0, 1e5)] = 0.0
     """Longer side of what these images show of film, plate or sensor."""
     principal_point: str = ""
@@ -137,13 +144,13 @@ class Photographs:
         given = {"--mask-path": self.masks.path, "--camera-mask-path": self.masks.camera_path}
         if not any(given.values()):
             return
-        photographs = {(self.folder / name).resolve() for name in names}
+        photographs = {resolved(self.folder / name) for name in names}
         for option, where in given.items():
             paths = [Path(where)] if where else []
             if option == "--mask-path":
                 paths = [path for name in names for path in self._mask_paths(name)]
             for path in paths:
-                if path.resolve() in photographs:
+                if resolved(path) in photographs:
                     raise OptionError(
                         f"{option} {where}: {path.name} is one of the photographs in "
                         f"{self.folder}; give the masks a folder of their own, outside of that"
@@ -173,7 +180,7 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     """Return the sorted names, relative to ``image_path``, of all images below it or of a list.
 
     Hidden files and other formats are passed over (:func:`left_out`). OptionError when there is no
-    such folder or list, ImageError when it holds none, or a listed one is missing.
+    such folder or list, it holds none, or a listed one is missing.
     """
     require_folder(image_path)
     if image_list_path is not None:
@@ -181,7 +188,7 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     names = [name for name in photograph_files(image_path, IMAGE_SUFFIXES) if not _odd(name)]
     if not names:
         others = "".join(f"; {kind}: {what}" for kind, what in left_out(image_path).items())
-        raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
+        raise OptionError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
     return names
 
 
@@ -266,7 +273,7 @@ class _Walk:
         self.left_out: defaultdict[str, list[str]] = defaultdict(list)
         self.ahead = deque([folder])
         self.linked = deque[Path]()
-        self.seen = {_identity(path) for path in folder.resolve().parents}
+        self.seen = {_identity(path) for path in resolved(folder).parents}
 
     def enter(self, path: Path) -> None:
         """Look through a folder, but not through those in it, if nobody has done that."""
@@ -328,26 +335,30 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
     except OSError as error:
         raise OptionError(f"{image_list_path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise ImageError(f"{image_list_path}: cannot be read ({error})") from error
-    listed = [
-        line if _is_below(image_path, line) else line.strip()  # a name may begin with a space or #
-        for line in lines
-        if _is_below(image_path, line) or (line.strip() and not line.startswith("#"))
-    ]
+        raise OptionError(f"{image_list_path}: cannot be read ({error})") from error
+    listed = []
+    for line in dict.fromkeys(lines):
+        if _is_below(image_path, line):  # a name may begin with a space or #
+            listed.append(line)
+        elif line.strip() and not line.startswith("#"):
+            listed.append(line.strip())
     if not listed:
-        raise ImageError(f"{image_list_path}: is empty")
+        raise OptionError(f"{image_list_path}: is empty")
     return checked_names(image_path, listed, str(image_list_path))
 
 
-def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[str]:
-    """Return the sorted names of images, each once; ImageError for one not below the folder."""
-    found = sorted({PurePosixPath(name).as_posix() for name in names})
+def checked_names(image_path: Path, names: Iterable[PathLike], where: str) -> list[str]:
+    """Return the sorted names of images, each once.
+
+    OptionError for one that is not below the folder, ImageError for one that lists cannot hold.
+    """
+    found = sorted({PurePosixPath(as_path(name)).as_posix() for name in names})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:
         if why := _odd(name):
             raise ImageError(f"{image_path}: {name!r}: {why}; rename it")
     if missing:
-        raise ImageError(f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}")
+        raise OptionError(f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}")
     return found
 
 

@@ -1,5 +1,6 @@
 """Reading of image files, by header before pixels, and encoding of pictures, through OpenCV."""
 
+import io
 import math
 import re
 import struct
@@ -33,13 +34,15 @@ MAX_NUM_PX = 1 << 29  # of a photograph; those of the largest cameras have 400 m
 MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
 ONE_AT_A_TIME = Lock()  # filters of warnings are of the process: threads would mix them up
 PNG = b"\x89PNG\r\n\x1a\n"
+PNM = b"P"
+MAX_PNM_HEADER = 1 << 16  # bytes, with comments; the pixels follow
 READERS = {
     b"\xff\xd8": jpeg_factory,
     PNG: PngImageFile,
     b"II": TiffImageFile,
     b"MM": TiffImageFile,
     b"BM": BmpImageFile,
-    b"P": PpmImageFile,
+    PNM: PpmImageFile,
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
 NEW_SUBFILE_TYPE, REDUCED = 254, 1  # TIFF's tag, and its bit of a smaller copy of another page
@@ -61,6 +64,8 @@ def opened(file: BinaryIO) -> Image.Image:
     """Open an image by its header; what is damaged raises nearly anything."""
     start = file.read(len(PNG))
     file.seek(0)
+    if start.startswith(PNM):  # whose header Pillow reads byte by byte
+        file = io.BytesIO(file.read(MAX_PNM_HEADER))
     return next(read for magic, read in READERS.items() if start.startswith(magic))(file, "")
 
 
@@ -78,7 +83,8 @@ def pages(path: Path) -> list[int]:
 
 
 def _tiff_pages(file: BinaryIO) -> list[int]:
-    image, found = opened(file), []
+    image = opened(file)
+    found = []
     if isinstance(image, TiffImageFile):
         for page in range(image.n_frames):
             image.seek(page)
@@ -238,7 +244,8 @@ def tones(image: NDArray[Any]) -> tuple[float, float] | None:
 def _sample(image: NDArray[Any]) -> NDArray[Any]:
     """Return some pixels of an (H, W[, 3]) image, from all over it but its frame."""
     height, width = image.shape[:2]
-    y, x = int(FRAME_FRAC * height), int(FRAME_FRAC * width)
+    y = int(FRAME_FRAC * height)
+    x = int(FRAME_FRAC * width)
     inner = image[y : height - y, x : width - x]
     step = max(1, round(math.sqrt(inner.size / NUM_TONES)))
     return inner[::step, ::step]
@@ -248,24 +255,26 @@ def range_of_floats(image: NDArray[Any]) -> tuple[float, float] | None:
     """Return what is black and white of floats that are not from 0 to 1; None for all else.
 
     Programs of measurement write floats of any range, and an image that is clipped to 0 to 1 would
-    be black or white all over.
+    be black or white all over. So do they with integers that are signed, or of 32 bits.
     """
-    if not np.issubdtype(image.dtype, np.floating):
+    if image.dtype in (np.uint8, np.uint16):
         return None
     sample = _sample(image)
     values = sample[np.isfinite(sample)]
     if not values.size:
         return None
     low, high = np.percentile(values, TONE_PERCENTILES)
-    if low >= FLOAT_RANGE[0] and high <= FLOAT_RANGE[1]:
+    is_float = np.issubdtype(image.dtype, np.floating)
+    if is_float and low >= FLOAT_RANGE[0] and high <= FLOAT_RANGE[1]:
         return None
     return float(low), float(max(high, low + np.finfo(np.float32).eps * max(abs(low), 1.0)))
 
 
 def in_eight_bits(image: NDArray[Any], black_and_white: tuple[float, float] | None = None) -> Bytes:
-    """Return an image of 8 or 16 bits or of floats in 8 bits.
+    """Return an image of integers or of floats in 8 bits.
 
-    Floats are from 0 to 1; those of another range are stretched (:func:`range_of_floats`).
+    Floats are from 0 to 1; those of another range are stretched (:func:`range_of_floats`), and so
+    are integers that are signed or of 32 bits.
     """
     black_and_white = black_and_white or range_of_floats(image)
     if black_and_white:

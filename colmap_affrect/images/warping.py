@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import ColorImage, GrayImage, Mask, Rectification
-from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
+from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.geometry.conventions import is_inside
 
@@ -84,13 +84,15 @@ def _warp_tile(source: Singles, image_from_tile: Array, size: tuple[int, int]) -
     compressions = _compressions(image_from_tile, size, source.shape[1::-1])
     density_x, density_y = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY).astype(int)
     sigma_x, sigma_y = map(_anti_aliasing_sigma, compressions, (density_x, density_y))
-    reach_x, reach_y = ceil(3 * sigma_x), ceil(3 * sigma_y)
+    reach_x = ceil(3 * sigma_x)
+    reach_y = ceil(3 * sigma_y)
     columns = np.arange(-reach_x, (size[0] - 1) * density_x + reach_x + 1) / density_x
     rows = np.arange(-reach_y, (size[1] - 1) * density_y + reach_y + 1) / density_y
     x, y, _ = _source_points(image_from_tile, columns, rows, source.shape[1::-1])
     dense = cv2.remap(source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     dense = cv2.GaussianBlur(dense, (2 * reach_x + 1, 2 * reach_y + 1), sigma_x, sigmaY=sigma_y)
-    rows_end, columns_end = dense.shape[0] - reach_y, dense.shape[1] - reach_x
+    rows_end = dense.shape[0] - reach_y
+    columns_end = dense.shape[1] - reach_x
     return np.asarray(dense[reach_y:rows_end:density_y, reach_x:columns_end:density_x])
 
 
@@ -102,7 +104,7 @@ def _compressions(
     points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = points[points @ image_from_tile[2, :2] + image_from_tile[2, 2] > 0.0]
     unit = lafs_from_keypoints(points, np.ones(len(points)), np.zeros(len(points)))
-    spans = transform_frames(image_from_tile, unit)
+    spans = transform_lafs(image_from_tile, unit)
     seen = is_inside(spans[:, :, 2], image_size)
     return np.asarray(np.linalg.norm(spans[seen, :, :2], axis=1).max(axis=0, initial=1.0))
 
@@ -123,7 +125,8 @@ def _source_points(
     ahead = third > 0.0
     third = np.where(ahead, third, 1.0)
     width, height = image_size
-    x, y = np.clip(x / third, -width, 2 * width), np.clip(y / third, -height, 2 * height)
+    x = np.clip(x / third, -width, 2 * width)
+    y = np.clip(y / third, -height, 2 * height)
     return x.astype(np.float32), y.astype(np.float32), ahead
 
 

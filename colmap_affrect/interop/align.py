@@ -6,53 +6,65 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
+from typing import Annotated, TypedDict, Unpack
 
 import numpy as np
+from pydantic import Field
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import require_inside, triangulated
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, FATAL_FOR_MAPPING
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.colmap.model_files import write_model
+from colmap_affrect.colmap.model_files import FAR, why_unusable, write_model
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.interop.consensus import agreeing
 from colmap_affrect.interop.consensus import residuals as residuals_of
 from colmap_affrect.interop.finished_models import read_finished_model
+from colmap_affrect.options import Options, Summarized, documented, takes_fields_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
-from colmap_affrect.project.paths import PathLike, TakesPaths, as_path
+from colmap_affrect.project.paths import GivenPath, PathLike, as_path
 from colmap_affrect.project.tables import read_table
 
 GEOREFERENCE = "georeference.json"  # beside a model: what COLMAP's files have no place for
 MIN_WIDTH = 0.01  # of known places across the line that fits them best, in units of its length
-METRIC, ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "altitude")
+METRIC = ("x", "y", "z")
+ON_EARTH = ("latitude", "longitude", "altitude")
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 GPS_ERROR_M = 10.0  # a position on earth that is no further off is not left out
 TABLE_ERROR = 0.02  # the same of other positions, of how far they spread
 SHOWN = 12  # residuals in the summary, the largest first
 
+Distance = Annotated[tuple[str, str, float], Field(strict=False)]  # a list, too
 Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reference(TakesPaths):
+class Reference(Options):
     """What a model is aligned to; exactly one of the first three, or distances."""
 
-    gps_database: Path | None = None  # COLMAP database with positions of the photographs
-    positions_path: Path | None = None  # CSV: name and x, y, z or latitude, longitude, altitude
-    points_path: Path | None = None  # CSV of marks: point, image, px, py; perhaps x, y, z
-    distances: tuple[tuple[str, str, float], ...] = ()  # two photographs or marks, and metres
+    gps_database: GivenPath | None = None
+    """COLMAP database with positions of the photographs."""
+    positions_path: GivenPath | None = None
+    """CSV table: ``name`` and ``x, y, z``, or ``latitude, longitude, altitude``."""
+    points_path: GivenPath | None = None
+    """CSV table of marks: ``point, image, px, py``, and where it is known ``x, y, z``."""
+    distances: Annotated[tuple[Distance, ...], Field(strict=False)] = ()
+    """Two photographs, or two marks of ``points_path``, and the metres between them."""
 
 
+@documented
 @dataclass(frozen=True)
-class Alignment:
+class Alignment(Summarized):
     """What was done."""
 
-    scale: float  # metres for a unit of the model as it was
-    residuals: Mapping[str, float]  # how far each position, point or distance is off, metres
-    left_out: Mapping[str, str] = field(default_factory=dict)  # why a position did not count
+    scale: float
+    """Metres for a unit of the model as it was."""
+    residuals: Mapping[str, float]
+    """How far each position, point or distance is off, in metres."""
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Why positions did not count."""
 
     def summary(self) -> str:
         """Return a few lines."""
@@ -68,21 +80,57 @@ class Alignment:
         return "\n".join(lines)
 
 
-def align(model_path: PathLike, output_path: PathLike, reference: Reference) -> Alignment:
+class ReferenceKeywords(TypedDict, total=False):
+    """The fields of :class:`Reference` as keywords of :func:`align`."""
+
+    gps_database: PathLike | None
+    positions_path: PathLike | None
+    points_path: PathLike | None
+    distances: Sequence[tuple[str, str, float]]
+
+
+@takes_fields_of(Reference)
+def align(
+    model_path: PathLike,
+    output_path: PathLike,
+    reference: Reference | None = None,
+    **keywords: Unpack[ReferenceKeywords],
+) -> Alignment:
     """Write a COLMAP model in metres to a new folder; the old one stays as it is.
 
     Positions and control points give scale, rotation and place, distances the scale alone. Those
-    that are no place on earth, or do not fit the others, are left out and named. ``model_path`` may
-    be the output folder of a run. Raises AffrectError when the reference is unreadable, or leaves
-    open how the model lies.
+    that are no place on earth, or do not fit the others, are left out and named.
+
+    Args:
+        model_path: folder of a model, or the output folder of a run, whose largest model it is.
+        output_path: folder to be made.
+        reference: what the model is aligned to.
+        keywords: fields of :class:`Reference`, as ``distances=[("a.jpg", "b.jpg", 2.5)]``.
+
+    Returns:
+        The scale, and how far positions, points or distances are off.
+
+    Raises:
+        AffrectError: when the reference is unreadable, or leaves open how the model lies.
     """
-    model_path, output_path = as_path(model_path), as_path(output_path)
+    model_path = as_path(model_path, "model_path")
+    output_path = as_path(output_path, "output_path")
+    return _align(
+        model_path, output_path, Reference.with_keywords(reference, keywords, "reference")
+    )
+
+
+def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignment:
+    """Align with checked arguments."""
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
-    model, origin = read_finished_model(model_path), tuple[float, ...]()
+    model = read_finished_model(model_path)
+    origin = tuple[float, ...]()
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     old = {name: image.projection_center() for name, image in images.items()}
-    true, is_on_earth, marked = Places(), False, Places()
+    true = Places()
+    is_on_earth = False
+    marked = Places()
     left_out: dict[str, str] = {}
     if reference.points_path:
         marked, true = _marked_points(model, images, reference.points_path)
@@ -102,6 +150,11 @@ def align(model_path: PathLike, output_path: PathLike, reference: Reference) -> 
         right = _without(true, left_out)
         new_from_old, residuals, origin = _similarity(old, right, is_on_earth=is_on_earth)
     model.transform(new_from_old)
+    why = why_unusable(model)
+    if not why and new_from_old.scale <= 1.0 / FAR:
+        why = "it has no extent"
+    if why:
+        raise OptionError(f"a scale of {new_from_old.scale:.3g} cannot be right: {why}")
     with new_results(output_path, names=images) as (folder,):
         write_model(model, folder)
         if origin:
@@ -257,7 +310,8 @@ def _marked_points(
             true[name] = _numbers(row, METRIC, place)
         if row.get("image", "") in images:
             image = images[row["image"]]
-            camera, mark = model.cameras[image.camera_id], _numbers(row, ("px", "py"), place)
+            camera = model.cameras[image.camera_id]
+            mark = _numbers(row, ("px", "py"), place)
             require_inside(place, mark, image.name, (camera.width, camera.height))
             marks[name][image.image_id] = mark
     views = {name: marked for name, marked in marks.items() if len(marked) > 1}

@@ -105,7 +105,9 @@ def _least_squares(errors: Callable[[Array], Array], params: Array) -> Array:
             trial = params - np.linalg.solve(normal + damping * scales, gradient)
             found = errors(trial)
             if float(found @ found) < cost:
-                params, current, cost = trial, found, float(found @ found)
+                params = trial
+                current = found
+                cost = float(found @ found)
                 damping /= 10
                 break
             damping *= 10

@@ -12,17 +12,24 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import model_folder, read_given_model, write_model
+from colmap_affrect.colmap.model_files import (
+    model_folder,
+    read_given_model,
+    refuse_panoramas,
+    write_model,
+)
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
 from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
 from colmap_affrect.images.orientation import forget_orientation
+from colmap_affrect.images.reading import header_size
 from colmap_affrect.interop.camera_models import with_camera_model
 from colmap_affrect.interop.finished_models import read_finished_model
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -47,10 +54,11 @@ class Source:
         return sorted(images, key=lambda image: str(image.name))
 
 
+@checks_arguments
 def export(
     model_path: PathLike,
     output_path: PathLike,
-    formats: Sequence[str] = (),
+    formats: str | Sequence[str] = (),
     *,
     image_path: PathLike | None = None,
     camera_model: str = "",
@@ -63,8 +71,8 @@ def export(
     Args:
         model_path: folder of a model, or the output folder of a run, whose largest model it is.
         output_path: folder for the files.
-        formats: some of ``FORMATS``; by default those of ``USUAL``, without text where COLMAP could
-            not read it back.
+        formats: one or some of ``FORMATS``, in a text separated by commas; by default those of
+            ``USUAL``, without text where COLMAP could not read it back.
         image_path: the photographs to undistort, by default those of the run.
         camera_model: of ``text`` and ``cameras``, fitted to the cameras; empty: their own.
         note: is told how well that fits.
@@ -75,14 +83,13 @@ def export(
     Raises:
         AffrectError: a format cannot hold the model, or a file exists; nothing is written then.
     """
-    model_path, output_path = model_folder(as_path(model_path)), as_path(output_path)
-    image_path = as_path(image_path) if image_path else None
-    for name in formats:
-        if name not in FORMATS:
-            raise OptionError(f"--format {name}: unknown{suggestion(name, FORMATS)}")
+    model_path = model_folder(as_path(model_path, "model_path"))
+    output_path = as_path(output_path, "output_path")
+    image_path = as_path_or_none(image_path, "image_path")
+    formats = _checked_formats(formats)
     if image_path is not None and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
-    photographs = image_path or Workspace(model_path.resolve().parent.parent).photographs()
+    photographs = image_path or Workspace(resolved(model_path).parent.parent).photographs()
     source = Source(model_path, read_finished_model(model_path), photographs)
     if not formats:
         formats = _usual(source)
@@ -98,11 +105,20 @@ def export(
     return {name: output_path / path.relative_to(folder) for name, path in written.items()}
 
 
+def _checked_formats(given: str | Sequence[str]) -> list[str]:
+    formats = given.split(",") if isinstance(given, str) else list(given)
+    for name in formats:
+        if name not in FORMATS:
+            raise OptionError(f"--format {name}: unknown{suggestion(str(name), FORMATS)}")
+    return formats
+
+
 def _change_cameras(
     model: pycolmap.Reconstruction, name: str, formats: Sequence[str], note: Callable[[str], None]
 ) -> None:
     if not {"text", "cameras"}.intersection(formats):
         raise OptionError("--camera-model: changes 'text' and 'cameras'; give one of these formats")
+    refuse_panoramas(model, "--camera-model")
     before = {key: camera.model_name for key, camera in model.cameras.items()}
     differences_px = with_camera_model(model, name)
     for old in sorted({before[key] for key in differences_px}):
@@ -162,7 +178,9 @@ def _not_in_text(name: str) -> str:
 
 def _undistorted(source: Source, folder: Path) -> Path:
     """Write undistorted photographs with their model, ready for COLMAP's patch_match_stereo."""
-    path, photographs = folder / DENSE, source.image_path
+    path = folder / DENSE
+    photographs = source.image_path
+    refuse_panoramas(source.model, "undistorted photographs")
     if photographs is None:
         raise OptionError("--image-path: give the folder of the photographs, to undistort them")
     for image in source.images():
@@ -173,6 +191,7 @@ def _undistorted(source: Source, folder: Path) -> Path:
             )
         if not (photographs / image.name).is_file():
             raise ImageError(f"{photographs / image.name}: no such photograph; give --image-path")
+        _require_size(photographs / image.name, source.model.cameras[image.camera_id])
     given = folder.parent / "model"  # a run may remove that of its folder meanwhile
     if not given.exists():
         write_model(source.model, given)
@@ -184,6 +203,17 @@ def _undistorted(source: Source, folder: Path) -> Path:
     return path
 
 
+def _require_size(path: Path, camera: pycolmap.Camera) -> None:
+    """Refuse a photograph of another size than its camera has; ImageError."""
+    size = header_size(path)
+    expected = (camera.width, camera.height)
+    if size not in (None, expected):
+        raise ImageError(
+            f"{path}: is {size[0]} x {size[1]} px, and its camera {expected[0]} x {expected[1]}; "
+            "give the photographs that the model was made of as --image-path"
+        )
+
+
 def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
@@ -193,7 +223,8 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
         raise why_not_written(path / "sparse", error) from error
     frames = []
     for image in flat.images():
-        camera, pose = flat.model.cameras[image.camera_id], np.eye(4)
+        camera = flat.model.cameras[image.camera_id]
+        pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
         pose[:3, :3] = pose[:3, :3] @ FLIP_Y_Z
         frames.append({
@@ -230,7 +261,8 @@ def _place(source: Source) -> dict[str, Any]:
     points = [point.xyz for point in source.model.points3D.values()]
     middle = np.median(points or poses[:, :, 3], axis=0)
     half = np.linalg.norm(poses[:, :, 3] - middle, axis=1).mean() / 2.64 or 1.0
-    box, up = [(middle - half).tolist(), (middle + half).tolist()], -poses[:, :, 1].mean(axis=0)
+    box = [(middle - half).tolist(), (middle + half).tolist()]
+    up = -poses[:, :, 1].mean(axis=0)
     return {"aabb_scale": 32, "aabb": box, "up": (up / np.linalg.norm(up)).tolist()}
 
 
@@ -239,7 +271,8 @@ def _cameras(source: Source, folder: Path) -> Path:
     path = folder / "cameras.csv"
     rows: list[dict[str, Any]] = []
     for image in source.images():
-        camera, center = source.model.cameras[image.camera_id], image.projection_center()
+        camera = source.model.cameras[image.camera_id]
+        center = image.projection_center()
         qx, qy, qz, qw = image.cam_from_world().rotation.inverse().quat.tolist()
         rows.append({
             "name": _no_formula(image.name), **dict(zip("xyz", center, strict=True)),

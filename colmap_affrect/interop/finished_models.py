@@ -5,6 +5,7 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import OptionError, StoreError, WorkspaceError
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 
 
@@ -17,7 +18,7 @@ def read_finished_model(folder: Path) -> pycolmap.Reconstruction:
     try:
         return read_given_model(folder)
     except (OptionError, StoreError):
-        whole = folder.resolve()
+        whole = resolved(folder)
         if any(Workspace(path).is_in_use() for path in (whole, *whole.parents[:2])):
             raise WorkspaceError(
                 f"{folder}: another colmap-affrect is writing this model; wait for it, and run the "

@@ -8,6 +8,7 @@ Matches: see :mod:`colmap_affrect.pairs.given_matches`. (0, 0) is the centre of 
 Links and data in other files are not followed, and arrays are checked.
 """
 
+import logging
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -51,36 +52,48 @@ from colmap_affrect.geometry.conventions import (
     pixel_from_colmap,
 )
 from colmap_affrect.images.photographs import CameraOptions, list_images, refuse_colliding_keys
+from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.given_matches import (
     GivenMatches,
     MatchType,
     given_matches,
 )
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
-from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.progress import Advance, GivenProgress, Progress
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.given_h5 import GivenFile, opened
 from colmap_affrect.project.outputs import leads_outside, new_results
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
 from colmap_affrect.project.stores import PairMatches, frame_datasets, hloc_matches, pair_key
 from colmap_affrect.stages.descriptors import Arrays, matched, unit_rows, write_given_matches
+
+logger = logging.getLogger(__name__)
 
 Datasets = dict[str, NDArray[Any]]
 
 SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
 
 
+@documented
 @dataclass(frozen=True)
-class InterchangeReport:
+class InterchangeReport(Summarized):
     """What was imported or exported."""
 
-    action: str  # ``imported`` or ``exported``
-    num_images: int  # in the database or the file, also those without features
+    action: str
+    """``imported`` or ``exported``."""
+    num_images: int
+    """Images in the database or the file, also those without features."""
     num_keypoints: int
+    """Keypoints of all images."""
     num_pairs: int
+    """Pairs of images with matches."""
     num_matches: int
-    num_verified: int | None  # pairs with a two-view geometry; None if not asked for
-    left_out: Mapping[str, Sequence[str]]  # names by what happened to them
+    """Matches of all pairs."""
+    num_verified: int | None
+    """Pairs with a two-view geometry; None if not asked for."""
+    left_out: Mapping[str, Sequence[str]]
+    """Names by what happened to them."""
 
     def summary(self) -> str:
         """Return a line of numbers, and one for each note."""
@@ -104,7 +117,8 @@ class _Wanted:
     verification: VerificationOptions | None  # None: pairs stay unverified
 
 
-def import_h5(
+@checks_arguments
+def import_h5(  # noqa: PLR0913 (all but three are keywords)
     image_path: PathLike,
     features_path: PathLike,
     matches_path: PathLike | None,
@@ -112,10 +126,10 @@ def import_h5(
     *,
     match_type: MatchType = "raw",
     match_list_path: PathLike | None = None,
-    cameras: CameraOptions | None = None,
+    cameras: CameraOptions | Mapping[str, Any] | None = None,
     skip_verification: bool = False,
     random_seed: int = 0,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
 ) -> InterchangeReport:
     """Make a new COLMAP database from features and matches of other programs.
 
@@ -143,15 +157,17 @@ def import_h5(
         OptionError: when the database exists.
         StoreError: for files that cannot be read, or contradict the photographs or each other.
     """
-    features_path, image_path = as_path(features_path), as_path(image_path)
-    database_path = as_path(database_path)
-    cameras = cameras or CameraOptions()
+    features_path = as_path(features_path, "features_path")
+    image_path = as_path(image_path, "image_path")
+    database_path = as_path(database_path, "database_path")
+    cameras = CameraOptions.given(cameras, "cameras")
+    progress = Progress.given(progress)
     if matches_path and match_list_path:
         raise OptionError("--match-list-path: only without --matches-path: it says what to match")
     wanted = _Wanted(
-        as_path(matches_path) if matches_path else None,
+        as_path_or_none(matches_path, "matches_path"),
         match_type,
-        as_path(match_list_path) if match_list_path else None,
+        as_path_or_none(match_list_path, "match_list_path"),
         image_path,
         None if skip_verification else VerificationOptions(random_seed=random_seed),
     )
@@ -167,7 +183,9 @@ def _import(
     progress: Progress,
 ) -> InterchangeReport:
     names = list_images(image_path)
-    InitialCameras(image_path, cameras).check(names)
+    note = InitialCameras(image_path, cameras).check(names)
+    if note:
+        logger.warning("cameras: %s", note)
     with (
         # Verification may take hours, and half a database must not be left behind.
         new_results(database_path, names=names) as (new,),
@@ -206,7 +224,9 @@ def _keys_of(features: GivenFile, names: Sequence[str], image_path: Path) -> dic
     full_names = defaultdict[str, list[str]](list)
     for name in names:
         full_names[PurePosixPath(name).name].append(name)
-    known, found, unknown = set(names), dict[str, str](), []
+    known = set(names)
+    found = dict[str, str]()
+    unknown = []
     for key in features.groups_with("keypoints"):
         alike = [key] if key in known else full_names.get(key, [])
         if len(alike) == 1:
@@ -327,7 +347,8 @@ def _write_keypoints(
     database: pycolmap.Database, image: pycolmap.Image, source: GivenFile, key: str
 ) -> None:
     """Write the keypoints of an image, if it is as large as the features were found in."""
-    name, camera = image.name, database.read_camera(image.camera_id)
+    name = image.name
+    camera = database.read_camera(image.camera_id)
     expected = (camera.width, camera.height)
     if f"{key}/image_size" in source.shapes:
         size = tuple(source.read(f"{key}/image_size", (2,)).tolist())
@@ -363,12 +384,13 @@ def _keypoint_rows(source: GivenFile, name: str) -> Singles:
         return np.column_stack([centers, sigmas, angles])
 
 
+@checks_arguments
 def export_h5(
     database_path: PathLike,
     features_path: PathLike,
     matches_path: PathLike,
     *,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
 ) -> InterchangeReport:
     """Write features and raw matches of a COLMAP database, which stays as it is, for hloc.
 
@@ -376,9 +398,11 @@ def export_h5(
     have, are 1. Of several matches of a keypoint of the first image one is kept. Raises OptionError
     when a file exists, StoreError for names that hloc's layout cannot hold.
     """
-    paths = database_path, features_path, matches_path
-    database_path, features_path, matches_path = map(as_path, paths)
-    if features_path.resolve() == matches_path.resolve():
+    database_path = as_path(database_path, "database_path")
+    features_path = as_path(features_path, "features_path")
+    matches_path = as_path(matches_path, "matches_path")
+    progress = Progress.given(progress)
+    if resolved(features_path) == resolved(matches_path):
         raise OptionError(f"{features_path}: features and matches need a file each")
     with open_copy(database_path) as database:
         images = sorted(database.read_all_images(), key=lambda image: image.name)
@@ -407,7 +431,8 @@ def _match_groups(
     for id1, id2 in pairs:
         indices = np.asarray(database.read_matches(id1, id2), np.int64)
         _, one_each = np.unique(indices[:, 0], return_index=True)
-        scores, count = np.ones(len(one_each), np.float32), database.num_keypoints_for_image(id1)
+        scores = np.ones(len(one_each), np.float32)
+        count = database.num_keypoints_for_image(id1)
         pair = PairMatches((names[id1], names[id2]), indices[one_each], scores, count)
         yield pair_key(*pair.names), hloc_matches(pair)
 

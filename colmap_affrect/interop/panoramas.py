@@ -15,9 +15,10 @@ from colmap_affrect.errors import ImageError, NoModelError, OptionError
 from colmap_affrect.images.exif import read_camera_tags
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.interop import pycolmap_api as ours
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.progress import GivenProgress, Progress
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.outputs import refuse_link
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.workspace import Workspace
 
 MATCHING = ("extract_features", "match_exhaustive", "match_sequential", "match_spatial")
@@ -54,13 +55,14 @@ class _Functions:
             )
 
 
+@checks_arguments
 def reconstruct_panoramas(
     image_path: PathLike,
     output_path: PathLike,
     *,
     order: Order = "sequence",
     random_seed: int = 0,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
 ) -> dict[int, pycolmap.Reconstruction]:
     """Reconstruct panoramas of 360 x 180 degrees.
 
@@ -71,7 +73,7 @@ def reconstruct_panoramas(
             ``sparse_equirectangular``, the views into ``images`` and ``masks``.
         order: match panoramas that follow each other by name, or all.
         random_seed: of mapping.
-        progress: where to show progress.
+        progress: True, False, or None for where somebody looks at it.
 
     Returns:
         The models of the panoramas, by the number of their folder.
@@ -81,7 +83,9 @@ def reconstruct_panoramas(
         OptionError: when ``output_path`` holds something else.
         NoModelError: when no two panoramas can be registered.
     """
-    image_path, output_path = as_path(image_path), as_path(output_path)
+    image_path = as_path(image_path, "image_path")
+    output_path = as_path(output_path, "output_path")
+    progress = Progress.given(progress)
     names = list_images(image_path)
     _check(image_path, names)
     _check_output(image_path, output_path)
@@ -143,7 +147,7 @@ def _check(image_path: Path, names: Sequence[str]) -> None:
 
 def _check_output(image_path: Path, output_path: Path) -> None:
     """Refuse to write among panoramas, or into a folder of something else."""
-    if output_path.resolve().is_relative_to(image_path.resolve()):
+    if resolved(output_path).is_relative_to(resolved(image_path)):
         raise OptionError(f"{output_path}: is in the folder of the panoramas; give another one")
     for name in ("", "images", "masks", "sparse", "sparse_equirectangular", "database.db"):
         refuse_link(output_path / name)

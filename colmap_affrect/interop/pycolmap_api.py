@@ -31,9 +31,9 @@ from colmap_affrect.mend import watched
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
-from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.progress import SILENT, Advance, GivenProgress, Progress
 from colmap_affrect.project.outputs import new_results, temporary_folder
-from colmap_affrect.project.paths import PathLike, as_path
+from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
@@ -66,10 +66,10 @@ ARGUMENTS = """
 """
 
 
-def extract_features(
+def extract_features(  # noqa: PLR0913 (arguments are those of pycolmap)
     database_path: PathLike,
     image_path: PathLike,
-    image_names: Sequence[str] = (),
+    image_names: Iterable[PathLike] = (),
     camera_mode: pycolmap.CameraMode | str = "auto",
     reader_options: pycolmap.ImageReaderOptions | Native = None,
     extraction_options: (
@@ -80,7 +80,7 @@ def extract_features(
     *,
     from_database: PathLike | None = None,
     weights_path: PathLike | None = None,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
 ) -> StageReport:
     """Extract rectified features of photographs into a COLMAP database, which may be new.
 
@@ -94,12 +94,14 @@ def extract_features(
     priors of this one, which stays as it is. ``weights_path``: folder with weights of networks.
     """
     cameras, masks = translate.reader_options(reader_options, camera_mode)
-    original = as_path(from_database) if from_database else None
-    inputs = Inputs.of(as_path(image_path), from_database=original, cameras=cameras, masks=masks)
+    original = as_path_or_none(from_database, "from_database")
+    inputs = Inputs.of(
+        as_path(image_path, "image_path"), from_database=original, cameras=cameras, masks=masks
+    )
     recipe, asked = translate.extraction_recipe(extraction_options)
-    shown = _Cancellable(progress, cancellation_token)
+    shown = _Cancellable(Progress.given(progress), cancellation_token)
     with _context(database_path, device, asked, weights_path, shown) as context:
-        report = extract(context, inputs, recipe, image_names=image_names)
+        report = extract(context, inputs, recipe, image_names=list(image_names))
     if report.failures:  # a script of pycolmap does not look at the report
         first, *_ = report.failures.values()
         warnings.warn(f"left out: {such_as(report.failures)}; the first: {first}", stacklevel=2)
@@ -120,12 +122,12 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
             *,
             random_seed: int | None = None,
             weights_path: PathLike | None = None,
-            progress: Progress = SILENT,
+            progress: GivenProgress = None,
         ) -> Reports:
             pairing: Any = translate.native(pairing_options, kind, "pairing_options")
             verification = translate.verification_options(verification_options, random_seed)
             matching, asked = translate.matching_options(matching_options)
-            shown = _Cancellable(progress, cancellation_token)
+            shown = _Cancellable(Progress.given(progress), cancellation_token)
             with _context(database_path, device, asked, weights_path, shown) as context:
                 if names := _described(context):
                     pairs = choose(context, names, pairing)
@@ -213,7 +215,8 @@ def _match_descriptors(
         raise OptionError("matching_options: descriptors of a database take NearestOptions alone")
     if refused := sorted(asked.keys() & {"guided_matching", "rig_verification"}):
         raise OptionError(f"{refused[0]}: not for descriptors of another program")
-    path, begun = context.workspace.database, time.perf_counter()
+    path = context.workspace.database
+    begun = time.perf_counter()
     refuse_unusable(path)
     listed = list(pairs)
     if asked.get("skip_image_pairs_in_same_frame"):
@@ -250,7 +253,8 @@ def _match(
         reports.append(escalate(context))
     if asked.get("rig_verification"):
         rigs = pycolmap.GeometricVerifierOptions(rig_verification=True)
-        path, native = context.workspace.database, two_view_options(verification)
+        path = context.workspace.database
+        native = two_view_options(verification)
         run_cancellable(
             lambda token: pycolmap.geometric_verification(
                 path, rigs, two_view_geometry_options=native, cancellation_token=token
@@ -264,7 +268,7 @@ def _match(
 
 def verify_matches(
     database_path: PathLike,
-    pairs_path: PathLike | None,
+    pairs_path: PathLike | None = None,
     options: GivenVerification = None,
     cancellation_token: Token = None,
 ) -> None:
@@ -274,20 +278,16 @@ def verify_matches(
     counterpart, in any database; DatabaseError where a match points at no keypoint. ``pairs_path``
     has two names per line; None stands for all pairs.
     """
-    path, pairs = as_path(database_path), None
+    path = as_path(database_path, "database_path")
+    pairs = None
     verification = translate.verification_options(options, None)
     refuse_unusable(path, FATAL_BEFORE_MAPPING, warns=True)
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
         if pairs_path is not None:
             ids = image_ids(path)
-            listed = read_pairs(as_path(pairs_path), list(ids))
+            listed = read_pairs(as_path(pairs_path, "pairs_path"), list(ids))
             pairs = {(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in listed}
         verify_database(path, verification, advance=advance, pairs=pairs)
-
-
-def verify(database_path: PathLike, options: GivenVerification = None) -> None:
-    """Do for all matched pairs what :func:`verify_matches` does for listed ones."""
-    verify_matches(database_path, None, options)
 
 
 def _of_different_frames(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
@@ -319,16 +319,20 @@ def incremental_mapping(
     """
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
     mapper = MAPPERS.make(translate.mapper_options(options))
-    database, output = as_path(database_path), as_path(output_path)
+    database = as_path(database_path, "database_path")
+    output = as_path(output_path, "output_path")
     refuse_unusable(database, FATAL_AS_IT_IS)
     with temporary_folder(output) as folder:
         existing = None
         if translate.given_path(input_path):
-            extension = Extension(as_path(input_path), not native.fix_existing_frames)
+            extension = Extension(
+                model_path=as_path(input_path),
+                refine_existing=not native.fix_existing_frames,
+            )
             existing = read_existing(extension, database)
         task = MappingTask(
             database,
-            as_path(image_path) if image_path else None,
+            as_path_or_none(image_path, "image_path"),
             extend=existing,
             cancellation=cancellation_token,
         )
@@ -380,7 +384,8 @@ class _Cancellable(Progress):
 
     def __init__(self, shown: Progress, token: Token) -> None:
         super().__init__()
-        self._shown, self._token = shown, token
+        self._shown = shown
+        self._token = token
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
@@ -407,11 +412,11 @@ def _context(
     progress: Progress,
 ) -> Iterator[Context]:
     """Lock the folder beside a database and return what the stages work with."""
-    weights = as_path(weights_path) if weights_path else None
-    resources = Resources(weights, str(getattr(device, "name", device)))
+    weights = as_path_or_none(weights_path, "weights_path")
+    resources = Resources(weights_path=weights, device=str(getattr(device, "name", device)))
     threads = asked.get("num_threads", -1)
     executor = Threads(threads) if threads > 0 else None
-    with Workspace.beside(as_path(database_path)).locked() as workspace:
+    with Workspace.beside(as_path(database_path, "database_path")).locked() as workspace:
         context = Context(workspace, resources, executor, progress)
         with watched(context):
             yield context

@@ -17,7 +17,7 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MatcherOptions
 from colmap_affrect.options import CUSTOM, flat
-from colmap_affrect.project.paths import PathLike
+from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 
 Native = TypeVar("Native")  # an option class of pycolmap
@@ -150,7 +150,8 @@ def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, M
 
 def given_path(path: PathLike) -> str:
     """Return an absolute path, or nothing for pycolmap's '.', which stands for none."""
-    return "" if Path(path) == Path() else str(Path(path).resolve())
+    given = Path() if path == "" else as_path(path)
+    return "" if given == Path() else str(resolved(given))
 
 
 def mapper_options(asked: object) -> MapperOptions:

@@ -1,8 +1,8 @@
-"""Bundle adjustment that knows what is known of the cameras.
+"""Bundle adjustment with priors on intrinsics.
 
-It minimises robust reprojection errors and, of each camera that is not held, how far focal length
-and distortion are from what is known of them beforehand. COLMAP's own adjustment has no such
-priors: where few points are seen by many images, its focal lengths run away.
+It minimises robust reprojection errors and, for each camera that is not fixed, the deviation of
+focal length and distortion from their priors. COLMAP's own adjustment has no such priors: where
+few points are seen by many images, its focal lengths run away.
 """
 
 import math
@@ -17,22 +17,33 @@ from pycolmap.cost_functions import ReprojErrorCost
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
-from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.colmap.model_files import all_see_long_tracks
 from colmap_affrect.mappers.tie_points import NONE, TiePoints
 
-USUAL_FOCAL = 1.15  # longer sides: the median of usual lenses, which are of 25 to 70 mm on film
-USUAL_SIGMA = 0.4  # deviation of the logarithm of a focal length of which nothing is known
-EXIF_SIGMA = 0.08  # the same of one by EXIF: rounded, and of another distance of focus
-DISTORTION_SIGMA = 0.07  # of the coefficients of a lens that is no fisheye
-NOISE_PX = 0.7  # standard deviation of keypoints
-UNKNOWN_SIGMA = 1e6  # of parameters that have no prior
-DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one
-MIN_LONG_TRACKS = 100  # of three images, that each image needs to do without tracks of two
-FAST, MEDIUM, FINAL = 15, 50, 300  # iterations on the way, of models to compare, and at last
-FIRST_STEPS = 3  # of an adjustment: they say nothing of those that follow
-SMALL_STEP, NUM_SMALL = 0.001, 3
-"""Steps in a row that bring less than this part of what the cost is above another one: the rest
-changes that by less than other numbers of iterations do, four per cent."""
+# Priors of intrinsics. The usual focal length and its deviation are judged on lenses of 25 to
+# 70 mm on 35 mm film; the deviation by EXIF covers rounding and the distance of focus.
+USUAL_FOCAL = 1.15  # longer sides of the image, the median
+USUAL_SIGMA = 0.4  # of the logarithm of an uncalibrated focal length
+EXIF_SIGMA = 0.08  # of the logarithm of a focal length by EXIF
+DISTORTION_SIGMA = 0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
+UNKNOWN_SIGMA = 1e6  # px, of parameters without a prior (the principal point)
+NOISE_PX = 0.7  # standard deviation of keypoints, judged on the benchmark scenes
+
+FAST = 15  # iterations while a model grows
+MEDIUM = 50  # iterations before models are compared
+FINAL = 300  # iterations of models that are kept
+FAST_TOLERANCE = 1e-5  # relative change of the cost at which Ceres ends a fast adjustment
+TOLERANCE = 1e-7  # the same of all others
+DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one (measured)
+MIN_LONG_TRACKS = 100
+"""Tracks of three images that every image needs before tracks of two are left out (judged)."""
+TIE_POINT_LOSS_SCALE = 4.0  # in deviations of keypoints: tie points pull from farther away
+
+# When a trial adjustment ends early. Judged: this changes the growth of the cost by less than
+# three times as many iterations do, four per cent.
+FIRST_STEPS = 3  # of an adjustment, which say nothing of those that follow
+SMALL_STEP = 0.001  # part of the excess over the other cost, below which a step is small
+NUM_SMALL = 3  # small steps in a row that end an adjustment
 
 
 @dataclass(frozen=True)
@@ -59,7 +70,7 @@ class FocalPrior:
         return 0.5 * (math.log(max(focal_px, 1e-9) / self.focal_px) / self.sigma) ** 2
 
 
-class Settled(pyceres.IterationCallback):  # type: ignore[misc]
+class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
     """Ends an adjustment once it is clear how far its cost stays above that of another one.
 
     That is so where the excess hardly shrinks any more, and where even all iterations that are left
@@ -70,55 +81,58 @@ class Settled(pyceres.IterationCallback):  # type: ignore[misc]
         """Begin.
 
         Args:
-            other_cost: what the cost is compared with, in nats.
-            enough: factor from which on it does not matter how much higher the cost is.
-            max_iterations: of the adjustment.
+            other_cost: Cost to compare with, as :meth:`Adjuster.adjust` returns it.
+            enough: Factor from which on it does not matter how much higher the cost is.
+            max_iterations: Limit of the adjustment.
         """
         super().__init__()
         self.other_cost = other_cost
         self.enough = enough
         self.max_iterations = max_iterations
-        self.noise_px = 1.0  # by which the solver's costs are scaled; an adjuster says it
-        self._num_small = 0  # steps in a row that brought little
+        self.noise_px = 1.0  # scale of the solver's costs; the adjuster sets it
+        self._num_small = 0  # small steps in a row
 
     def __call__(self, step: Any) -> Any:
         """See Ceres' IterationCallback."""
-        is_settled = step.iteration >= FIRST_STEPS and self._is_settled(step)
-        types = pyceres.CallbackReturnType
-        return types.SOLVER_TERMINATE_SUCCESSFULLY if is_settled else types.SOLVER_CONTINUE
+        if step.iteration >= FIRST_STEPS and self._is_clear(step):
+            return pyceres.CallbackReturnType.SOLVER_TERMINATE_SUCCESSFULLY
+        return pyceres.CallbackReturnType.SOLVER_CONTINUE
 
-    def _is_settled(self, step: Any) -> bool:
+    def _is_clear(self, step: Any) -> bool:
         if not step.step_is_successful:
             return False
         cost = step.cost / self.noise_px**2
         change = step.cost_change / self.noise_px**2
         excess = cost - self.other_cost
-        self._num_small = self._num_small + 1 if change <= SMALL_STEP * excess else 0
+        if change <= SMALL_STEP * excess:
+            self._num_small += 1
+        else:
+            self._num_small = 0
         num_left = max(0, self.max_iterations - step.iteration)
-        is_enough = cost - num_left * change >= self.enough * self.other_cost
-        return is_enough or self._num_small >= NUM_SMALL
+        lowest_cost = cost - num_left * change
+        return lowest_cost >= self.enough * self.other_cost or self._num_small >= NUM_SMALL
 
 
-def priors_of(
+def focal_priors(
     cameras: Iterable[pycolmap.Camera], records: Mapping[int, CameraRecord]
 ) -> dict[int, FocalPrior]:
-    """Return what is known of the focal lengths of cameras, by id."""
+    """Return the priors of the focal lengths of cameras, by camera id."""
     return {c.camera_id: FocalPrior.of(c, records.get(c.camera_id)) for c in cameras}
 
 
 @dataclass(frozen=True)
 class Adjuster:
-    """Adjusts models."""
+    """Adjusts models with priors on intrinsics."""
 
     priors: Mapping[int, FocalPrior]  # by camera id
     noise_px: float  # standard deviation of the keypoints, the scale of the robust loss
     refining: pycolmap.BundleAdjustmentOptions  # say which parameters of cameras are refined
     constant: frozenset[int] = frozenset()  # ids of the cameras of which nothing is refined
-    constant_frames: frozenset[int] = frozenset()  # ids of the frames that stay where they are
+    constant_frames: frozenset[int] = frozenset()  # ids of the frames whose poses are fixed
     tie_points: TiePoints = NONE  # observed by all models that have two of their images
 
-    def begin(self, model: pycolmap.Reconstruction) -> None:
-        """Give the cameras of a model that are not held the focal lengths of their priors."""
+    def set_initial_focals(self, model: pycolmap.Reconstruction) -> None:
+        """Give the cameras of a model that are not fixed the focal lengths of their priors."""
         for key, camera in model.cameras.items():
             prior = self.priors.get(key)
             if prior and prior.sigma and key not in self.constant:
@@ -129,14 +143,46 @@ class Adjuster:
         model: pycolmap.Reconstruction,
         max_iterations: int,
         image_ids: Iterable[int] | None = None,
-        settled: Settled | None = None,
+        early_stop: EarlyStop | None = None,
     ) -> float:
-        """Adjust poses, points and cameras in place; return the cost, infinite if that fails.
+        """Adjust poses, points and cameras in place.
 
-        Of some images only, the others stay, and the cameras that they share. The cost is in nats.
-        ``settled`` may end it before.
+        Args:
+            model: Changed in place.
+            max_iterations: Limit for Ceres.
+            image_ids: Images to adjust, all by default. The other images are fixed, and the
+                cameras that they share with these.
+            early_stop: May end the adjustment before it has converged.
+
+        Returns:
+            The cost in units of the variance of the keypoints, a negative log-likelihood;
+            infinite if the adjustment fails.
         """
         self.tie_points.observe(model)
+        registered = set(model.reg_image_ids())
+        images = sorted(registered if image_ids is None else set(image_ids))
+        cameras = {model.images[image_id].camera_id for image_id in images}
+        others = registered.difference(images)
+        fixed = {model.images[image_id].camera_id for image_id in others} | self.constant
+        config = self._config(model, images, cameras & fixed, fix_gauge=image_ids is None)
+        options = self._options(model)
+        problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+        self._add_tie_points(problem, model)
+        for key in sorted(cameras - fixed):
+            if problem.has_parameter_block(model.cameras[key].params):
+                self._add_prior(problem, model.cameras[key])
+        solver = _solver_options(max_iterations, len(images))
+        if early_stop:
+            early_stop.noise_px = self.noise_px
+            solver.callbacks = [early_stop]
+        summary = pyceres.SolverSummary()
+        pyceres.solve(solver, problem, summary)
+        model.update_point_3d_errors()
+        if not summary.IsSolutionUsable():
+            return math.inf
+        return float(summary.final_cost) / self.noise_px**2
+
+    def _options(self, model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentOptions:
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
         options.refine_focal_length = self.refining.refine_focal_length
         options.refine_principal_point = self.refining.refine_principal_point
@@ -144,63 +190,61 @@ class Adjuster:
         options.refine_sensor_from_rig = self.refining.refine_sensor_from_rig
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = self.noise_px
-        config, registered = pycolmap.BundleAdjustmentConfig(), set(model.reg_image_ids())
-        counts = num_long_tracks(model, {})
-        has_long = all(counts[image_id] >= MIN_LONG_TRACKS for image_id in registered)
+        has_long = all_see_long_tracks(model, model.reg_image_ids(), MIN_LONG_TRACKS)
         options.min_track_length = 3 if has_long else 2
-        images = sorted(registered if image_ids is None else set(image_ids))
-        for image_id in images:
+        return options
+
+    def _config(
+        self,
+        model: pycolmap.Reconstruction,
+        image_ids: Iterable[int],
+        fixed_cameras: Iterable[int],
+        *,
+        fix_gauge: bool,
+    ) -> pycolmap.BundleAdjustmentConfig:
+        """Return which images are adjusted, and which cameras and frames are fixed."""
+        config = pycolmap.BundleAdjustmentConfig()
+        frames = set[int]()
+        for image_id in image_ids:
             config.add_image(image_id)
-        used = {model.images[image_id].camera_id for image_id in images}
-        others = registered.difference(images)
-        held = {model.images[image_id].camera_id for image_id in others} | self.constant
-        for key in sorted(used & held):
+            frames.add(model.images[image_id].frame_id)
+        for key in sorted(fixed_cameras):
             config.set_constant_cam_intrinsics(key)
-        frames = {model.images[image_id].frame_id for image_id in images} & self.constant_frames
-        for frame_id in frames:
+        fixed_frames = frames & self.constant_frames
+        for frame_id in fixed_frames:
             config.set_constant_rig_from_world_pose(frame_id)
-        if image_ids is None and not frames:
+        if fix_gauge and not fixed_frames:
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
-        self._add_tie_points(problem, model)
-        for key in sorted(used - held):
-            if problem.has_parameter_block(model.cameras[key].params):
-                self._add_prior(problem, model.cameras[key])
-        solver = pyceres.SolverOptions()
-        solver.max_num_iterations, solver.num_threads = max_iterations, 1
-        solver.function_tolerance = 1e-5 if max_iterations <= FAST else 1e-7
-        kinds = pyceres.LinearSolverType
-        is_small = len(images) <= DENSE_LIMIT
-        solver.linear_solver_type = kinds.DENSE_SCHUR if is_small else kinds.SPARSE_SCHUR
-        if settled:
-            settled.noise_px = self.noise_px
-            solver.callbacks = [settled]
-        summary = pyceres.SolverSummary()
-        pyceres.solve(solver, problem, summary)
-        model.update_point_3d_errors()
-        usable = summary.IsSolutionUsable()
-        return float(summary.final_cost) / self.noise_px**2 if usable else math.inf
+        return config
 
     def _add_tie_points(self, problem: Any, model: pycolmap.Reconstruction) -> None:
-        """Give tie points the weight of their noise, far from where they should be, too.
+        """Add tie points once more, with the weight of their own noise.
 
-        They are points as all others before, whose loss hardly pulls from there.
+        COLMAP has added them as points like all others, whose robust loss hardly pulls where a
+        mark is far from its reprojection.
         """
         covariance = np.eye(2) * (SIGMA_PX / self.noise_px) ** 2
         for _, image_id, mark in self.tie_points.observed(model):
-            image, place = model.images[image_id], model.points3D[mark.point3D_id].xyz
-            camera, frame = model.cameras[image.camera_id], model.frames[image.frame_id]
+            image = model.images[image_id]
+            camera = model.cameras[image.camera_id]
+            frame = model.frames[image.frame_id]
             is_reference = frame.rig is None or frame.rig.is_ref_sensor(camera.sensor_id)
             if frame.rig_from_world is None or not is_reference:
                 continue
-            blocks = [place, frame.rig_from_world.params, camera.params]
+            blocks = [
+                model.points3D[mark.point3D_id].xyz,
+                frame.rig_from_world.params,
+                camera.params,
+            ]
             if all(map(problem.has_parameter_block, blocks)):
                 cost = ReprojErrorCost(camera.model, covariance, mark.xy)
-                problem.add_residual_block(cost, pyceres.CauchyLoss(4 * self.noise_px), blocks)
+                loss = pyceres.CauchyLoss(TIE_POINT_LOSS_SCALE * self.noise_px)
+                problem.add_residual_block(cost, loss, blocks)
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
         prior = self.priors[camera.camera_id]
-        focal, extra = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())
+        focal = list(camera.focal_length_idxs())
+        extra = list(camera.extra_params_idxs())
         if not prior.sigma:  # distortion alone is refined
             fixed = [*focal, *camera.principal_point_idxs()]
             if len(fixed) == len(camera.params):
@@ -208,9 +252,21 @@ class Adjuster:
             manifold = pyceres.SubsetManifold(len(camera.params), fixed)
             problem.set_manifold(camera.params, manifold)
             return
-        mean, sigma = camera.params.copy(), np.full(len(camera.params), UNKNOWN_SIGMA)
+        mean = camera.params.copy()
+        sigma = np.full(len(camera.params), UNKNOWN_SIGMA)
         mean[focal], sigma[focal] = prior.focal_px, prior.sigma * prior.focal_px
         mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
         # Reprojection errors are in px, priors in units of their deviation times the noise.
         normal = pyceres.factors.NormalPrior(mean, np.diag((sigma / self.noise_px) ** 2))
         problem.add_residual_block(normal, None, [camera.params])
+
+
+def _solver_options(max_iterations: int, num_images: int) -> Any:
+    options = pyceres.SolverOptions()
+    options.max_num_iterations = max_iterations
+    options.num_threads = 1
+    options.function_tolerance = FAST_TOLERANCE if max_iterations <= FAST else TOLERANCE
+    is_small = num_images <= DENSE_LIMIT
+    kinds = pyceres.LinearSolverType
+    options.linear_solver_type = kinds.DENSE_SCHUR if is_small else kinds.SPARSE_SCHUR
+    return options

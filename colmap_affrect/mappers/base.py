@@ -27,14 +27,24 @@ class MapperOptions(PartOptions, PresetOptions):
     ignore_two_view_tracks: bool = False
     """COLMAP's True leaves sparse sets without a model: there most tracks have two views."""
     min_model_size: Annotated[int, within(2, 1_000_000)] = 2
+    """Models of fewer images are dropped."""
     keep_given_intrinsics: bool = True
     """Leave camera parameters that the user gave as they are; refining them on a few images of a
     sparse set moves them far away."""
     random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
+    """Of all that mapping leaves to chance; -1: another one each time."""
     mapper_options: dict[str, Any] = Field(default_factory=dict)
     """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
     over those above."""
     can_extend: ClassVar[bool] = True  # register images into a finished model
+
+
+@dataclass(frozen=True)
+class RefinedIntrinsics:
+    """Which parameters of cameras are refined."""
+
+    focal_lengths: bool
+    distortion: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +55,14 @@ class MappingTask:
     image_path: Path | None  # folder of the photographs, for the colours of points
     extend: ExistingModel | None = None  # register images into this model
     # models from before pairs were matched again, the best first: mappers may begin with them
-    before: Sequence[MappedModel] = ()
+    previous_models: Sequence[MappedModel] = ()
     snapshot_path: Path | None = None  # of snapshots to go on from; mappers may leave it unused
     cancellation: pycolmap.CancellationToken | None = None  # stops mapping from outside
-    # pairs of image names that only frames verify which were not measured one by one
-    unmeasured: frozenset[tuple[str, str]] = frozenset()
+    # pairs of image names that only affine frames verify which were not measured one by one
+    unmeasured_pairs: frozenset[tuple[str, str]] = frozenset()
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)  # what is known, by id
-    may_share: bool = False  # images of one size may turn out to share a camera that nobody knows
-    # which keypoints show the same by hand, by point and image name
+    may_share: bool = False  # images of one size may turn out to share an uncalibrated camera
+    # keypoints of the tie points, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     @property
@@ -61,11 +71,14 @@ class MappingTask:
         photographs = self.image_path
         return photographs if photographs and photographs.is_dir() else self.database_path.parent
 
-    def all_given(self, options: MapperOptions) -> tuple[bool, bool]:
-        """Tell whether no focal length, and no distortion, is to be refined: the user gave all."""
-        known = self.cameras.values() if options.keep_given_intrinsics else ()
-        focals = bool(known) and all("focal" in record.given for record in known)
-        return focals, focals and all(record.is_fixed for record in known)
+    def refined_intrinsics(self, options: MapperOptions) -> RefinedIntrinsics:
+        """Return what is to be refined, of at least one camera."""
+        records = list(self.cameras.values())
+        if not records or not options.keep_given_intrinsics:
+            return RefinedIntrinsics(focal_lengths=True, distortion=True)
+        focals = not all("focal" in record.given for record in records)
+        distortion = focals or not all(record.is_fixed for record in records)
+        return RefinedIntrinsics(focals, distortion)
 
     def constant_cameras(self, options: MapperOptions) -> set[int]:
         """Return the ids of the cameras that are not to be refined.
@@ -73,13 +86,14 @@ class MappingTask:
         One whose focal length alone is given is among them where others are refined: pycolmap has
         no focal length that is fixed for some cameras only.
         """
-        all_focals, _ = self.all_given(options)
-        return {
-            key
-            for key, record in self.cameras.items()
-            if options.keep_given_intrinsics
-            and (record.is_fixed or ("focal" in record.given and not all_focals))
-        }
+        if not options.keep_given_intrinsics:
+            return set()
+        refines_focals = self.refined_intrinsics(options).focal_lengths
+        found = set[int]()
+        for key, record in self.cameras.items():
+            if record.is_fixed or (refines_focals and "focal" in record.given):
+                found.add(key)
+        return found
 
 
 @dataclass(frozen=True)
@@ -89,9 +103,9 @@ class MappedModel:
     reconstruction: pycolmap.Reconstruction
     bridges: Mapping[str, Bridge] = field(default_factory=dict)
     """By the names of images that came in by one verified pair, not by tracks of three images."""
-    moves: tuple[str, ...] = ()  # what made the model, in the words of a report
+    moves: tuple[str, ...] = ()  # hypotheses that made the model, in the words of a report
     finish: Callable[[], None] | None = None
-    """Gives the reconstruction its last points and colours; called once, after it is judged."""
+    """Gives the reconstruction its last points and colours; called once, when images are scored."""
 
 
 class Mapper(Protocol):
@@ -102,10 +116,20 @@ class Mapper(Protocol):
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
-        """Map once; ``output_path`` is an empty folder that models may be written to.
+        """Map once.
 
-        ``show`` is told how many images have been registered so far. AffrectError when COLMAP ends
-        with an error, KeyboardInterrupt after mapping has been stopped.
+        Args:
+            task: What to map.
+            output_path: An empty folder that models may be written to.
+            random_seed: For all that is left to chance.
+            show: Is told how many images have been registered so far.
+
+        Returns:
+            The models, in any order.
+
+        Raises:
+            AffrectError: When COLMAP ends with an error.
+            KeyboardInterrupt: After mapping has been stopped.
         """
 
 
@@ -118,4 +142,6 @@ MAPPERS: Registry[Mapper] = Registry(
         "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },
     default="sparse",
+    protocol=Mapper,
+    options_base=MapperOptions,
 )

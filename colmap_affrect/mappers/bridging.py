@@ -1,9 +1,10 @@
-"""Bridges: images that hang on a model by one verified pair.
+"""Bridges: images that one verified pair alone connects with a model.
 
 The pair gives rotation and direction of translation, but not the scale, since its features are
-not those whose depth the model knows. They lie beside them, though: the ratio of the model's depths
-to those of the pair at neighbouring places is the scale (:mod:`colmap_affrect.geometry.two_views`).
-What a bridge would do is judged by all other verified pairs of the images that it brings in.
+not those whose depth the model knows. They lie beside them, though: the ratio of the depths of the
+model to those of the pair, at neighbouring positions, is the scale
+(:mod:`colmap_affrect.geometry.two_views`).
+A bridge is scored by all other verified pairs of the image that it brings in.
 """
 
 from collections.abc import Iterator
@@ -28,108 +29,166 @@ from colmap_affrect.mappers.pair_graph import (
 )
 from colmap_affrect.project.report import Bridge
 
-RADIUS_FRAC = 0.03  # of the longer side of an image: places of known depth so near are neighbours
-PLANE_RADIUS = 4.0  # known depths on a plane may be so many times farther away
-MIN_AGREEING, MIN_AGREEING_SHARE = 10, 0.5
-"""A scale needs so many places that agree, and this share: right pairs have 80 %, chance 25 %."""
-FOCAL_STEP = 0.02  # change of a focal length from which on relative poses are estimated again
+# Judged on bridges of the benchmark scenes whose poses are known.
+NEIGHBOR_RADIUS = 0.03  # of the longer side of an image: known depths so near are compared
+PLANE_RADIUS_FACTOR = 4.0  # known depths on a common plane may be so many times farther away
+MIN_AGREEING = 10  # depth ratios that agree with a scale
+MIN_AGREEING_SHARE = 0.5  # of all ratios: right pairs have 0.8, chance 0.25
+FOCAL_STEP = 0.02  # of the logarithm: relative poses are estimated once for such a step
 
 
-class _Part:
-    """A model as bridges see it."""
+class _PosedModel:
+    """The poses, cameras and depths of a model."""
 
     def __init__(self, model: pycolmap.Reconstruction) -> None:
-        self.model, self.poses, self.cameras = model, poses_of(model), cameras_of(model)
+        self.model = model
+        self.poses = poses_of(model)
+        self.cameras = cameras_of(model)
         self.known_depths = cache(self._known_depths)
 
     def _known_depths(self, image_id: int) -> tuple[Array, Array]:
         """Return (K, 2) px and (K,) depths of the points that an image sees."""
         rotation, translation = self.poses[image_id]
-        points = self.model.images[image_id].get_observation_points2D()
-        places = np.array([p.xy for p in points]).reshape(-1, 2)
-        world = np.array([self.model.points3D[p.point3D_id].xyz for p in points])
-        depths = world.reshape(-1, 3) @ rotation[2] + translation[2]
-        return places[depths > 0], depths[depths > 0]
+        keypoints = self.model.images[image_id].get_observation_points2D()
+        positions = np.array([p.xy for p in keypoints]).reshape(-1, 2)
+        points = np.array([self.model.points3D[p.point3D_id].xyz for p in keypoints])
+        depths = points.reshape(-1, 3) @ rotation[2] + translation[2]
+        is_before = depths > 0
+        return positions[is_before], depths[is_before]
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class _OpenPair:
+    """A verified pair with one image in a model, and one that is not in it."""
+
+    pair: VerifiedPair
+    side: int  # index of the image in the model, 0 or 1
+    camera: pycolmap.Camera  # of the other image
+
+    @property
+    def inside(self) -> int:
+        """The id of the image in the model."""
+        return self.pair.ids[self.side]
+
+    @property
+    def outside(self) -> int:
+        """The id of the image that is not in the model."""
+        return self.pair.ids[1 - self.side]
+
+
+@dataclass(frozen=True)
+class BridgeHypothesis:
     """A bridge that could be built."""
 
     bridge: Bridge  # what would be reported
-    image_id: int  # of the image that comes in
-    pose: Pose  # of this image, in the frame of the model
+    image_id: int  # of the image that would be registered
+    pose: Pose  # cam_from_world of this image
     camera: pycolmap.Camera  # of this image
-    rank: float  # higher for what more pairs agree with, and for scales that more places agree on
+    rank: float  # weight of the pairs that agree, times the share of depths that agree
 
 
-class Bridges:
+class BridgeFinder:
     """Finds bridges between models and images of one database."""
 
     def __init__(self, graph: PairGraph, random_seed: int) -> None:
         """Begin without any pose known."""
-        self.graph, self.random_seed = graph, random_seed
-        self._relative: dict[tuple[Any, ...], list[RelativePose]] = {}
+        self.graph = graph
+        self.random_seed = random_seed
+        self._relative_poses: dict[tuple[Any, ...], list[RelativePose]] = {}
 
-    def find(self, model: pycolmap.Reconstruction) -> list[Hypothesis]:
+    def find(self, model: pycolmap.Reconstruction) -> list[BridgeHypothesis]:
         """Return all bridges from a model to other images, best first."""
-        return sorted(self._to_images(_Part(model)), key=lambda hypothesis: -hypothesis.rank)
+        posed = _PosedModel(model)
+        found = list[BridgeHypothesis]()
+        for open_pair in self._open_pairs(posed):
+            found += self._hypotheses(posed, open_pair)
+        return sorted(found, key=lambda hypothesis: -hypothesis.rank)
 
-    def _to_images(self, part: _Part) -> Iterator[Hypothesis]:
-        camera_of = {camera.camera_id: camera for camera in part.cameras.values()}
+    def _open_pairs(self, posed: _PosedModel) -> Iterator[_OpenPair]:
+        refined = {camera.camera_id: camera for camera in posed.cameras.values()}
         for pair in self.graph.pairs:
-            inside = [image_id in part.poses for image_id in pair.ids]
-            if sum(inside) != 1:
+            is_inside = [image_id in posed.poses for image_id in pair.ids]
+            if sum(is_inside) == 1:
+                side = is_inside.index(True)
+                initial = self.graph.cameras[pair.ids[1 - side]]
+                yield _OpenPair(pair, side, refined.get(initial.camera_id, initial))
+
+    def _hypotheses(self, posed: _PosedModel, open_pair: _OpenPair) -> Iterator[BridgeHypothesis]:
+        """Yield the bridges that the relative poses of a pair allow."""
+        inside = open_pair.inside
+        outside = open_pair.outside
+        camera = open_pair.camera
+        cameras = {inside: posed.cameras[inside], outside: camera}
+        for relative in self._poses_of_pair(open_pair.pair, cameras):
+            scale = self._scale(posed, open_pair, relative)
+            if scale is None:
                 continue
-            side = inside.index(True)
-            near, far = pair.ids[side], pair.ids[1 - side]
-            usual = self.graph.cameras[far]
-            camera = camera_of.get(usual.camera_id, usual)
-            for relative in self._poses(pair, {near: part.cameras[near], far: camera}):
-                scale = self._scale(part, near, side, relative)
-                if scale is None:
-                    continue
-                turn, shift = relative.pose  # cam2_from_cam1
-                if side == 1:
-                    turn, shift = turn.T, -turn.T @ shift
-                rotation, translation = part.poses[near]
-                pose = turn @ rotation, turn @ translation + scale.scale * shift
-                agreeing = self._agreeing(part, far, pose, camera)
-                if agreeing is not None:
-                    numbers = scale.num_agreeing, scale.num_ratios, scale.error_frac
-                    bridge = Bridge(self.graph.names[near], *numbers)
-                    yield Hypothesis(bridge, far, pose, camera, agreeing * scale.share)
+            pose = _chained(posed.poses[inside], relative.pose, open_pair.side, scale.scale)
+            agreeing = self._agreeing_weight(posed, outside, pose, camera)
+            if agreeing is not None:
+                bridge = Bridge(
+                    self.graph.names[inside], scale.num_agreeing, scale.num_ratios, scale.error_frac
+                )
+                yield BridgeHypothesis(bridge, outside, pose, camera, agreeing * scale.share)
 
     def _scale(
-        self, part: _Part, image_id: int, side: int, relative: RelativePose
+        self, posed: _PosedModel, open_pair: _OpenPair, relative: RelativePose
     ) -> ScaleEstimate | None:
-        """Compare the depths of a pair in an image with those that a model knows there."""
-        camera, known = part.cameras[image_id], part.known_depths(image_id)
-        radius = RADIUS_FRAC * max(camera.width, camera.height)
-        places = self.graph.keypoints[image_id][relative.matches[:, side]].astype(np.float64)
-        own = places, relative.depths[side]
-        for estimate, distance in (scale_between, radius), (scale_by_planes, PLANE_RADIUS * radius):
-            scale = estimate(known, own, distance)
-            if scale and scale.num_agreeing >= MIN_AGREEING and scale.share >= MIN_AGREEING_SHARE:
-                return scale
-        return None
+        """Compare the depths of a pair in the image of the model with those of the model."""
+        image_id = open_pair.inside
+        side = open_pair.side
+        camera = posed.cameras[image_id]
+        known = posed.known_depths(image_id)
+        keypoints = self.graph.keypoints[image_id]
+        positions = keypoints[relative.matches[:, side]].astype(np.float64)
+        own = positions, relative.depths[side]
+        radius = NEIGHBOR_RADIUS * max(camera.width, camera.height)
+        scale = scale_between(known, own, radius)
+        if not _is_certain(scale):
+            scale = scale_by_planes(known, own, PLANE_RADIUS_FACTOR * radius)
+        return scale if _is_certain(scale) else None
 
-    def _agreeing(
-        self, part: _Part, image_id: int, pose: Pose, camera: pycolmap.Camera
+    def _agreeing_weight(
+        self, posed: _PosedModel, image_id: int, pose: Pose, camera: pycolmap.Camera
     ) -> float | None:
-        """Return the weight of agreeing pairs of model and image; None where most disagree."""
-        poses, cameras = {**part.poses, image_id: pose}, {**part.cameras, image_id: camera}
-        weight = agreeing = 0.0
+        """Return the weight of the pairs that agree with an image's pose, None if most do not."""
+        poses = {**posed.poses, image_id: pose}
+        cameras = {**posed.cameras, image_id: camera}
+        total = agreeing = 0.0
         for pair in self.graph.pairs_inside(poses):
             if image_id in pair.ids:
-                own = float(np.sqrt(len(pair.matches)))
-                weight += own
-                agreeing += own * self.graph.agreement(pair, poses, cameras)
-        return agreeing if agreeing >= MIN_SHARE * weight else None
+                weight = float(np.sqrt(len(pair.matches)))
+                total += weight
+                agreeing += weight * self.graph.agreement(pair, poses, cameras)
+        return agreeing if agreeing >= MIN_SHARE * total else None
 
-    def _poses(self, pair: VerifiedPair, cameras: CameraById) -> list[RelativePose]:
+    def _poses_of_pair(self, pair: VerifiedPair, cameras: CameraById) -> list[RelativePose]:
+        """Return the relative poses of a pair; for nearly the same focal lengths the same ones."""
         focals = [cameras[image_id].mean_focal_length() for image_id in pair.ids]
-        key = (pair.ids, *np.round(np.log(focals) / FOCAL_STEP).astype(int))
-        if key not in self._relative:
-            self._relative[key] = self.graph.relative_poses(pair, cameras, self.random_seed)
-        return self._relative[key]
+        steps = np.round(np.log(focals) / FOCAL_STEP).astype(int)
+        key = (pair.ids, *steps)
+        if key not in self._relative_poses:
+            self._relative_poses[key] = self.graph.relative_poses(pair, cameras, self.random_seed)
+        return self._relative_poses[key]
+
+
+def _is_certain(scale: ScaleEstimate | None) -> bool:
+    if scale is None:
+        return False
+    return scale.num_agreeing >= MIN_AGREEING and scale.share >= MIN_AGREEING_SHARE
+
+
+def _chained(known: Pose, relative: Pose, side: int, scale: float) -> Pose:
+    """Return cam_from_world of the other image of a pair.
+
+    Args:
+        known: cam_from_world of one image.
+        relative: cam2_from_cam1 of the pair.
+        side: Which image the known one is, 0 for the first and 1 for the second.
+        scale: Length of the relative translation in units of the model.
+    """
+    rotation, translation = relative
+    if side == 1:
+        rotation, translation = rotation.T, -rotation.T @ translation
+    known_rotation, known_translation = known
+    return rotation @ known_rotation, rotation @ known_translation + scale * translation

@@ -3,11 +3,17 @@
 Models are made from some of the tracks, and adjusted by tracks of three images where these are
 enough (:mod:`colmap_affrect.mappers.adjustment`). In the end all tracks become points, each where
 its errors are smallest; poses and cameras stay as they are, to the bit.
+
+A robust loss places a point by the observations that agree, and the others leave it. Where fewer
+than two are left, the point stands where COLMAP's own adjustment puts it, which shares the errors
+among all observations: it stays if these are within COLMAP's limit then.
 """
 
+import numpy as np
 import pyceres
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.tie_points import TiePoints
 
@@ -33,15 +39,20 @@ def complete_points(
     correspondences = _correspondences(model, graph)
     manager = pycolmap.ObservationManager(model, correspondences)
     triangulator = pycolmap.IncrementalTriangulator(correspondences, model, manager)
-    mapping, finding = native.get_mapper(), native.get_triangulation()
+    mapping = native.get_mapper()
+    finding = native.get_triangulation()
     for image_id in sorted(model.reg_image_ids()):
         triangulator.triangulate_image(finding, image_id)
     triangulator.complete_all_tracks(finding)
     triangulator.merge_all_tracks(finding)
     by_hand = {mark.point3D_id for _, _, mark in tie_points.observed(model)}
-    _refine(model, by_hand, noise_px)
+    _refine(model, by_hand, pycolmap.LossFunctionType.CAUCHY, noise_px)
+    max_error_px = mapping.filter_max_reproj_error
+    failing = _failing(model, max_error_px) - by_hand
+    if failing:
+        _refine(model, model.point3D_ids() - failing, pycolmap.LossFunctionType.TRIVIAL, noise_px)
     refined = model.point3D_ids() - by_hand
-    manager.filter_points3D(mapping.filter_max_reproj_error, mapping.filter_min_tri_angle, refined)
+    manager.filter_points3D(max_error_px, mapping.filter_min_tri_angle, refined)
     model.update_point_3d_errors()
 
 
@@ -49,7 +60,8 @@ def _correspondences(
     model: pycolmap.Reconstruction, graph: PairGraph
 ) -> pycolmap.CorrespondenceGraph:
     """Return the inliers of the pairs among a model's images, but for those it contradicts."""
-    inside, against = set(model.reg_image_ids()), graph.contradicted(model)
+    inside = set(model.reg_image_ids())
+    against = graph.contradicted(model)
     found = pycolmap.CorrespondenceGraph()
     for image_id in sorted(inside):
         found.add_image(image_id, model.images[image_id].num_points2D())
@@ -60,13 +72,45 @@ def _correspondences(
     return found
 
 
-def _refine(model: pycolmap.Reconstruction, held: set[int], noise_px: float) -> None:
+def _failing(model: pycolmap.Reconstruction, max_error_px: float) -> set[int]:
+    """Return the ids of the points that have fewer than two observations within a limit."""
+    model.update_point_3d_errors()
+    found = set[int]()
+    for point_id, point in model.points3D.items():
+        if point.error * point.track.length() <= max_error_px:  # the sum: none is above
+            continue
+        errors = [_error_px(model, point, element) for element in point.track.elements]
+        num_within = sum(error <= max_error_px for error in errors)
+        if num_within < 2:
+            found.add(point_id)
+    return found
+
+
+def _error_px(
+    model: pycolmap.Reconstruction, point: pycolmap.Point3D, element: pycolmap.TrackElement
+) -> float:
+    """Return how far an observation is from its point; infinite behind the camera."""
+    image = model.images[element.image_id]
+    projected = image.project_point(point.xyz)
+    if projected is None:
+        return float("inf")
+    observed = image.points2D[element.point2D_idx].xy
+    return float(np.linalg.norm(projected - observed))
+
+
+def _refine(
+    model: pycolmap.Reconstruction,
+    held: set[int],
+    loss: pycolmap.LossFunctionType,
+    noise_px: float,
+) -> None:
     """Move the points to where their errors are smallest; poses and cameras stay, to the bit.
 
     Args:
         model: Changed in place.
         held: Ids of the points that stay, too.
-        noise_px: Scale of the robust loss, px.
+        loss: How much an error costs.
+        noise_px: Scale of the loss, px, where it is a robust one.
     """
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.refine_focal_length = False
@@ -75,16 +119,29 @@ def _refine(model: pycolmap.Reconstruction, held: set[int], noise_px: float) -> 
     options.refine_rig_from_world = False
     options.refine_sensor_from_rig = False
     options.min_track_length = 2
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_type = loss
     options.ceres.loss_function_scale = noise_px
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
     for point_id in sorted(held):
         config.add_constant_point(point_id)
+    poses = _pose_parameters(model)
+    before = [pose.copy() for pose in poses]
     problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
     solver = pyceres.SolverOptions()
     solver.max_num_iterations = MAX_ITERATIONS
     solver.num_threads = 1
     solver.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
     pyceres.solve(solver, problem, pyceres.SolverSummary())
+    for pose, known in zip(poses, before, strict=True):
+        pose[:] = known  # COLMAP makes quaternions of length 1 again, which may change a last bit
+
+
+def _pose_parameters(model: pycolmap.Reconstruction) -> list[Array]:
+    """Return the parameters of the poses of frames, and of the sensors in rigs, as the model's."""
+    poses = [model.frames[key].rig_from_world for key in sorted(model.reg_frame_ids())]
+    for rig_id in sorted(model.rigs):
+        rig = model.rigs[rig_id]  # its sensors are copies there, and the model's by their ids
+        poses += [rig.sensor_from_rig(sensor) for sensor in rig.non_ref_sensors]
+    return [pose.params for pose in poses if pose is not None]

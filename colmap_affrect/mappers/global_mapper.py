@@ -9,7 +9,7 @@ from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.native_options import Plain, resolve, set_values
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, priors_of
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, focal_priors
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 
 FLAG = "--mapper-options"
@@ -61,7 +61,21 @@ class GlobalMapper:
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
-        """See :class:`colmap_affrect.mappers.base.Mapper`; all images register at once."""
+        """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
+
+        Args:
+            task: What to map.
+            output_path: An empty folder.
+            random_seed: For all that is left to chance.
+            show: Is told the number of images at the end: all register at once.
+
+        Returns:
+            The models.
+
+        Raises:
+            OptionError: When a model is to be extended.
+            AffrectError: When COLMAP ends with an error.
+        """
         if task.extend:
             raise OptionError("--extend: the global mapper cannot; use --mapper sparse")
         native = self.native(task, random_seed)
@@ -78,19 +92,24 @@ class GlobalMapper:
             reason = " ".join(str(error).split())
             raise AffrectError(f"COLMAP's global mapper failed: {reason}") from error
         for model in models:
-            self._hold_cameras(model, task, native.mapper.bundle_adjustment)
+            self._restore_given_cameras(model, task, native.mapper.bundle_adjustment)
         show(max((model.num_reg_images() for model in models), default=0))
         return [MappedModel(model) for model in models]
 
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.GlobalPipelineOptions:
-        """Translate the options into pycolmap's, with what of a task's cameras is refined."""
+        """Translate the options into pycolmap's.
+
+        Args:
+            task: Says which parameters of cameras are refined.
+            random_seed: For all that is left to chance.
+        """
         options = self.options
-        focals_given, all_given = task.all_given(options)
+        refined = task.refined_intrinsics(options)
         values: dict[str, Plain] = {
             "min_model_size": options.min_model_size,
             "mapper.retriangulation.ignore_two_view_tracks": options.ignore_two_view_tracks,
-            "mapper.bundle_adjustment.refine_focal_length": not focals_given,
-            "mapper.bundle_adjustment.refine_extra_params": not all_given,
+            "mapper.bundle_adjustment.refine_focal_length": refined.focal_lengths,
+            "mapper.bundle_adjustment.refine_extra_params": refined.distortion,
         }
         if not options.ignore_two_view_tracks:
             values |= dict.fromkeys(TRACK_LENGTHS, 2)
@@ -102,24 +121,30 @@ class GlobalMapper:
         set_values(native, values | options.mapper_options)
         return native
 
-    def _hold_cameras(
+    def _restore_given_cameras(
         self,
         model: pycolmap.Reconstruction,
         task: MappingTask,
         options: pycolmap.BundleAdjustmentOptions,
     ) -> None:
-        """Give the cameras that are to stay their parameters back, and adjust all else."""
+        """Give the cameras that are not refined their parameters back, and adjust all else.
+
+        Args:
+            model: Changed in place.
+            task: Says which cameras were given.
+            options: Say which parameters of the other cameras are refined.
+        """
         constant = task.constant_cameras(self.options) & set(model.cameras)
         if not constant:
             return
         with open_database(task.database_path) as database:
-            given = {c.camera_id: c.params for c in cameras_of_images(database).values()}
-        has_moved = False
+            given = {c.camera_id: c.params.tolist() for c in cameras_of_images(database).values()}
+        has_changed = False
         for key in constant:
             camera = model.cameras[key]
-            if camera.params.tolist() != given[key].tolist():
-                camera.params = given[key].tolist()
-                has_moved = True
-        if has_moved:
-            priors = priors_of(model.cameras.values(), task.cameras)
+            if camera.params.tolist() != given[key]:
+                camera.params = given[key]
+                has_changed = True
+        if has_changed:
+            priors = focal_priors(model.cameras.values(), task.cameras)
             Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(model, FINAL)

@@ -1,6 +1,6 @@
 """Models that grow from a first pair, as in COLMAP's incremental mapper, and by bridges.
 
-All adjustments know what is known of the cameras (:mod:`colmap_affrect.mappers.adjustment`).
+All adjustments have priors on intrinsics (:mod:`colmap_affrect.mappers.adjustment`).
 """
 
 import copy
@@ -13,15 +13,15 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.adjustment import FAST, FINAL, MEDIUM, Adjuster
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.bridging import Bridges
-from colmap_affrect.mappers.evidence import Evidence
+from colmap_affrect.mappers.bridging import BridgeFinder
+from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import CameraById, PairGraph, PoseById, cameras_of, poses_of
 
-MIN_POINTS = 10  # of a first pair
-ALWAYS = 10  # images up to which everything is adjusted after each one
-GROWTH = 1.15  # from then on, everything is adjusted when the model has grown by this factor
-NUM_LAST_ROUNDS = 2  # of finding points anew and adjusting to the end
-MAX_TRIALS = 5  # bridges from one model that are tried before nothing more is expected to join it
+MIN_POINTS = 10  # of a first pair (judged)
+NUM_ALWAYS_ADJUSTED = 10  # images up to which each new one is followed by a global adjustment
+GROWTH = 1.15  # of the number of images from one global adjustment to the next; COLMAP has 1.1
+NUM_LAST_ROUNDS = 2  # of triangulation and adjustment at the end (judged)
+MAX_TRIALS = 5  # bridges that are built from one model before it is called complete (judged)
 
 
 class Grower:
@@ -34,8 +34,20 @@ class Grower:
         native: pycolmap.IncrementalPipelineOptions,
         show: Callable[[int], None],
     ) -> None:
-        self.graph, self.adjuster, self.native, self.show = graph, adjuster, native, show
-        self.options, self.triangulation = native.get_mapper(), native.get_triangulation()
+        """Prepare for the pairs of one graph.
+
+        Args:
+            graph: Verified pairs.
+            adjuster: Makes all adjustments.
+            native: Options of registration, triangulation and filters.
+            show: Is told how many images a model has.
+        """
+        self.graph = graph
+        self.adjuster = adjuster
+        self.native = native
+        self.show = show
+        self.options = native.get_mapper()
+        self.triangulation = native.get_triangulation()
 
     @contextmanager
     def _mapping(self, model: pycolmap.Reconstruction) -> Iterator[pycolmap.IncrementalMapper]:
@@ -45,10 +57,10 @@ class Grower:
         mapper.end_reconstruction(False)
 
     def grow(self, pair: tuple[int, int]) -> pycolmap.Reconstruction | None:
-        """Return the model that a first pair of image ids ends with, None if it makes none."""
+        """Return the model that begins with a pair of image ids, None if it makes none."""
         model = pycolmap.Reconstruction()
         with self._mapping(model) as mapper:
-            self.adjuster.begin(model)
+            self.adjuster.set_initial_focals(model)
             pose = mapper.estimate_initial_two_view_geometry(self.options, *pair)
             if pose is None:
                 return None
@@ -61,50 +73,47 @@ class Grower:
             self._complete(mapper)
         return model
 
-    def _complete(self, mapper: pycolmap.IncrementalMapper) -> None:
-        """Register images as long as there are any, and adjust all."""
-        model = mapper.reconstruction
-        adjusted = model.num_reg_images()
-        while image_id := self._register_next(mapper):
-            self._triangulate(mapper, [image_id])
-            mapper.complete_and_merge_tracks(self.triangulation)
-            count = model.num_reg_images()
-            self.show(count)
-            if count <= ALWAYS or count >= GROWTH * adjusted:
-                self._adjust(mapper, FAST)
-                adjusted = count
-            else:
-                near = mapper.find_local_bundle(self.options, image_id)
-                self._adjust(mapper, FAST, [image_id, *near])
-        self._refine(mapper, MEDIUM)
-
     def finish(self, model: pycolmap.Reconstruction, max_iterations: int = FINAL) -> None:
-        """Find points anew and adjust a model, by default to the end."""
+        """Triangulate again and adjust a model, by default until it converges.
+
+        Args:
+            model: Changed in place.
+            max_iterations: Of each adjustment.
+        """
         with self._mapping(model) as mapper:
             for _ in range(NUM_LAST_ROUNDS):
                 self._refine(mapper, max_iterations)
 
-    def fill(self, model: pycolmap.Reconstruction) -> None:
-        """Find all points of a model that some of them made, and adjust it a little."""
+    def triangulate_all(self, model: pycolmap.Reconstruction) -> None:
+        """Triangulate all tracks of a model made from some of them, and adjust it a little."""
         with self._mapping(model) as mapper:
             self._triangulate(mapper, model.reg_image_ids())
             self._refine(mapper, FAST)
 
-    def again(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    def restart_from(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """Return a new model that begins with the poses and cameras of another one."""
-        return self.placed(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
+        return self.register_at(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
 
-    def placed(
+    def register_at(
         self, poses: PoseById, cameras: CameraById, model: pycolmap.Reconstruction
     ) -> pycolmap.Reconstruction:
-        """Register images where they are said to be; grow and adjust the model from there."""
-        known = {model.images[i].camera_id for i in model.reg_image_ids()}
+        """Register images with given poses; grow and adjust the model from there.
+
+        Args:
+            poses: cam_from_world by image id; images that the model has already stay.
+            cameras: Cameras of these images, taken over where the model has not used them yet.
+            model: Changed in place; may be empty.
+
+        Returns:
+            The model.
+        """
+        used = {model.images[i].camera_id for i in model.reg_image_ids()}
         model.load(self.graph.cache)
         for image_id, (rotation, translation) in poses.items():
             image = model.images[image_id]
             if image.has_pose or image.frame is None:
                 continue
-            if image.camera_id not in known:
+            if image.camera_id not in used:
                 model.cameras[image.camera_id].params = cameras[image_id].params.tolist()
             pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
             image.frame.set_cam_from_world(image.camera_id, pose)
@@ -115,9 +124,36 @@ class Grower:
         self.show(model.num_reg_images())
         return model
 
+    def _complete(self, mapper: pycolmap.IncrementalMapper) -> None:
+        """Register images as long as there are any, and adjust all."""
+        model = mapper.reconstruction
+        num_adjusted = model.num_reg_images()
+        image_id = self._register_next(mapper)
+        while image_id:
+            self._triangulate(mapper, [image_id])
+            mapper.complete_and_merge_tracks(self.triangulation)
+            num_images = model.num_reg_images()
+            self.show(num_images)
+            is_global = num_images <= NUM_ALWAYS_ADJUSTED or num_images >= GROWTH * num_adjusted
+            if is_global:
+                self._adjust(mapper, FAST)
+                num_adjusted = num_images
+            else:
+                neighbors = mapper.find_local_bundle(self.options, image_id)
+                self._adjust(mapper, FAST, [image_id, *neighbors])
+            image_id = self._register_next(mapper)
+        self._refine(mapper, MEDIUM)
+
+    def _register_next(self, mapper: pycolmap.IncrementalMapper) -> int | None:
+        """Register one more image by points that it sees; return its id."""
+        for image_id in mapper.find_next_images(self.options, False):
+            if mapper.register_next_image(self.options, image_id):
+                return image_id
+        return None
+
     def _triangulate(self, mapper: pycolmap.IncrementalMapper, image_ids: Collection[int]) -> None:
-        """Find points of images, and of those of a rig that were taken with them."""
-        for image_id in _of_frames(mapper.reconstruction, image_ids):
+        """Triangulate images, and those that a rig took with them."""
+        for image_id in _with_frames(mapper.reconstruction, image_ids):
             mapper.triangulate_image(self.triangulation, image_id)
 
     def _refine(self, mapper: pycolmap.IncrementalMapper, max_iterations: int) -> None:
@@ -134,35 +170,49 @@ class Grower:
         self.adjuster.adjust(mapper.reconstruction, max_iterations, image_ids)
         mapper.filter_points(self.options)
 
-    def _register_next(self, mapper: pycolmap.IncrementalMapper) -> int | None:
-        """Register one more image by points that it sees; return its id."""
-        ids = mapper.find_next_images(self.options, False)
-        return next((i for i in ids if mapper.register_next_image(self.options, i)), None)
 
-
-def _of_frames(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> list[int]:
-    """Return images, each before the others of its frame, once."""
+def _with_frames(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> list[int]:
+    """Return images, each followed by the others of its frame, once."""
     found = dict[int, None]()
     for image_id in image_ids:
         found[image_id] = None
         frame = model.images[image_id].frame
-        mates = sorted(data.id for data in frame.image_ids) if frame else []
-        found |= dict.fromkeys(mates)
+        if frame:
+            same_frame = sorted(data.id for data in frame.image_ids)
+            found |= dict.fromkeys(same_frame)
     return list(found)
 
 
-def join(mapped: MappedModel, bridges: Bridges, grower: Grower, evidence: Evidence) -> MappedModel:
-    """Bridge from a model to images until nothing joins."""
-    model, built = mapped.reconstruction, dict(mapped.bridges)
-    score = evidence.of(model)
-    while True:
-        for found in bridges.find(model)[:MAX_TRIALS]:
-            place = {found.image_id: found.pose}, {found.image_id: found.camera}
-            grown = grower.placed(*place, copy.deepcopy(model))
-            new_score = evidence.of(grown)
-            if grown.num_reg_images() > model.num_reg_images() and new_score > score:
+def register_bridges(
+    mapped: MappedModel, bridges: BridgeFinder, grower: Grower, scorer: ModelScorer
+) -> MappedModel:
+    """Register images by bridges as long as that raises the score of a model.
+
+    Args:
+        mapped: The model to begin with; it stays as it is.
+        bridges: Finds the bridges to other images.
+        grower: Registers an image with the pose of a bridge, and what follows from it.
+        scorer: Decides whether the model is better with it.
+
+    Returns:
+        The model with all bridges.
+    """
+    model = mapped.reconstruction
+    score = scorer.score(model)
+    built = dict(mapped.bridges)
+    has_grown = True
+    while has_grown:
+        has_grown = False
+        for hypothesis in bridges.find(model)[:MAX_TRIALS]:
+            image_id = hypothesis.image_id
+            grown = grower.register_at(
+                {image_id: hypothesis.pose}, {image_id: hypothesis.camera}, copy.deepcopy(model)
+            )
+            grown_score = scorer.score(grown)
+            has_grown = grown.num_reg_images() > model.num_reg_images() and grown_score > score
+            if has_grown:
+                model = grown
+                score = grown_score
+                built[grower.graph.names[image_id]] = hypothesis.bridge
                 break
-        else:
-            return replace(mapped, reconstruction=model, bridges=built)
-        model, score = grown, new_score
-        built[grower.graph.names[found.image_id]] = found.bridge
+    return replace(mapped, reconstruction=model, bridges=built)

@@ -24,10 +24,14 @@ class PipelineOptions(MapperOptions):
     """Options of COLMAP's incremental pipeline."""
 
     init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
+    """Smallest angle between the rays of a point, in the first pair of images."""
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50
+    """Fewest inliers of the first pair of images."""
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12
+    """Fewest points that an image is registered by."""
     max_focal_length_ratio: Annotated[float, within(1.0, 1000.0)] = 30.0
-    """Longer sides; COLMAP's 10 leaves nothing of the photographs of a narrow lens."""
+    """Longest focal length, in longer sides of the image; COLMAP's 10 leaves nothing of the
+    photographs of a narrow lens."""
 
     COLMAP: ClassVar[Mapping[str, Any]] = {
         "ignore_two_view_tracks": True,
@@ -63,13 +67,27 @@ class IncrementalMapper:
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
-        """See :class:`colmap_affrect.mappers.base.Mapper`."""
+        """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
+
+        Args:
+            task: What to map.
+            output_path: An empty folder that models are written to.
+            random_seed: For all that is left to chance.
+            show: Is told how many images have been registered so far.
+
+        Returns:
+            The models.
+
+        Raises:
+            AffrectError: When COLMAP ends with an error.
+            KeyboardInterrupt: After mapping has been stopped.
+        """
         native = self.native(task, random_seed)
         if task.image_path is None:
             native.extract_colors = False
-        call = _Call(task, native, output_path, show, task.database_path)
+        run = _PipelineRun(task, native, output_path, show, task.database_path)
         try:
-            models = run_cancellable(call.models, task.cancellation)
+            models = run_cancellable(run.models, task.cancellation)
         except InterruptedError as error:
             raise KeyboardInterrupt from error
         except (RuntimeError, ValueError) as error:
@@ -78,23 +96,28 @@ class IncrementalMapper:
         return [MappedModel(model) for model in models]
 
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:
-        """Translate the options into pycolmap's, with what of a task's cameras is refined."""
+        """Translate the options into pycolmap's.
+
+        Args:
+            task: Says which parameters of cameras are refined.
+            random_seed: For all that is left to chance.
+        """
         options = self.options
-        focals, distortion = (not given for given in task.all_given(options))
+        refined = task.refined_intrinsics(options)
         native = pycolmap.IncrementalPipelineOptions(
             min_model_size=options.min_model_size,
             max_focal_length_ratio=options.max_focal_length_ratio,
             random_seed=random_seed,
             num_threads=1,
-            ba_refine_focal_length=focals,
-            ba_refine_extra_params=distortion,
+            ba_refine_focal_length=refined.focal_lengths,
+            ba_refine_extra_params=refined.distortion,
             constant_cameras=task.constant_cameras(options),
             mapper=dict(
                 init_min_tri_angle=options.init_min_tri_angle_deg,
                 init_min_num_inliers=options.init_min_num_inliers,
                 abs_pose_min_num_inliers=options.abs_pose_min_num_inliers,
-                abs_pose_refine_focal_length=focals,
-                abs_pose_refine_extra_params=distortion,
+                abs_pose_refine_focal_length=refined.focal_lengths,
+                abs_pose_refine_extra_params=refined.distortion,
                 random_seed=random_seed,
                 num_threads=1,
             ),
@@ -107,7 +130,7 @@ class IncrementalMapper:
 
 
 @dataclass
-class _Call:
+class _PipelineRun:
     """Calls of pycolmap that make the models of one task, and how many images they registered."""
 
     task: MappingTask
@@ -115,30 +138,40 @@ class _Call:
     output_path: Path
     show: Callable[[int], None]
     database_path: Path
-    count: int = 0
+    num_registered: int = 0
 
     def models(self, token: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
-        """Map from scratch, go on from a snapshot, or extend the model of the task."""
-        task, snapshots = self.task, self.task.snapshot_path
-        if task.extend:
-            return self._extended(task.extend, token)
-        if not snapshots or self.options.snapshot_frames_freq:  # those of the user
+        """Map from scratch, resume from a snapshot, or extend the model of the task."""
+        snapshots = self.task.snapshot_path
+        if self.task.extend:
+            return self._extended(self.task.extend, token)
+        has_own_snapshots = bool(self.options.snapshot_frames_freq)  # the user's
+        if not snapshots or has_own_snapshots:
             return self._map(token)
         self.options.snapshot_path = snapshots
         self.options.snapshot_frames_freq = SNAPSHOT_FRAMES
         snapshot = largest_snapshot(snapshots)
-        if not snapshot:
-            return self._map(token)
+        return self._resumed(snapshot, token) if snapshot else self._map(token)
+
+    def _resumed(
+        self, snapshot: Path, token: pycolmap.CancellationToken
+    ) -> list[pycolmap.Reconstruction]:
+        """Resume from a snapshot, then map the images that are not in its model."""
         self._add(len(registered_names(snapshot)))
         models = self._map(token, snapshot)
-        # After a model that is gone on with pycolmap begins no other.
-        found = {name for model in models for name in model_poses(model)}
-        self.options.image_names = sorted(image_ids(task.database_path).keys() - found)
-        return models + (self._map(token) if len(self.options.image_names) > 1 else [])
+        # pycolmap begins no other model after the one that it resumes.
+        left = set(image_ids(self.task.database_path))
+        for model in models:
+            left -= model_poses(model).keys()
+        self.options.image_names = sorted(left)
+        if len(left) > 1:
+            models += self._map(token)
+        return models
 
     def _extended(
         self, existing: ExistingModel, token: pycolmap.CancellationToken
     ) -> list[pycolmap.Reconstruction]:
+        """Triangulate the points of an existing model, then register other images."""
         existing.constrain(self.options)
         self._add(len(existing.images))
         with tempfile.TemporaryDirectory(dir=self.output_path) as name:
@@ -152,7 +185,9 @@ class _Call:
             start.write(folder)
             frames = {image.frame_id for image in existing.images}
             # COLMAP drops a model of which no pair ties some images to others.
-            models = [m for m in self._map(token, folder) if frames <= set(m.frames)] or [start]
+            models = [model for model in self._map(token, folder) if frames <= set(model.frames)]
+        if not models:
+            models = [start]
         for model in models:
             existing.restore(model)
         return models
@@ -160,21 +195,21 @@ class _Call:
     def _map(
         self, token: pycolmap.CancellationToken, input_path: Path | None = None
     ) -> list[pycolmap.Reconstruction]:
-        first = 0 if input_path else 2  # of a model that is gone on with it is told, too
+        num_initial = 0 if input_path else 2  # pycolmap also calls it for a resumed model
         models = pycolmap.incremental_mapping(
             self.database_path,
             self.task.colors_path,
             self.output_path,
             options=self.options,
             input_path=input_path or "",
-            initial_image_pair_callback=lambda: self._add(first),
+            initial_image_pair_callback=lambda: self._add(num_initial),
             next_image_callback=lambda: self._add(1),
             cancellation_token=token,
         )
         return list(models.values())
 
     def _add(self, number: int) -> None:
-        self.count += number
-        self.show(self.count)
+        self.num_registered += number
+        self.show(self.num_registered)
         if self.task.snapshot_path:
             drop_old_snapshots(self.task.snapshot_path)

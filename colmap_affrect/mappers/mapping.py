@@ -1,11 +1,12 @@
 """From a verified database to a folder of models, by any mapper.
 
-What is known of finished models is kept beside them: COLMAP's files cannot hold it all.
+A summary of each finished model is kept beside it: COLMAP's files cannot hold it all.
 """
 
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,41 +15,48 @@ from pydantic import TypeAdapter
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
-from colmap_affrect.errors import damage, made_again
+from colmap_affrect.errors import WorkspaceError, damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
-from colmap_affrect.mappers.one_view import one_views
-from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, graph_of
-from colmap_affrect.mappers.reliability import Judgement, focal_growths, judge
+from colmap_affrect.mappers.focal_observability import focal_growths
+from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, PairGraph, graph_of
+from colmap_affrect.mappers.reliability import Confidence, score_images
+from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 from colmap_affrect.mappers.snapshots import with_snapshots
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.regular_files import read_regular
-from colmap_affrect.project.report import DOUBTFUL, ModelSummary
+from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_probability
+
+MIN_PROBABILITY = 0.05
+"""Images leave their model below this probability: nineteen of twenty such poses are wrong."""
+# What was begun is removed while a call of COLMAP may still write there.
+NUM_REMOVALS = 5  # times that this is tried
+REMOVAL_INTERVAL_S = 0.05  # between them
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _SummaryFile:
     model: dict[str, str]  # digests of its files by name
     summary: ModelSummary
 
 
-_KEPT = TypeAdapter(_Kept)
+_SUMMARY_FILE = TypeAdapter(_SummaryFile)
 
 
 def write_summary(summary: ModelSummary, folder: Path) -> None:
     """Keep the summary of the model in a folder."""
-    kept = _Kept(file_digests(folder), summary)
-    replace_text(folder / SUMMARY, _KEPT.dump_json(kept, indent=2).decode())
+    content = _SummaryFile(file_digests(folder), summary)
+    replace_text(folder / SUMMARY, _SUMMARY_FILE.dump_json(content, indent=2).decode())
 
 
 def copy_with_keypoints(folder: Path, target: Path, database_path: Path) -> None:
     """Copy a model with the keypoints that the database has got since it was made.
 
     Args:
-        folder: of the model and its summary.
-        target: new folder of the copy.
-        database_path: the database of the model; new keypoints follow those that there were.
+        folder: Of the model and its summary.
+        target: New folder of the copy.
+        database_path: The database of the model; new keypoints follow those that there were.
     """
     summary = read_summary(folder)
     model = pycolmap.Reconstruction(folder)
@@ -71,7 +79,7 @@ def read_summary(folder: Path) -> ModelSummary:
     again = made_again("map", folder.parent.parent)
     mend = f"if you have edited the model, copy it to a folder of its own; then {again}"
     with damage(folder / SUMMARY, mend):
-        return _KEPT.validate_json(read_regular(folder / SUMMARY)).summary
+        return _SUMMARY_FILE.validate_json(read_regular(folder / SUMMARY)).summary
 
 
 def read_summaries(sparse_path: Path) -> list[ModelSummary]:
@@ -85,8 +93,37 @@ def model_folders(sparse_path: Path) -> list[Path]:
     return sorted((p for p in folders if p.name.isdecimal()), key=lambda p: int(p.name))
 
 
-Judgements = Mapping[str, Judgement]  # by the names of the images
-WRONG = 0.05  # probability below which an image leaves its model: nineteen of twenty are wrong
+@dataclass
+class _ScoredModel:
+    """A model and the confidence in its images."""
+
+    mapped: MappedModel
+    confidences: dict[str, Confidence] = field(default_factory=dict)  # of its images, by name
+    taken_out: dict[str, Confidence] = field(default_factory=dict)  # of images that it has lost
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Numbers of images and points."""
+        model = self.mapped.reconstruction
+        return model.num_reg_images(), model.num_points3D()
+
+
+class _Progress:
+    """Passes on by how many images the largest model has grown."""
+
+    def __init__(self, next_image: Callable[[int], None], num_images: int) -> None:
+        self.next_image = next_image
+        self.num_images = num_images
+        self._num_shown = 0
+        self._lock = threading.Lock()  # several models may grow at once
+
+    def show(self, count: int) -> None:
+        """Take the number of images of any model."""
+        with self._lock:
+            num_new = min(count, self.num_images) - self._num_shown
+            if num_new > 0:
+                self._num_shown += num_new
+                self.next_image(num_new)
 
 
 def map_database(
@@ -98,110 +135,177 @@ def map_database(
     of a model that is extended. ``sparse_path`` appears only once all models are written, and
     what was in it, perhaps the model that is extended, stays there until then.
 
-    ``next_image`` is called with the number of images registered since the last call, never more
-    than there are, also when a mapper tries several models. AffrectError when COLMAP ends with an
-    error; KeyboardInterrupt after mapping has been stopped, of which snapshots alone stay.
+    Args:
+        mapper: Makes the models.
+        task: What to map.
+        sparse_path: Folder of the models.
+        next_image: Called with the number of images registered since the last call, never more
+            than there are, also when a mapper tries several models.
+
+    Returns:
+        The summaries of the models, in their order.
+
+    Raises:
+        AffrectError: When COLMAP ends with an error.
+        KeyboardInterrupt: After mapping has been stopped, of which snapshots alone stay.
     """
-    partial, snapshots = (
-        sparse_path.with_name(sparse_path.name + end) for end in (".partial", ".snapshots")
-    )
-    remove_own([partial] if task.extend or task.before else [partial, sparse_path])
+    partial = sparse_path.with_name(sparse_path.name + ".partial")
+    snapshots = sparse_path.with_name(sparse_path.name + ".snapshots")
+    keeps_models = task.extend or task.previous_models
+    remove_own([partial] if keeps_models else [partial, sparse_path])
     num_images = len(image_ids(task.database_path))
-    most_shown, lock = 0, threading.Lock()
-
-    def show(count: int) -> None:
-        nonlocal most_shown
-        with lock:  # several models may grow at once
-            news = min(count, num_images) - most_shown
-            if news > 0:
-                most_shown += news
-                next_image(news)
-
+    progress = _Progress(next_image, num_images)
     try:
         with with_snapshots(task, mapper.options, snapshots, num_images) as whole:
             raw = partial / "raw"
             raw.mkdir(parents=True)
-            found = mapper.map(whole, raw, mapper.options.random_seed, show)
+            found = mapper.map(whole, raw, mapper.options.random_seed, progress.show)
             remove_own([raw])
-        judged = [(model, *_judged(model, task)) for model in found]
-        kept = [(model, sure, taken) for model, sure, taken in judged if sure]
-        summaries = []
-        kept.sort(key=lambda found: -found[0].reconstruction.num_points3D())
-        kept.sort(key=lambda found: -found[0].reconstruction.num_reg_images())
-        for index, (model, sure, taken) in enumerate(kept):
-            if model.finish:
-                model.finish()
-            write_model(model.reconstruction, partial / str(index))
-            summaries.append(_summary(model, sure, taken, task))
-            write_summary(summaries[-1], partial / str(index))
+        scored = [_without_wrong_images(model, task) for model in found]
+        kept = [model for model in scored if model.confidences]
+        kept.sort(key=lambda model: model.size, reverse=True)
+        summaries = _write_models(kept, task, partial)
         remove_own([sparse_path])
         partial.rename(sparse_path)
     finally:
-        remove_own([partial])
+        _remove_unfinished(partial)
     return summaries
 
 
-def _judged(mapped: MappedModel, task: MappingTask) -> tuple[Judgements, Judgements]:
-    """Take out the images that are surely wrong, the worst one first; judge what is left, and them.
+def _remove_unfinished(partial: Path) -> None:
+    """Remove what mapping has not finished; a call of COLMAP that was left may still write there.
+
+    What stays nevertheless, the next mapping removes.
+    """
+    for _ in range(NUM_REMOVALS):
+        try:
+            remove_own([partial])
+            return
+        except WorkspaceError:
+            time.sleep(REMOVAL_INTERVAL_S)
+
+
+def _write_models(
+    models: Sequence[_ScoredModel], task: MappingTask, folder: Path
+) -> list[ModelSummary]:
+    """Write models, with their last points, and their summaries.
+
+    Args:
+        models: In the order of their numbers.
+        task: What they were made from.
+        folder: Of the models.
+    """
+    summaries = list[ModelSummary]()
+    for index, model in enumerate(models):
+        path = folder / str(index)
+        if model.mapped.finish:
+            model.mapped.finish()
+        write_model(model.mapped.reconstruction, path)
+        summary = _summary(model, task)
+        write_summary(summary, path)
+        summaries.append(summary)
+    return summaries
+
+
+def _without_wrong_images(mapped: MappedModel, task: MappingTask) -> _ScoredModel:
+    """Take out the images that are surely wrong, the worst one first, and score all.
 
     The reconstruction itself is changed; nothing is left of it with fewer than two images. Of a rig
     all images leave that were taken at once. Those of a model that is extended stay.
     """
-    model, taken = mapped.reconstruction, dict[str, Judgement]()
-    growths, are_new = focal_growths(model, task), True
+    model = mapped.reconstruction
+    scored = _ScoredModel(mapped)
+    growths = focal_growths(model, task)
+    is_stale = False  # growths are of a model with a few images more
     while model.num_reg_images() > 1:
-        found = _best_of_frames(model, judge(mapped, task, growths))
-        name = min(found, key=lambda name: found[name].probability)
-        if task.extend or found[name].probability >= WRONG:
-            if are_new:
-                return found, taken
-            growths, are_new = focal_growths(model, task), True
-            continue
-        are_new = False
-        frame_id = model.find_image_with_name(name).frame_id
-        for image in model.images.values():
-            if image.frame_id == frame_id and image.has_pose:
-                taken[image.name] = found[name]
-        model.deregister_frame(frame_id)
-    return {}, taken
+        confidences = _best_of_frames(model, score_images(mapped, task, growths))
+        worst = min(confidences, key=lambda name: confidences[name].probability)
+        is_wrong = confidences[worst].probability < MIN_PROBABILITY and not task.extend
+        if is_wrong:
+            for name in _deregister(model, worst):
+                scored.taken_out[name] = confidences[worst]
+            is_stale = True
+        elif is_stale:
+            growths = focal_growths(model, task)
+            is_stale = False
+        else:
+            scored.confidences = confidences
+            return scored
+    return scored
 
 
-def _best_of_frames(model: pycolmap.Reconstruction, found: Judgements) -> Judgements:
-    """Return of each image the judgement of the surest one that a rig took with it.
+def _deregister(model: pycolmap.Reconstruction, name: str) -> list[str]:
+    """Deregister an image with all that a rig took with it; return their names."""
+    frame_id = model.find_image_with_name(name).frame_id
+    names = list[str]()
+    for image in model.images.values():
+        if image.frame_id == frame_id and image.has_pose:
+            names.append(image.name)
+    model.deregister_frame(frame_id)
+    return names
 
-    A rig is rigid: where one of its images stands right, the others do, which may see next to
-    nothing.
+
+def _best_of_frames(
+    model: pycolmap.Reconstruction, confidences: Mapping[str, Confidence]
+) -> dict[str, Confidence]:
+    """Return for each image the confidence in the surest one that a rig took with it.
+
+    A rig is rigid: where the pose of one of its images is right, that of the others is, which may
+    see next to nothing.
     """
-    best = dict[int, Judgement]()
-    frames = {name: model.find_image_with_name(name).frame_id for name in found}
-    for name, judgement in found.items():
+    frames = {name: model.find_image_with_name(name).frame_id for name in confidences}
+    best = dict[int, Confidence]()
+    for name, confidence in confidences.items():
         known = best.get(frames[name])
-        if not known or judgement.probability > known.probability:
-            best[frames[name]] = judgement
+        if not known or confidence.probability > known.probability:
+            best[frames[name]] = confidence
     return {name: best[frame_id] for name, frame_id in frames.items()}
 
 
-def _summary(
-    mapped: MappedModel, found: Judgements, taken: Judgements, task: MappingTask
-) -> ModelSummary:
+def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
     """Count what a model holds, and say how sure it is of each photograph."""
-    model = mapped.reconstruction
-    inside, graph = set(model.reg_image_ids()), graph_of(task, MIN_NUM_MATCHES)
-    images = [model.images[image_id] for image_id in sorted(inside)]
-    alike = sorted(one_views(graph, task.image_path))
-    focals = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
+    model = scored.mapped.reconstruction
+    graph = graph_of(task, MIN_NUM_MATCHES)
+    confidences = scored.confidences
+    images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    focals_px = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
+    bridges = scored.mapped.bridges
+    everybody = {**scored.taken_out, **confidences}
+    probabilities = {}
+    doubtful = {}
+    unsure = {}
+    for name, one in confidences.items():
+        kept = kept_probability(one.probability)
+        probabilities[name] = kept
+        if kept < DOUBTFUL:
+            doubtful[name] = one.reason
+        elif kept < SURE:
+            unsure[name] = one.reason
     return ModelSummary(
-        registered_names=tuple(sorted(focals)),
+        registered_names=tuple(sorted(focals_px)),
         num_points3D=model.num_points3D(),
         mean_track_length=float(model.compute_mean_track_length()),
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
-        probabilities={name: round(one.probability, 3) for name, one in found.items()},
-        gains={name: round(one.gain, 3) for name, one in {**taken, **found}.items()},
-        doubtful={name: one.reason for name, one in found.items() if one.probability < DOUBTFUL},
-        bridges={name: one for name, one in mapped.bridges.items() if name in focals},
-        taken_out={name: one.reason for name, one in taken.items()},
-        focals_px=focals,
-        moves=mapped.moves,
+        probabilities=probabilities,
+        gains={name: round(one.gain, 3) for name, one in everybody.items()},
+        doubtful=doubtful,
+        unsure=unsure,
+        bridges={name: bridge for name, bridge in bridges.items() if name in focals_px},
+        taken_out={name: one.reason for name, one in scored.taken_out.items()},
+        focals_px=focals_px,
+        moves=scored.mapped.moves,
         tie_points=tie_points_of(task, graph).report(model),
-        one_view=tuple((graph.names[a], graph.names[b]) for a, b in alike if inside >= {a, b}),
+        one_view=_same_viewpoint_names(model, graph, task),
     )
+
+
+def _same_viewpoint_names(
+    model: pycolmap.Reconstruction, graph: PairGraph, task: MappingTask
+) -> tuple[tuple[str, str], ...]:
+    """Return the names of pairs in a model that were taken from the same viewpoint."""
+    registered = set(model.reg_image_ids())
+    found = list[tuple[str, str]]()
+    for first, second in sorted(same_viewpoint_pairs(graph, task.image_path)):
+        if first in registered and second in registered:
+            found.append((graph.names[first], graph.names[second]))
+    return tuple(found)

@@ -1,9 +1,10 @@
 """The verified pairs of a database, and how well poses agree with them."""
 
 import copy
+import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Self
@@ -27,16 +28,16 @@ Ids = tuple[int, int]  # of two images
 PoseById = Mapping[int, Pose]
 CameraById = Mapping[int, pycolmap.Camera]  # by image id
 
-MAX_ERROR_PX, MAX_ERROR = 4.0, 0.003
-"""An inlier agrees with poses up to this Sampson error, or this part of the longer side if that is
-more: COLMAP's limit for observations, and what features of a shrunk photograph allow."""
-MIN_ANGLE_DEG = 1.0  # rays closer to parallel tell no depth, nor which side of a camera a point is
-MAX_MATCHES, MAX_TRIALS = 500, 1000
-"""What agreement is measured with and relative poses estimated from: of inliers few are enough."""
-MAX_PAIRS_OF_IMAGE = 15
-"""An image's pairs with fewer inliers have no say, unless they are among those of the other one."""
-MIN_NUM_MATCHES = 15  # pairs with fewer inliers are left out, as by COLMAP's mappers
-MIN_SHARE = 0.5  # a pair speaks for poses when at least this share of its inliers agrees
+# An inlier agrees with poses up to this Sampson error, the larger of the two.
+MAX_ERROR_PX = 4.0  # COLMAP's limit for observations (filter_max_reproj_error)
+MAX_ERROR = 0.003  # of the longer side: features of a shrunk photograph (judged)
+MIN_ANGLE_DEG = 1.0
+"""Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
+MAX_MATCHES = 500  # inliers of a pair that are sampled for agreement and relative poses
+MAX_TRIALS = 1000  # of RANSAC, for a relative pose
+MAX_PAIRS_OF_IMAGE = 15  # the strongest of each image that models are scored by (judged)
+MIN_NUM_MATCHES = 15  # inliers of a pair; COLMAP's min_num_matches
+MIN_SHARE = 0.5  # of the inliers of a pair: fewer that agree contradict poses
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,23 @@ class RelativePose:
     depths: tuple[Array, Array]  # of these in both cameras, twice (M,), all positive
 
 
+@dataclass(frozen=True)
+class _Agreement:
+    """Which matches agree with a relative pose."""
+
+    agrees: Bools  # (M,)
+    depths: Depths  # of all matches
+
+
+@dataclass(frozen=True, eq=False)
+class _KnownAgreement:
+    """The agreement of a pair, and what it was computed of."""
+
+    pair: VerifiedPair
+    asked: bytes  # its poses and cameras, see _bytes_of
+    share: float  # of its inliers
+
+
 @dataclass(frozen=True, eq=False)
 class PairGraph:
     """The verified pairs of a database, of each image the strongest."""
@@ -71,67 +89,78 @@ class PairGraph:
     pairs: Pairs  # sorted by ids
     weak: Pairs  # that are not among the strongest, and in the cache only
     min_num_matches: int  # pairs with fewer inliers are left out
+    _agreements: dict[Ids, _KnownAgreement] = field(default_factory=dict, init=False, repr=False)
+    """The last agreement of each pair: models are looked at several times."""
 
     @classmethod
     def read(cls, path: Path, min_num_matches: int = MIN_NUM_MATCHES) -> Self:
-        """Read the pairs with at least as many inliers, and all images."""
+        """Read the verified pairs and all images of a database.
+
+        Args:
+            path: The database.
+            min_num_matches: Pairs with fewer inliers are left out.
+        """
+        options = pycolmap.DatabaseCacheOptions(
+            min_num_matches=min_num_matches, load_all_images=True
+        )
         with open_database(path) as database:
             names = {image.image_id: image.name for image in database.read_all_images()}
             cameras = cameras_of_images(database)
-            verified = [
-                VerifiedPair(
-                    pycolmap.pair_id_to_image_pair(pair_id),
-                    np.asarray(geometry.inlier_matches, np.int64),
-                    geometry,
-                )
-                for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
-                if len(geometry.inlier_matches) >= min_num_matches
-            ]
-            options = pycolmap.DatabaseCacheOptions(
-                min_num_matches=min_num_matches, load_all_images=True
-            )
+            verified = _read_pairs(database, min_num_matches)
             cache = pycolmap.DatabaseCache.create(database, options)
-            keypoints = {
-                image_id: np.array(database.read_keypoints(image_id)[:, :2], np.float32)
-                for image_id in {image_id for pair in verified for image_id in pair.ids}
-            }
-        return cls(cache, names, cameras, keypoints, *_strongest(verified), min_num_matches)
+            keypoints = {}
+            for image_id in _images_of(verified):
+                rows = database.read_keypoints(image_id)
+                keypoints[image_id] = np.array(rows[:, :2], np.float32)
+        strong, weak = _strongest(verified)
+        return cls(cache, names, cameras, keypoints, strong, weak, min_num_matches)
 
     def without(self, ids: Collection[Ids]) -> Self:
-        """Leave out some pairs; itself where there are none."""
+        """Leave out some pairs; return the same graph where there are none."""
+        if not ids:
+            return self
         kept = [pair for pair in self.verified if pair.ids not in ids]
-        return self._with(kept, self.cache) if ids else self
+        return self._with(kept, self.cache)
 
     @property
     def verified(self) -> Pairs:
-        """All pairs, also those that have no say."""
+        """All pairs, also those that are not among the strongest."""
         return self.pairs + self.weak
 
     @cached_property
     def most_connected(self) -> frozenset[int]:
-        """The images that pairs connect with the most others."""
-        parts = connected_parts(pair.ids for pair in self.pairs)
-        return frozenset(parts[0] if parts else ())
+        """The images of the largest connected component."""
+        components = connected_parts(pair.ids for pair in self.pairs)
+        return frozenset(components[0] if components else ())
 
     def with_cameras(self, records: Mapping[int, CameraRecord]) -> Self:
         """Give images the cameras that records say they have, of those of the graph."""
-        camera_of = {name: key for key, record in records.items() for name in record.names}
+        camera_of = {}
+        for key, record in records.items():
+            for name in record.names:
+                camera_of[name] = key
         cache = _empty_copy(self.cache, camera_of)
-        cameras = {i: cache.cameras[image.camera_id] for i, image in cache.images.items()}
-        return replace(self._with(self.verified, cache), cameras={**self.cameras, **cameras})
+        cameras = {**self.cameras}
+        for image_id, image in cache.images.items():
+            cameras[image_id] = cache.cameras[image.camera_id]
+        return replace(self._with(self.verified, cache), cameras=cameras)
 
     def thinned(self) -> Self:
         """Leave out tracks where the others tell the poses as well; itself where they are few.
 
         See :mod:`colmap_affrect.mappers.thinning`.
         """
-        pairs = self.verified
-        numbers = {i: len(points) for i, points in self.keypoints.items()}
-        kept = matches_of_best_tracks([(pair.ids, pair.matches) for pair in pairs], numbers)
-        if 2 * sum(map(np.sum, kept)) > sum(map(len, kept)):
+        matches = [(pair.ids, pair.matches) for pair in self.verified]
+        num_keypoints = {i: len(points) for i, points in self.keypoints.items()}
+        kept_matches = matches_of_best_tracks(matches, num_keypoints)
+        num_kept = sum(map(np.sum, kept_matches))
+        num_all = sum(map(len, kept_matches))
+        if 2 * num_kept > num_all:
             return self
-        some = (replace(p, matches=p.matches[k]) for p, k in zip(pairs, kept, strict=True))
-        return self._with(some, self.cache)
+        thin = list[VerifiedPair]()
+        for pair, kept in zip(self.verified, kept_matches, strict=True):
+            thin.append(replace(pair, matches=pair.matches[kept]))
+        return self._with(thin, self.cache)
 
     def _with(self, verified: Iterable[VerifiedPair], cache: pycolmap.DatabaseCache) -> Self:
         """Return a graph of other pairs, with the cameras and images of a cache."""
@@ -142,24 +171,30 @@ class PairGraph:
             geometry.inlier_matches = pair.matches.astype(np.uint32)
             new.correspondence_graph.add_two_view_geometry(*pair.ids, geometry)
         new.correspondence_graph.finalize()
-        used = {image_id for pair in kept for image_id in pair.ids}
+        used = _images_of(kept)
         keypoints = {i: points for i, points in self.keypoints.items() if i in used}
         strong, weak = _strongest(kept)
         return replace(self, cache=new, keypoints=keypoints, pairs=strong, weak=weak)
 
-    def points(self, pair: VerifiedPair, step: int = 1) -> tuple[Array, Array]:
-        """Return the (M, 2) px in both images of the inliers, or of every so many."""
-        columns = zip(pair.ids, pair.matches[::step].T, strict=True)
-        first, second = (self.keypoints[i][rows].astype(np.float64) for i, rows in columns)
-        return first, second
+    def points(self, pair: VerifiedPair) -> tuple[Array, Array]:
+        """Return the (M, 2) px of the inliers in both images."""
+        return self._points(pair, pair.matches)
+
+    def _sampled_points(self, pair: VerifiedPair) -> tuple[Array, Array]:
+        step = sampling_step(len(pair.matches), MAX_MATCHES)
+        return self._points(pair, pair.matches[::step])
+
+    def _points(self, pair: VerifiedPair, matches: Indices) -> tuple[Array, Array]:
+        first, second = pair.ids
+        points1 = self.keypoints[first][matches[:, 0]]
+        points2 = self.keypoints[second][matches[:, 1]]
+        return points1.astype(np.float64), points2.astype(np.float64)
 
     def sizes(self, ids: Ids) -> tuple[Size, Size]:
         """Return the sizes of the images of a pair."""
-        first, second = (self.cameras[image_id] for image_id in ids)
+        first = self.cameras[ids[0]]
+        second = self.cameras[ids[1]]
         return (first.width, first.height), (second.width, second.height)
-
-    def _some_points(self, pair: VerifiedPair) -> tuple[Array, Array]:
-        return self.points(pair, -(-len(pair.matches) // MAX_MATCHES))
 
     def pairs_inside(self, image_ids: Collection[int]) -> list[VerifiedPair]:
         """Return the pairs both of whose images are among some."""
@@ -167,55 +202,81 @@ class PairGraph:
         return [pair for pair in self.pairs if inside.issuperset(pair.ids)]
 
     def agreement(self, pair: VerifiedPair, poses: PoseById, cameras: CameraById) -> float:
-        """Return the share of the inliers of a pair that agree with the poses of its images."""
+        """Return the share of the inliers of a pair that agree with poses, from a sample of them.
+
+        Args:
+            pair: A pair of the graph.
+            poses: cam_from_world of both images, by image id.
+            cameras: Cameras of both images, by image id.
+        """
         first, second = pair.ids
-        pose, both = relative_pose(poses[first], poses[second]), (cameras[first], cameras[second])
-        return float(_agrees(pose, both, self._some_points(pair))[0].mean())
+        both = cameras[first], cameras[second]
+        asked = _bytes_of((*poses[first], *poses[second]), both)
+        known = self._agreements.get(pair.ids)
+        if known and known.pair is pair and known.asked == asked:
+            return known.share
+        pose = relative_pose(poses[first], poses[second])
+        share = float(_agreement(pose, both, self._sampled_points(pair)).agrees.mean())
+        self._agreements[pair.ids] = _KnownAgreement(pair, asked, share)
+        return share
 
     def unexplained_by(self, model: pycolmap.Reconstruction) -> list[VerifiedPair]:
         """Return the pairs that contradict a model, or have an image that it has not."""
-        inside, against = set(model.reg_image_ids()), self.contradicted(model)
+        inside = set(model.reg_image_ids())
+        against = self.contradicted(model)
         return [p for p in self.pairs if p.ids in against or not inside.issuperset(p.ids)]
 
     def contradicted(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
         """Return the pairs most of whose inliers disagree with a model that has both images."""
-        poses, cameras = poses_of(model), cameras_of(model)
-        return frozenset(
-            pair.ids
-            for pair in self.pairs_inside(poses)
-            if self.agreement(pair, poses, cameras) < MIN_SHARE
-        )
+        poses = poses_of(model)
+        cameras = cameras_of(model)
+        found = set[Ids]()
+        for pair in self.pairs_inside(poses):
+            if self.agreement(pair, poses, cameras) < MIN_SHARE:
+                found.add(pair.ids)
+        return frozenset(found)
 
     def relative_poses(
         self, pair: VerifiedPair, cameras: CameraById, random_seed: int
     ) -> list[RelativePose]:
         """Return the relative poses that explain a pair, the likeliest one first.
 
-        That of its essential matrix, and the ones into which its homography can be decomposed:
-        of a plane seen twice both solutions may have all points before both cameras, so that only
-        other pairs can tell which one is right.
+        The first one is of its essential matrix, the others are those into which its homography
+        can be decomposed: of a plane seen twice both solutions may have all points before both
+        cameras, so that only other pairs can tell which one is right.
+
+        Args:
+            pair: A pair of the graph.
+            cameras: Cameras of both images, by image id.
+            random_seed: For RANSAC.
         """
         both = cameras[pair.ids[0]], cameras[pair.ids[1]]
+        allowed = list[RelativePose]()
+        for pose in self._candidate_poses(pair, both, random_seed):
+            found = _agreement(pose, both, self.points(pair))
+            has_depth = found.agrees & (found.depths.angles_deg > MIN_ANGLE_DEG)
+            if found.agrees.mean() >= MIN_SHARE and has_depth.any():
+                depths = found.depths.first[has_depth], found.depths.second[has_depth]
+                allowed.append(RelativePose(pose, pair.matches[has_depth], depths))
+        return allowed
+
+    def _candidate_poses(
+        self, pair: VerifiedPair, cameras: Cameras, random_seed: int
+    ) -> list[Pose]:
         options = pycolmap.RANSACOptions(
             max_error=MAX_ERROR_PX, max_num_trials=MAX_TRIALS, random_seed=max(random_seed, 0)
         )
+        candidates = list[Pose]()
         # Not by a two-view geometry, which where a fundamental matrix has more inliers is that.
-        found: Any = pycolmap.estimate_essential_matrix(*self._some_points(pair), *both, options)
-        candidates = []
+        points = self._sampled_points(pair)
+        found: Any = pycolmap.estimate_essential_matrix(*points, *cameras, options)
         if found and found.get("cam2_from_cam1") is not None:
             matrix = found["cam2_from_cam1"].matrix()
             candidates.append((matrix[:, :3], matrix[:, 3]))
         homography = homography_matrix(pair.geometry)
         if homography is not None:
-            candidates += decomposed_homography(homography, both)
-        allowed = []
-        for pose in candidates:
-            agrees, depths = _agrees(pose, both, self.points(pair))
-            known = agrees & (depths.angles_deg > MIN_ANGLE_DEG)
-            if agrees.mean() >= MIN_SHARE and known.any():
-                kept = depths.first[known], depths.second[known]
-                allowed.append(RelativePose(pose, pair.matches[known], kept))
-        return allowed
+            candidates += decomposed_homography(homography, cameras)
+        return candidates
 
 
 @lru_cache(maxsize=1)
@@ -226,8 +287,11 @@ def graph_of(task: MappingTask, min_num_matches: int) -> PairGraph:
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[int, Pose]:
     """Return cam_from_world of the registered images by image id."""
-    matrices = {i: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}
-    return {image_id: (matrix[:, :3], matrix[:, 3]) for image_id, matrix in matrices.items()}
+    poses = {}
+    for image_id in model.reg_image_ids():
+        matrix = model.image(image_id).cam_from_world().matrix()
+        poses[image_id] = matrix[:, :3], matrix[:, 3]
+    return poses
 
 
 def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
@@ -240,22 +304,58 @@ def has_rigs(model: pycolmap.Reconstruction) -> bool:
     return any(rig.num_sensors() > 1 for rig in model.rigs.values())
 
 
-def _agrees(pose: Pose, cameras: Cameras, points: tuple[Array, Array]) -> tuple[Bools, Depths]:
-    """Return which matches agree with a relative pose, and their depths."""
-    rays1, rays2 = (
-        np.asarray(camera.cam_from_img(part), np.float64)
-        for camera, part in zip(cameras, points, strict=True)
-    )
+def _bytes_of(arrays: Iterable[Array], cameras: Cameras) -> bytes:
+    """Return what tells poses and cameras from others, to the bit."""
+    parts = [np.asarray(values).tobytes() for values in arrays]
+    for camera in cameras:
+        numbers = [camera.model.value, camera.width, camera.height, *camera.params]
+        parts.append(np.array(numbers, np.float64).tobytes())
+    return b"".join(parts)
+
+
+def sampling_step(num_items: int, max_num: int) -> int:
+    """Return the step with which at most so many items are taken, 1 where there are no more."""
+    return max(1, math.ceil(num_items / max_num))
+
+
+def _agreement(pose: Pose, cameras: Cameras, points: tuple[Array, Array]) -> _Agreement:
+    """Compare matches with a relative pose.
+
+    Args:
+        pose: cam2_from_cam1.
+        cameras: Of both images.
+        points: Px in both images, twice (M, 2).
+    """
+    first, second = cameras
+    rays1 = np.asarray(first.cam_from_img(points[0]), np.float64)
+    rays2 = np.asarray(second.cam_from_img(points[1]), np.float64)
     with np.errstate(all="ignore"):  # of cameras that are impossible
         depths = triangulated_depths(*pose, rays1, rays2)
-        focal1, focal2 = (np.float64(camera.mean_focal_length()) for camera in cameras)
+        focal1 = np.float64(first.mean_focal_length())
+        focal2 = np.float64(second.mean_focal_length())
         # Sampson errors are of px when rays are scaled by the focal lengths.
-        scale1, scale2 = (np.diag([1 / focal, 1 / focal, 1.0]) for focal in (focal1, focal2))
+        scale1 = np.diag([1 / focal1, 1 / focal1, 1.0])
+        scale2 = np.diag([1 / focal2, 1 / focal2, 1.0])
         fundamental = scale2 @ essential_matrix(*pose) @ scale1
         errors = sampson_errors(fundamental, focal1 * rays1, focal2 * rays2)
-    sides = depths.in_front | (depths.angles_deg < MIN_ANGLE_DEG)
-    tolerance = max(MAX_ERROR_PX, *(MAX_ERROR * max(c.width, c.height) for c in cameras))
-    return (errors <= tolerance) & sides, depths
+    longer_sides = [max(camera.width, camera.height) for camera in cameras]
+    tolerance = max(MAX_ERROR_PX, *(MAX_ERROR * side for side in longer_sides))
+    is_possible = depths.in_front | (depths.angles_deg < MIN_ANGLE_DEG)
+    return _Agreement((errors <= tolerance) & is_possible, depths)
+
+
+def _read_pairs(database: pycolmap.Database, min_num_matches: int) -> list[VerifiedPair]:
+    verified = list[VerifiedPair]()
+    for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        matches = np.asarray(geometry.inlier_matches, np.int64)
+        if len(matches) >= min_num_matches:
+            ids = pycolmap.pair_id_to_image_pair(pair_id)
+            verified.append(VerifiedPair(ids, matches, geometry))
+    return verified
+
+
+def _images_of(pairs: Iterable[VerifiedPair]) -> set[int]:
+    return {image_id for pair in pairs for image_id in pair.ids}
 
 
 def _strongest(pairs: Iterable[VerifiedPair]) -> tuple[Pairs, Pairs]:
@@ -264,8 +364,10 @@ def _strongest(pairs: Iterable[VerifiedPair]) -> tuple[Pairs, Pairs]:
     strong: list[VerifiedPair] = []
     weak: list[VerifiedPair] = []
     for pair in sorted(pairs, key=lambda pair: (-len(pair.matches), pair.ids)):
-        is_strong = min(counts[image_id] for image_id in pair.ids) < MAX_PAIRS_OF_IMAGE
-        (strong if is_strong else weak).append(pair)
+        if min(counts[image_id] for image_id in pair.ids) < MAX_PAIRS_OF_IMAGE:
+            strong.append(pair)
+        else:
+            weak.append(pair)
         counts.update(pair.ids)
     return tuple(sorted(strong, key=lambda pair: pair.ids)), tuple(weak)
 
@@ -273,25 +375,44 @@ def _strongest(pairs: Iterable[VerifiedPair]) -> tuple[Pairs, Pairs]:
 def _empty_copy(
     cache: pycolmap.DatabaseCache, camera_of: Mapping[str, int]
 ) -> pycolmap.DatabaseCache:
-    """Return used cameras, rigs and images, without pairs; some images have another camera."""
-    new = pycolmap.DatabaseCache()
-    rigs = {rig.ref_sensor_id: rig for rig in cache.rigs.values()}
-    frames, images = dict(cache.frames), []
-    for image in map(copy.copy, cache.images.values()):
+    """Return the used cameras, rigs and images of a cache, without pairs.
+
+    Args:
+        cache: It stays as it is.
+        camera_of: Other cameras of some images, by image name.
+    """
+    rig_of = {rig.ref_sensor_id: rig.rig_id for rig in cache.rigs.values()}
+    frames = dict(cache.frames)
+    images = [copy.copy(image) for image in cache.images.values()]
+    for image in images:
         key = camera_of.get(image.name, image.camera_id)
         if key != image.camera_id:
-            image.camera_id, rig = key, rigs[cache.cameras[key].sensor_id]
-            frames[image.frame_id] = pycolmap.Frame(frame_id=image.frame_id, rig_id=rig.rig_id)
-            frames[image.frame_id].add_data_id(image.data_id)
-        images.append(image)
-    used = {frame.rig_id for frame in frames.values()}
-    sensors = {sensor for rig_id in used for sensor in cache.rigs[rig_id].sensor_ids()}
+            image.camera_id = key
+            rig_id = rig_of[cache.cameras[key].sensor_id]
+            frame = pycolmap.Frame(frame_id=image.frame_id, rig_id=rig_id)
+            frame.add_data_id(image.data_id)
+            frames[image.frame_id] = frame
+    used_rigs = sorted({frame.rig_id for frame in frames.values()})
+    return _filled_cache(cache, used_rigs, frames.values(), images)
+
+
+def _filled_cache(
+    cache: pycolmap.DatabaseCache,
+    rig_ids: Sequence[int],
+    frames: Iterable[pycolmap.Frame],
+    images: Iterable[pycolmap.Image],
+) -> pycolmap.DatabaseCache:
+    """Return a cache with some rigs of another one and their cameras, frames and images."""
+    new = pycolmap.DatabaseCache()
+    sensors = set[Any]()
+    for rig_id in rig_ids:
+        sensors |= cache.rigs[rig_id].sensor_ids()
     for camera in cache.cameras.values():
         if camera.sensor_id in sensors:
             new.add_camera(camera)
-    for rig_id in sorted(used):
+    for rig_id in rig_ids:
         new.add_rig(cache.rigs[rig_id])
-    for frame in frames.values():
+    for frame in frames:
         new.add_frame(frame)
     for image in images:
         new.add_image(image)

@@ -1,8 +1,8 @@
-"""The search for the model with most evidence.
+"""The search for the model with the highest score.
 
-Models grow from several first pairs and, where a focal length is not known, from several of these;
-bridges add images to them. One number chooses: how much the verified pairs speak for a model
-(:mod:`colmap_affrect.mappers.evidence`).
+Models grow from several first pairs and, where a focal length is unknown, from several values of
+it; bridges add images to them. One number decides: the score of a model
+(:mod:`colmap_affrect.mappers.model_score`).
 """
 
 import math
@@ -16,118 +16,174 @@ from typing import Self
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.adjustment import EXIF_SIGMA, MEDIUM, Adjuster, FocalPrior
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.bridging import Bridges
-from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
-from colmap_affrect.mappers.growing import Grower, join
+from colmap_affrect.mappers.bridging import BridgeFinder
+from colmap_affrect.mappers.growing import Grower, register_bridges
+from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 ZOOMS = 1.0, 1.4, 0.7, 2.0
-"""Factors of the usual focal length near which unknown ones begin: all lenses from wide to long."""
+"""Factors of the usual focal length near which unknown ones begin (judged): all lenses from wide to
+long are within a fifth of one of them."""
 SHARED_SIGMA = 0.1
-"""Deviation of the logarithm of those that several images share, while models grow: two or three of
-these images do not tell it."""
-SAME_FOCAL = 0.03  # of the logarithm: bridges built with one are right with the other
-NUM_STARTS = 3
+"""Deviation of the logarithm of a focal length that several images share, while models grow
+(judged): two or three of these images do not tell it."""
+SAME_FOCAL = 0.03
+"""Largest difference of the logarithms of two focal lengths, of which bridges that were built with
+one are right with the other (judged)."""
+NUM_STARTS = 3  # models from which bridges are built in turn (judged)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """Models that a search has made with some focal lengths."""
+
+    models: list[MappedModel]  # best first
+    score: float  # of the first
+    agrees: bool  # its unknown focal lengths ended near those that it was made with
 
 
 @dataclass(frozen=True)
 class Search:
-    """Looks for the models with most evidence."""
+    """Looks for the models with the highest scores."""
 
     adjuster: Adjuster
-    evidence: Evidence
+    scorer: ModelScorer
     native: pycolmap.IncrementalPipelineOptions
-    num_seeds: int
-    show: Callable[[int], None]
+    num_seeds: int  # first pairs in a row that may bring nothing
+    show: Callable[[int], None]  # is told how many images a model has
     num_starts: int = NUM_STARTS
-    """Models from which bridges are built in turn; with 0 there are none, and one try."""
+    """Models from which bridges are built in turn; with 0 there are none, and one focal length."""
+
+    @property
+    def graph(self) -> PairGraph:
+        """All pairs, by which models are scored."""
+        return self.scorer.graph
 
     def grower(self, graph: PairGraph) -> Grower:
         """Return what grows models of a graph."""
         return Grower(graph, self.adjuster, self.native, self.show)
 
-    def evidence_of(self, *models: MappedModel) -> float:
-        """Return the evidence of the best of some models."""
-        return max((self.evidence.of(model.reconstruction) for model in models), default=0.0)
+    def best_score(self, models: Iterable[MappedModel]) -> float:
+        """Return the score of the best of some models, 0 where there are none."""
+        scores = [self.scorer.score(mapped.reconstruction) for mapped in models]
+        return max(scores, default=0.0)
 
     def best(self, graph: PairGraph) -> list[MappedModel]:
-        """Return the best model, and then the best ones of images that none before has."""
-        best, most, grower = list[MappedModel](), -math.inf, self.grower(graph)
-        zooms = ZOOMS if self.num_starts else ZOOMS[:1]
-        usual = [self._near(zoom) for zoom in zooms] if self._shared else [self]
-        left = usual.copy()
-        while left:
-            near = left.pop(0)
-            found = near.joined(graph, near._grown(graph, graph.pairs))
-            if not found:
+        """Return the best model, then the best ones of images that none before has."""
+        best = _Attempt([], -math.inf, agrees=False)
+        initial = self._with_initial_focals()
+        pending = list(initial)
+        while pending:
+            search = pending.pop(0)
+            attempt = self._attempt(search, graph)
+            if not attempt.models:
                 continue
-            model = found[0].reconstruction
-            if self.unknown:
-                grower.finish(model, MEDIUM)
-            agrees = near._agrees(model)  # with other focal lengths, bridges are of wrong length
-            evidence = self.evidence.of(model) + MIN_GAIN * agrees
-            if evidence > most:
-                most, best = evidence, found
-                if near in usual and not agrees:
-                    left.insert(0, self._as_found(model))
-            if self.is_certain(model, graph, agrees=agrees):
+            model = attempt.models[0].reconstruction
+            if attempt.score > best.score:
+                best = attempt
+                if search in initial and not attempt.agrees:
+                    pending.insert(0, self._with_focals_of(model))
+            if self.is_certain(model, graph, agrees=attempt.agrees):
                 break
-        for mapped in best:
+        grower = self.grower(graph)
+        for mapped in best.models:
             grower.finish(mapped.reconstruction)
-        return best
+        return best.models
 
-    def beyond(self, graph: PairGraph, known: Sequence[MappedModel]) -> list[MappedModel]:
-        """Do so when some are known already; focal lengths stay near those of the first.
+    def extend_models(self, graph: PairGraph, known: Sequence[MappedModel]) -> list[MappedModel]:
+        """Return the best models of a graph of which some models are known already.
 
-        Bridges begin at these, too; others grow from pairs that the first does not explain.
+        Focal lengths stay near those of the first one. Bridges begin at the known models, too;
+        other models grow from pairs that the first one does not explain.
+
+        Args:
+            graph: The pairs.
+            known: The known models, best first; they stay as they are.
         """
-        again = pycolmap.Reconstruction(known[0].reconstruction)
-        near = self._as_found(again)
-        grower = near.grower(graph)
-        grower.finish(again)
-        grown = near._grown(graph, graph.unexplained_by(again))
-        models = [replace(known[0], reconstruction=again), *known[1:], *grown]
-        found = near.joined(graph, sorted(models, key=self.evidence_of, reverse=True))
-        for model in found:
-            grower.finish(model.reconstruction)
+        first = pycolmap.Reconstruction(known[0].reconstruction)
+        search = self._with_focals_of(first)
+        grower = search.grower(graph)
+        grower.finish(first)
+        grown = search._grown(graph, graph.unexplained_by(first))
+        models = [replace(known[0], reconstruction=first), *known[1:], *grown]
+        models.sort(key=self._score, reverse=True)
+        found = search.with_bridges(graph, models)
+        for mapped in found:
+            grower.finish(mapped.reconstruction)
         return found
+
+    def with_bridges(self, graph: PairGraph, models: Sequence[MappedModel]) -> list[MappedModel]:
+        """Register images by bridges from the best models.
+
+        Args:
+            graph: Pairs that bridges are built by.
+            models: The models, best first; they stay as they are.
+
+        Returns:
+            The model with the highest score, and those models that have other images.
+        """
+        if not models:
+            return []
+        if not self.num_starts or not graph.unexplained_by(models[0].reconstruction):
+            return [models[0]]
+        grower = self.grower(graph)
+        bridges = BridgeFinder(graph, self.native.random_seed)
+        joined = list[MappedModel]()
+        for mapped in models[: self.num_starts]:
+            joined.append(register_bridges(mapped, bridges, grower, self.scorer))
+        return with_own_images([max(joined, key=self._score), *models])
 
     def is_certain(
         self, model: pycolmap.Reconstruction, graph: PairGraph, *, agrees: bool = True
     ) -> bool:
-        """Tell whether a model has all images that are connected, and pairs or points confirm it.
+        """Tell whether a model has all connected images, and pairs or tracks confirm it.
 
-        That is, no pair contradicts it and its unknown focal lengths are those that it was made
-        with, or features of three images confirm it.
+        Args:
+            model: The model in question.
+            graph: Pairs that it should explain.
+            agrees: Whether its unknown focal lengths are those that it was made with.
+
+        Returns:
+            Whether no pair contradicts it and its focal lengths agree, or tracks of three images
+            confirm each image.
         """
         if not graph.most_connected.issubset(model.reg_image_ids()):
             return False
-        return (agrees and not graph.contradicted(model)) or self.evidence.is_confirmed(model)
+        return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(model)
 
     @cached_property
     def unknown(self) -> dict[int, FocalPrior]:
-        """Priors of the cameras that nobody knows, by id."""
+        """Priors of the unknown focal lengths, by camera id."""
         priors = self.adjuster.priors
         return {key: prior for key, prior in priors.items() if prior.sigma > EXIF_SIGMA}
 
     @cached_property
     def _shared(self) -> set[int]:
-        """Cameras that nobody knows and several images share."""
-        counts = Counter(camera.camera_id for camera in self.evidence.graph.cameras.values())
+        """Cameras with an unknown focal length that several images share."""
+        counts = Counter(camera.camera_id for camera in self.graph.cameras.values())
         return {key for key in self.unknown if counts[key] > 1}
 
-    def _near(self, zoom: float) -> Self:
-        """Return what keeps unknown focal lengths near the usual one times a factor."""
-        sigmas = {k: min(SHARED_SIGMA, self.unknown[k].sigma) for k in self._shared}
-        near = {
-            key: FocalPrior(zoom * prior.focal_px, sigmas.get(key, prior.sigma))
-            for key, prior in self.unknown.items()
-        }
-        return self._with_priors(near)
+    def _score(self, mapped: MappedModel) -> float:
+        return self.scorer.score(mapped.reconstruction)
 
-    def _as_found(self, model: pycolmap.Reconstruction) -> Self:
-        """Return what keeps unknown focal lengths near those of a model."""
+    def _with_initial_focals(self) -> list[Self]:
+        """Return searches with several values of unknown focal lengths, the usual one first."""
+        if not self._shared:
+            return [self]
+        zooms = ZOOMS if self.num_starts else ZOOMS[:1]
+        return [self._with_focals_near(zoom) for zoom in zooms]
+
+    def _with_focals_near(self, zoom: float) -> Self:
+        """Return a search that keeps unknown focal lengths near the usual one times a factor."""
+        priors = {}
+        for key, prior in self.unknown.items():
+            sigma = min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma
+            priors[key] = FocalPrior(zoom * prior.focal_px, sigma)
+        return self._with_priors(priors)
+
+    def _with_focals_of(self, model: pycolmap.Reconstruction) -> Self:
+        """Return a search that keeps unknown focal lengths near those of a model."""
         focals = self._unknown_focals(model).items()
         return self._with_priors({key: FocalPrior(px, SHARED_SIGMA) for key, px in focals})
 
@@ -135,45 +191,58 @@ class Search:
         together = {**self.adjuster.priors, **priors}
         return replace(self, adjuster=replace(self.adjuster, priors=together))
 
+    def _attempt(self, search: Self, graph: PairGraph) -> _Attempt:
+        """Grow models with the focal lengths of another search; then these may change."""
+        found = search.with_bridges(graph, search._grown(graph, graph.pairs))
+        if not found:
+            return _Attempt([], -math.inf, agrees=False)
+        model = found[0].reconstruction
+        if self.unknown:
+            self.grower(graph).finish(model, MEDIUM)
+        agrees = search._agrees(model)
+        score = self.scorer.score(model)
+        if agrees:  # with other focal lengths, bridges have a wrong length
+            score += MIN_SCORE_GAIN
+        return _Attempt(found, score, agrees)
+
     def _agrees(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether unknown focal lengths ended near those with which a model was made."""
-        return all(
-            abs(math.log(focal_px / self.adjuster.priors[key].focal_px)) <= SAME_FOCAL
-            for key, focal_px in self._unknown_focals(model).items()
-        )
+        for key, focal_px in self._unknown_focals(model).items():
+            change = math.log(focal_px / self.adjuster.priors[key].focal_px)
+            if abs(change) > SAME_FOCAL:
+                return False
+        return True
 
     def _unknown_focals(self, model: pycolmap.Reconstruction) -> dict[int, float]:
-        """Return the focal lengths of the used cameras that nobody knows, by id of the camera."""
+        """Return the focal lengths of the used cameras whose prior is unknown, by camera id."""
         used = {camera.camera_id: camera for camera in cameras_of(model).values()}
         return {k: used[k].mean_focal_length() for k in used.keys() & self.unknown.keys()}
 
-    def joined(self, graph: PairGraph, models: Sequence[MappedModel]) -> list[MappedModel]:
-        """Return the best model that bridges make of one of some, and those left out of it."""
-        if not (models and self.num_starts and graph.unexplained_by(models[0].reconstruction)):
-            return list(models[:1])
-        grower, bridges = self.grower(graph), Bridges(graph, self.native.random_seed)
-        joined = [join(m, bridges, grower, self.evidence) for m in models[: self.num_starts]]
-        return with_own_images([max(joined, key=self.evidence_of), *models])
-
     def _grown(self, graph: PairGraph, first: Sequence[VerifiedPair]) -> list[MappedModel]:
-        """Return models of different images from first pairs, that with most evidence first."""
-        models: dict[frozenset[int], tuple[float, pycolmap.Reconstruction]] = {}
-        best, in_vain = 0.0, 0
-        pairs = _as_first_pairs(first, graph)
-        with closing(_in_order(self.grower(graph), [pair.ids for pair in pairs])) as grown:
+        """Return models of different images from first pairs, the highest score first."""
+        models: dict[frozenset[int], MappedModel] = {}
+        scores: dict[frozenset[int], float] = {}
+        best_score = 0.0
+        num_in_vain = 0
+        pairs = first_pairs(first, graph)
+        with closing(_grow_in_order(self.grower(graph), [pair.ids for pair in pairs])) as grown:
             for model in grown:
-                images, evidence = frozenset(model.reg_image_ids()), self.evidence.of(model)
-                in_vain = 0 if evidence > best + MIN_GAIN else in_vain + 1
-                best = max(best, evidence)
-                if images not in models or evidence > models[images][0]:
-                    models[images] = evidence, model
-                is_complete = len(images) == len(graph.keypoints)
-                if in_vain >= self.num_seeds or (is_complete and self.evidence.is_confirmed(model)):
+                score = self.scorer.score(model)
+                num_in_vain = 0 if score > best_score + MIN_SCORE_GAIN else num_in_vain + 1
+                best_score = max(best_score, score)
+                images = frozenset(model.reg_image_ids())
+                if images not in models or score > scores[images]:
+                    models[images] = MappedModel(model)
+                    scores[images] = score
+                if num_in_vain >= self.num_seeds:
                     break
-        return [MappedModel(m) for _, m in sorted(models.values(), key=lambda found: -found[0])]
+                is_complete = len(images) == len(graph.keypoints)
+                if is_complete and self.scorer.is_confirmed(model):
+                    break
+        return [models[images] for images in sorted(models, key=lambda images: -scores[images])]
 
 
-def _as_first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[VerifiedPair]:
+def first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[VerifiedPair]:
     """Return pairs in the order in which models begin with them.
 
     Those with most inliers come first, and those of two images that a rig took at once come last:
@@ -190,7 +259,8 @@ def _as_first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[Ver
 
 def with_own_images(models: Iterable[MappedModel]) -> list[MappedModel]:
     """Leave out models with less than two images that none before has."""
-    found, inside = list[MappedModel](), set[int]()
+    found = list[MappedModel]()
+    inside = set[int]()
     for model in models:
         own = set(model.reconstruction.reg_image_ids())
         if len(own - inside) > 1:
@@ -199,7 +269,7 @@ def with_own_images(models: Iterable[MappedModel]) -> list[MappedModel]:
     return found
 
 
-def _in_order(
+def _grow_in_order(
     grower: Grower, pairs: Sequence[Ids]
 ) -> Generator[pycolmap.Reconstruction, None, None]:
     """Yield models that grow from pairs: in threads after the first, which often is enough."""

@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 SNAPSHOT_FRAMES = 100
 """Images between two snapshots. A model of so many is not tried again with another seed, so that
 nothing but the attempt that made it can be gone on with."""
-NUM_KEPT = 2  # a snapshot may be half written when a run is killed; the one before is complete
+NUM_KEPT = 2  # a snapshot may be incomplete when a run is killed; the one before is complete
 
 
 @contextmanager
@@ -29,6 +29,12 @@ def with_snapshots(
 
     Those that an interrupted mapping of the same pairs and cameras with the same options has left
     are kept until then. Small sets and models that are extended have none.
+
+    Args:
+        task: What is mapped.
+        options: Of the mapper.
+        folder: Of all snapshots; there is one for each task in it.
+        num_images: Of the database.
     """
     if num_images < SNAPSHOT_FRAMES or task.extend:
         yield task
@@ -40,7 +46,8 @@ def with_snapshots(
     try:
         yield replace(task, snapshot_path=own)
     except BaseException:
-        if not any(own.iterdir()):
+        is_empty = not any(own.iterdir())
+        if is_empty:
             remove_own([folder])
         raise
     remove_own([folder])

@@ -1,30 +1,38 @@
 """The sparse mapper: mapping as one estimate, for small sets with few matches."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, FocalPrior, priors_of
+from colmap_affrect.mappers.adjustment import (
+    EXIF_SIGMA,
+    NOISE_PX,
+    Adjuster,
+    FocalPrior,
+    focal_priors,
+)
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
+from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.search import Search, with_own_images
 from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
+# What made a model, in the words of a report.
 MEASURED_PAIRS = "with the pairs of measured frames"  # others also verify sides that look the same
 ALL_PAIRS = "with all pairs"
-SOME_TRACKS = "from some of the tracks"  # the move that makes easy models
+SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
 OWN_CAMERAS = "with a camera for each photograph"
-LARGE = 100  # images from which on COLMAP's own pipeline maps
+
+LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
 
 
 class SparseOptions(PipelineOptions):
@@ -48,54 +56,92 @@ class SparseMapper(IncrementalMapper):
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
-        """See :class:`colmap_affrect.mappers.base.Mapper`."""
+        """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
+
+        Args:
+            task: What to map.
+            output_path: An empty folder that models may be written to.
+            random_seed: For all that is left to chance.
+            show: Is told how many images have been registered so far.
+
+        Returns:
+            The models; their last points come by ``finish``.
+
+        Raises:
+            AffrectError: When COLMAP ends with an error.
+            KeyboardInterrupt: After mapping has been stopped.
+        """
         native = self.native(task, random_seed)
         graph = graph_of(task, native.min_num_matches)
 
-        def shown(count: int) -> None:
+        def show_or_stop(count: int) -> None:
             if task.cancellation and task.cancellation.is_cancelled:
                 raise KeyboardInterrupt
             show(count)
 
-        is_large = len(graph.keypoints) >= LARGE
-        if is_large or task.extend:
-            search = replace(self._search(task, graph, native, shown), num_starts=1)
-            if task.before:
-                found = _again(search, graph, task.before)
-            else:
-                found = super().map(task, output_path, random_seed, show)
-                is_whole = found and not graph.unexplained_by(found[0].reconstruction)
-                if is_whole and not task.tie_points:
-                    return found
-                found.sort(key=search.evidence_of, reverse=True)
-            best = _joined_by_hand(search, graph, search.joined(graph, found))
-            for model in best:
-                if task.extend:
-                    task.extend.restore(model.reconstruction)
+        is_small = len(graph.keypoints) < LARGE and not task.extend
+        if is_small:
+            native.mapper.init_max_forward_motion = 1.0  # the score decides on such pairs
+            return self._map_small(task, graph, native, show_or_stop)
+        search = self._search(task, graph, native, show_or_stop)
+        search = replace(search, num_starts=1)
+        if task.previous_models:
+            found = _restarted(search, task.previous_models)
         else:
-            native.mapper.init_max_forward_motion = 1.0  # the evidence decides on such pairs
-            best = self._best(task, graph, native, shown)
-            for model in best:
-                if not has_rigs(model.reconstruction):  # which tell the scale
-                    model.reconstruction.normalize()  # as COLMAP does
-        if task.extend:
-            for mapped in best:
-                _extract_colors(mapped.reconstruction, task, native)
-            return best
-        finish = partial(self._finish, task, graph, native)
-        return [replace(m, finish=partial(finish, m.reconstruction)) for m in best]
+            found = super().map(task, output_path, random_seed, show)
+            is_whole = found and not graph.unexplained_by(found[0].reconstruction)
+            if is_whole and not task.tie_points:
+                return found
+            found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
+        best = _joined_by_tie_points(search, search.with_bridges(graph, found))
+        if not task.extend:
+            return self._with_finish(best, task, graph, native)
+        for mapped in best:
+            task.extend.restore(mapped.reconstruction)
+            _extract_colors(mapped.reconstruction, task, native)
+        return best
 
-    def _finish(
+    def _map_small(
         self,
         task: MappingTask,
         graph: PairGraph,
         native: pycolmap.IncrementalPipelineOptions,
-        model: pycolmap.Reconstruction,
-    ) -> None:
-        """Give a model the points of all tracks, and their colours."""
-        tie_points = tie_points_of(task, graph)
-        complete_points(model, graph, native, self.options.noise_px, tie_points)
-        _extract_colors(model, task, native)
+        show: Callable[[int], None],
+    ) -> list[MappedModel]:
+        """Return the models with the highest scores.
+
+        Images of one size share uncalibrated cameras at first. Cameras of their own are one more
+        hypothesis, which scores higher where they differ, or some images are parts of others.
+        """
+        own = self._search(task, graph, native, show)
+        best = list[MappedModel]()
+        cameras = with_shared_cameras(task.cameras) if task.may_share else task.cameras
+        if len(cameras) < len(task.cameras):
+            sharing = replace(task, cameras=cameras)
+            shared = self._search(sharing, graph.with_cameras(cameras), native, show)
+            best = _HypothesisTest(task, shared, own).run()
+        if not best:
+            best = _HypothesisTest(task, own, None).run()
+        for mapped in best:
+            if not has_rigs(mapped.reconstruction):  # which tell the scale
+                mapped.reconstruction.normalize()  # as COLMAP does
+        return self._with_finish(best, task, graph, native)
+
+    def _with_finish(
+        self,
+        models: Sequence[MappedModel],
+        task: MappingTask,
+        graph: PairGraph,
+        native: pycolmap.IncrementalPipelineOptions,
+    ) -> list[MappedModel]:
+        """Have models get the points of all tracks, and colours, once their images are scored."""
+
+        def finish(model: pycolmap.Reconstruction) -> None:
+            tie_points = tie_points_of(task, graph)
+            complete_points(model, graph, native, self.options.noise_px, tie_points)
+            _extract_colors(model, task, native)
+
+        return [replace(m, finish=partial(finish, m.reconstruction)) for m in models]
 
     def _search(
         self,
@@ -104,77 +150,132 @@ class SparseMapper(IncrementalMapper):
         native: pycolmap.IncrementalPipelineOptions,
         show: Callable[[int], None],
     ) -> Search:
-        priors = priors_of(graph.cameras.values(), task.cameras)
-        constant, frames = frozenset[int](), frozenset[int]()
-        if self.options.keep_given_intrinsics:
-            constant = frozenset(key for key, record in task.cameras.items() if record.is_fixed)
-        else:
-            priors = {k: replace(p, sigma=p.sigma or EXIF_SIGMA) for k, p in priors.items()}
-        if not native.ba_refine_focal_length:  # then they are those of the database
-            used = {camera.camera_id: camera for camera in graph.cameras.values()}
-            priors = {k: FocalPrior(float(c.mean_focal_length()), 0.0) for k, c in used.items()}
-            if not (native.ba_refine_extra_params or native.ba_refine_principal_point):
-                constant |= used.keys()
+        constant_frames = frozenset[int]()
         if task.extend:
             task.extend.constrain(native)
-            constant |= native.constant_cameras
             if not task.extend.refine:
-                frames = frozenset(image.frame_id for image in task.extend.images)
-        refining, tie_points = native.get_global_bundle_adjustment(), tie_points_of(task, graph)
-        adjuster = Adjuster(priors, self.options.noise_px, refining, constant, frames, tie_points)
-        return Search(adjuster, Evidence(graph, priors), native, self.options.num_seeds, show)
+                constant_frames = frozenset(image.frame_id for image in task.extend.images)
+        priors = self._priors(task, graph, native)
+        adjuster = Adjuster(
+            priors,
+            self.options.noise_px,
+            native.get_global_bundle_adjustment(),
+            self._constant_cameras(task, graph, native),
+            constant_frames,
+            tie_points_of(task, graph),
+        )
+        return Search(adjuster, ModelScorer(graph, priors), native, self.options.num_seeds, show)
 
-    def _best(
-        self,
-        task: MappingTask,
-        graph: PairGraph,
-        native: pycolmap.IncrementalPipelineOptions,
-        show: Callable[[int], None],
-    ) -> list[MappedModel]:
-        """Return what has most evidence after all moves.
+    def _priors(
+        self, task: MappingTask, graph: PairGraph, native: pycolmap.IncrementalPipelineOptions
+    ) -> dict[int, FocalPrior]:
+        """Return the priors of the focal lengths, by camera id."""
+        if not native.ba_refine_focal_length:  # then they are those of the database
+            used = {camera.camera_id: camera for camera in graph.cameras.values()}
+            return {k: FocalPrior(float(c.mean_focal_length()), 0.0) for k, c in used.items()}
+        priors = focal_priors(graph.cameras.values(), task.cameras)
+        if not self.options.keep_given_intrinsics:
+            for key, prior in priors.items():
+                priors[key] = replace(prior, sigma=prior.sigma or EXIF_SIGMA)
+        return priors
 
-        Images of one size share unknown cameras at first. Cameras of their own are one more move,
-        which the evidence is for where they differ, or some images are parts of others.
+    def _constant_cameras(
+        self, task: MappingTask, graph: PairGraph, native: pycolmap.IncrementalPipelineOptions
+    ) -> frozenset[int]:
+        """Return the ids of the cameras of which nothing is refined."""
+        constant = set[int]()
+        if self.options.keep_given_intrinsics:
+            constant |= {key for key, record in task.cameras.items() if record.is_fixed}
+        refines_others = native.ba_refine_extra_params or native.ba_refine_principal_point
+        if not native.ba_refine_focal_length and not refines_others:
+            constant |= {camera.camera_id for camera in graph.cameras.values()}
+        if task.extend:
+            constant |= native.constant_cameras
+        return frozenset(constant)
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """Which pairs a model is made from."""
+
+    name: str  # in the words of a report
+    left_out: Collection[Ids]
+
+
+class _HypothesisTest:
+    """Makes models under several hypotheses and keeps those with the highest score."""
+
+    def __init__(self, task: MappingTask, search: Search, own: Search | None) -> None:
+        """Begin with the previous models of a task.
+
+        Args:
+            task: What to map.
+            search: Makes and scores models, with the cameras that images have at first.
+            own: The same with a camera for each image; None if they have these at first.
         """
-        cameras = with_shared_cameras(task.cameras) if task.may_share else task.cameras
-        is_sharing = len(cameras) < len(task.cameras)
-        own = graph, self._search(task, graph, native, show)
-        if is_sharing:
-            graph = graph.with_cameras(cameras)
-        search = self._search(replace(task, cameras=cameras), graph, native, show)
-        ids = {name: image_id for image_id, name in graph.names.items()}
-        pairs = ((ids[a], ids[b]) for a, b in task.unmeasured)
-        unmeasured = {(min(pair), max(pair)) for pair in pairs}
-        best = _again(search, graph, task.before)
-        most = search.evidence_of(*best)
-        measured = {MEASURED_PAIRS: unmeasured} if unmeasured else {}
-        for name, left_out in {**measured, ALL_PAIRS: set[Ids]()}.items():
-            start = best[0].reconstruction if best else None
-            if start and search.is_certain(start, graph):
+        self.task = task
+        self.search = search
+        self.own = own
+        self.best = _restarted(search, task.previous_models)
+        self.score = search.best_score(self.best)
+
+    def run(self) -> list[MappedModel]:
+        """Return the best models."""
+        for hypothesis in self._hypotheses():
+            if self._is_certain():
                 break
-            reduced = graph.without(left_out)
-            if start and not reduced.unexplained_by(start):
-                continue
-            if start:
-                models = search.beyond(reduced, best)
-            else:
-                models = _of_some_tracks(search, reduced, graph) or search.best(reduced)
-            evidence = search.evidence_of(*models)
-            if not models or (best and evidence <= most):
-                continue
-            before = best[0].moves if best else ()
-            moves = tuple(dict.fromkeys((*before, name, *models[0].moves)))
-            best, most = [replace(model, moves=moves) for model in models], evidence
-            if is_sharing:
-                model = _with_own_cameras(own[1], own[0].without(left_out), search, best[0])
-                if model and own[1].evidence.of(model) > most + MIN_GAIN:
-                    is_sharing, (graph, search) = False, own
-                    first = replace(best[0], reconstruction=model, moves=(*moves, OWN_CAMERAS))
-                    best = with_own_images([first, *best[1:]])
-                    most = search.evidence_of(*best)
-        if not best and is_sharing:
-            return self._best(replace(task, may_share=False), own[0], native, show)
-        return _joined_by_hand(search, graph, best)
+            models = self._built(hypothesis)
+            score = self.search.best_score(models)
+            if models and (not self.best or score > self.score):
+                self._take(hypothesis, models, score)
+                self._try_own_cameras(hypothesis)
+        return _joined_by_tie_points(self.search, self.best)
+
+    def _hypotheses(self) -> list[_Hypothesis]:
+        """Return the hypotheses, the one with the fewest pairs first."""
+        ids = {name: image_id for image_id, name in self.search.graph.names.items()}
+        unmeasured = set[Ids]()
+        for first, second in self.task.unmeasured_pairs:
+            unmeasured.add((min(ids[first], ids[second]), max(ids[first], ids[second])))
+        found = [_Hypothesis(ALL_PAIRS, ())]
+        if unmeasured:
+            found.insert(0, _Hypothesis(MEASURED_PAIRS, unmeasured))
+        return found
+
+    def _is_certain(self) -> bool:
+        if not self.best:
+            return False
+        return self.search.is_certain(self.best[0].reconstruction, self.search.graph)
+
+    def _built(self, hypothesis: _Hypothesis) -> list[MappedModel]:
+        """Return the models of a hypothesis, none where it explains no more than the best ones."""
+        graph = self.search.graph.without(hypothesis.left_out)
+        if not self.best:
+            return _of_some_tracks(self.search, graph) or self.search.best(graph)
+        if not graph.unexplained_by(self.best[0].reconstruction):
+            return []
+        return self.search.extend_models(graph, self.best)
+
+    def _take(self, hypothesis: _Hypothesis, models: Sequence[MappedModel], score: float) -> None:
+        before = self.best[0].moves if self.best else ()
+        moves = _without_duplicates((*before, hypothesis.name, *models[0].moves))
+        self.best = [replace(mapped, moves=moves) for mapped in models]
+        self.score = score
+
+    def _try_own_cameras(self, hypothesis: _Hypothesis) -> None:
+        """Give each image of the best model a camera of its own where that scores higher."""
+        if self.own is None:
+            return
+        first = self.best[0]
+        graph = self.own.graph.without(hypothesis.left_out)
+        model = _with_own_cameras(self.own, graph, self.search, first.reconstruction)
+        if model is None or self.own.scorer.score(model) <= self.score + MIN_SCORE_GAIN:
+            return
+        changed = replace(first, reconstruction=model, moves=(*first.moves, OWN_CAMERAS))
+        self.best = with_own_images([changed, *self.best[1:]])
+        self.search = self.own
+        self.own = None
+        self.score = self.search.best_score(self.best)
 
 
 def _extract_colors(
@@ -186,49 +287,67 @@ def _extract_colors(
         model.extract_colors_for_all_images(task.image_path)
 
 
-def _joined_by_hand(
-    search: Search, graph: PairGraph, models: Sequence[MappedModel]
-) -> list[MappedModel]:
-    joiner = TieJoiner(search.adjuster.tie_points, search.grower(graph), search.evidence)
-    return joiner.join(models)
+def _joined_by_tie_points(search: Search, models: Sequence[MappedModel]) -> list[MappedModel]:
+    grower = search.grower(search.graph)
+    return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 
 
-def _again(search: Search, graph: PairGraph, before: Sequence[MappedModel]) -> list[MappedModel]:
-    """Return models with the poses of some before, and all that their tracks now register."""
-    grower, found = search.grower(graph), list[MappedModel]()
-    for mapped in before:
-        model = grower.again(mapped.reconstruction)
+def _without_duplicates(moves: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(moves))
+
+
+def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
+    """Return models with the poses of previous ones, and all that their tracks now register."""
+    grower = search.grower(search.graph)
+    found = list[MappedModel]()
+    for mapped in previous:
+        model = grower.restart_from(mapped.reconstruction)
         grower.finish(model)
-        moves = tuple(dict.fromkeys((*mapped.moves, AGAIN)))
+        moves = _without_duplicates((*mapped.moves, AGAIN))
         found.append(replace(mapped, reconstruction=model, moves=moves))
     return with_own_images(found)
 
 
 def _with_own_cameras(
-    own: Search, graph: PairGraph, shared: Search, found: MappedModel
+    own: Search, graph: PairGraph, shared: Search, model: pycolmap.Reconstruction
 ) -> pycolmap.Reconstruction | None:
-    """Return a model with a camera for each image; None where some tracks already tell against."""
-    thin, model = graph.thinned(), found.reconstruction
+    """Return a model with a camera for each image.
+
+    Args:
+        own: Makes the model.
+        graph: Its pairs.
+        shared: Scores the model with shared cameras.
+        model: The model with shared cameras.
+
+    Returns:
+        The model; None where it scores no higher with some of the tracks.
+    """
+    thin = graph.thinned()
     if thin is not graph:
-        trial = own.grower(thin).again(model)
-        before, after = (replace(s.evidence, graph=thin) for s in (shared, own))
-        if after.of(trial) <= before.of(model) + MIN_GAIN:
+        trial = own.grower(thin).restart_from(model)
+        own_score = replace(own.scorer, graph=thin).score(trial)
+        shared_score = replace(shared.scorer, graph=thin).score(model)
+        if own_score <= shared_score + MIN_SCORE_GAIN:
             return None
     grower = own.grower(graph)
-    model = grower.again(model)
-    grower.finish(model)
-    return model
+    changed = grower.restart_from(model)
+    grower.finish(changed)
+    return changed
 
 
-def _of_some_tracks(search: Search, reduced: PairGraph, graph: PairGraph) -> list[MappedModel]:
-    """Return a model, with all points, if some tracks of a reduced graph make a certain one."""
-    thin = reduced.thinned()
-    if thin is reduced:
+def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
+    """Return the model that some tracks of a graph make, with all points, if it is certain."""
+    thin = graph.thinned()
+    if thin is graph:
         return []
-    quick = replace(search, evidence=replace(search.evidence, graph=thin), num_starts=0)
+    scorer = replace(search.scorer, graph=thin)
+    quick = replace(search, scorer=scorer, num_starts=0)
     models = quick.best(thin)
-    has_all = models and models[0].reconstruction.num_reg_images() == len(graph.keypoints)
-    if not has_all or not quick.is_certain(models[0].reconstruction, graph):
+    if not models:
         return []
-    search.grower(reduced).fill(models[0].reconstruction)  # poses are right
+    model = models[0].reconstruction
+    has_all = model.num_reg_images() == len(search.graph.keypoints)
+    if not has_all or not quick.is_certain(model, search.graph):
+        return []
+    search.grower(graph).triangulate_all(model)  # its poses are right
     return [replace(models[0], moves=(SOME_TRACKS,))]

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,120 +13,217 @@ from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.adjustment import EXIF_SIGMA
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.bridging import Bridges
-from colmap_affrect.mappers.evidence import Evidence
-from colmap_affrect.mappers.growing import Grower, join
+from colmap_affrect.mappers.bridging import BridgeFinder
+from colmap_affrect.mappers.growing import Grower, register_bridges
+from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import CameraById, PoseById, cameras_of, poses_of
 from colmap_affrect.mappers.search import ZOOMS
 from colmap_affrect.mappers.tie_points import AGREEING_PX, MIN_NUM_POINTS, TiePoints
 
-BY_HAND = "with tie points"  # the move, in a report
-MAX_SIM3_ERROR = 0.1  # of tie points of two models, of their spread
+BY_HAND = "with tie points"  # what made the model, in the words of a report
+MAX_SIM3_ERROR = 0.1  # of tie points of two models, in units of their spread (judged)
+
+
+@dataclass(frozen=True)
+class _NewImages:
+    """Images that tie points register into a model."""
+
+    poses: PoseById
+    cameras: CameraById
+
+
+@dataclass(frozen=True)
+class _Resection:
+    """A pose of an image by its tie points."""
+
+    pose: Pose  # cam_from_world
+    camera: pycolmap.Camera  # with the focal length that was found
+    num_inliers: int
+    focal_cost: float  # by the prior of the focal length
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Larger is better."""
+        return self.num_inliers, -self.focal_cost
 
 
 class TieJoiner:
-    """Joins photographs and models that tie points hold, whatever the matches say."""
+    """Joins photographs and models that have tie points in common, whatever the matches say."""
 
-    def __init__(self, points: TiePoints, grower: Grower, evidence: Evidence) -> None:
-        self.points, self.grower, self.evidence = points, grower, evidence
+    def __init__(self, points: TiePoints, grower: Grower, scorer: ModelScorer) -> None:
+        """Take the tie points of the graph that a grower works with."""
+        self.points = points
+        self.grower = grower
+        self.scorer = scorer
 
     def join(self, models: Sequence[MappedModel]) -> list[MappedModel]:
         """Return models with all that joins them, and all tie points observed; large ones first.
 
-        Bridges go on from there. Images that their tie points contradict are placed anew.
+        Bridges go on from there. Images that their tie points contradict get new poses.
         """
         if not self.points.keypoints:
             return list(models)
         left = sorted(models, key=lambda mapped: -mapped.reconstruction.num_reg_images())
         joined = list[MappedModel]()
         while left:
-            mapped, *left = left
+            mapped = left.pop(0)
             for image_id in self.points.misplaced(mapped.reconstruction):
                 frame_id = mapped.reconstruction.images[image_id].frame_id
                 mapped.reconstruction.deregister_frame(frame_id)
-            while new := next(self._new_poses(mapped.reconstruction, left), None):
-                mapped = self._with(mapped, *new)
-                inside = set(mapped.reconstruction.reg_image_ids())
-                left = [m for m in left if not inside >= set(m.reconstruction.reg_image_ids())]
+            new = self._next_images(mapped, left)
+            while new:
+                mapped = self._with(mapped, new)
+                left = _not_inside(left, mapped)
+                new = self._next_images(mapped, left)
             if BY_HAND in mapped.moves:
                 self.grower.finish(mapped.reconstruction)
             self.points.observe(mapped.reconstruction)
             joined.append(mapped)
         return joined
 
-    def _with(self, mapped: MappedModel, poses: PoseById, cameras: CameraById) -> MappedModel:
-        """Place images, and what bridges join to them."""
-        model = self.grower.placed(poses, cameras, copy.deepcopy(mapped.reconstruction))
-        bridges = Bridges(self.grower.graph, self.grower.native.random_seed)
-        moves = tuple(dict.fromkeys((*mapped.moves, BY_HAND)))
-        placed = replace(mapped, reconstruction=model, moves=moves)
-        return join(placed, bridges, self.grower, self.evidence)
+    def _with(self, mapped: MappedModel, new: _NewImages) -> MappedModel:
+        """Register images, and what bridges register from there."""
+        model = copy.deepcopy(mapped.reconstruction)
+        model = self.grower.register_at(new.poses, new.cameras, model)
+        moves = mapped.moves if BY_HAND in mapped.moves else (*mapped.moves, BY_HAND)
+        registered = replace(mapped, reconstruction=model, moves=moves)
+        bridges = BridgeFinder(self.grower.graph, self.grower.native.random_seed)
+        return register_bridges(registered, bridges, self.grower, self.scorer)
 
-    def _new_poses(
-        self, model: pycolmap.Reconstruction, left: Sequence[MappedModel]
-    ) -> Iterator[tuple[PoseById, CameraById]]:
-        places = self.points.places(model)
-        others = [mapped.reconstruction for mapped in left]
+    def _next_images(self, mapped: MappedModel, left: Sequence[MappedModel]) -> _NewImages | None:
+        """Return the next images that tie points register, those of whole models first."""
+        model = mapped.reconstruction
+        others = [other.reconstruction for other in left]
+        return next(self._new_images(model, others), None)
+
+    def _new_images(
+        self, model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]
+    ) -> Iterator[_NewImages]:
+        positions = self.points.positions(model)
+        registered = set(model.reg_image_ids())
         for other in others:
-            moved = self._moved(other, places)
-            if moved is not None:
-                yield poses_of(moved), cameras_of(moved)
-        elsewhere = {i for m in (model, *others) for i in m.reg_image_ids()}
+            registered.update(other.reg_image_ids())
+            aligned = self._aligned(other, positions)
+            if aligned is not None:
+                yield _NewImages(poses_of(aligned), cameras_of(aligned))
         for image in self.grower.graph.cache.images.values():
-            if image.image_id not in elsewhere:
-                found = self._registered(image, model, places)
+            if image.image_id not in registered:
+                found = self._resected(image, model, positions)
                 if found:
-                    yield {image.image_id: found[0]}, {image.image_id: found[1]}
+                    yield _NewImages({image.image_id: found.pose}, {image.image_id: found.camera})
 
-    def _moved(
-        self, other: pycolmap.Reconstruction, places: Mapping[str, Array]
+    def _aligned(
+        self, other: pycolmap.Reconstruction, positions: Mapping[str, Array]
     ) -> pycolmap.Reconstruction | None:
-        """Return a copy of a model, moved to where its tie points are in another one."""
-        own = self.points.places(other)
-        if len(names := sorted(own.keys() & places.keys())) < MIN_NUM_POINTS:
+        """Return a copy of a model, moved to where its tie points are in another one.
+
+        Args:
+            other: The model to move.
+            positions: Positions of tie points in the model to move it to, by name.
+
+        Returns:
+            The copy; None if too few tie points agree on a similarity.
+        """
+        own = self.points.positions(other)
+        names = sorted(own.keys() & positions.keys())
+        if len(names) < MIN_NUM_POINTS:
             return None
-        source, target = (np.array([at[name] for name in names]) for at in (own, places))
+        source = np.array([own[name] for name in names])
+        target = np.array([positions[name] for name in names])
         spread = float(np.linalg.norm(np.std(target, axis=0)))
         options = self._ransac(MAX_SIM3_ERROR * spread)
         found: Any = pycolmap.estimate_sim3d_robust(source, target, options)
         if not found or found["num_inliers"] < MIN_NUM_POINTS:
             return None
-        moved = pycolmap.Reconstruction(other)
-        moved.transform(found["tgt_from_src"])
-        return moved
+        aligned = pycolmap.Reconstruction(other)
+        aligned.transform(found["tgt_from_src"])
+        return aligned
 
-    def _registered(
-        self, image: pycolmap.Image, model: pycolmap.Reconstruction, places: Mapping[str, Array]
-    ) -> tuple[Pose, pycolmap.Camera] | None:
-        """Return pose and camera of an image by its tie points; a focal length may be unknown."""
+    def _resected(
+        self,
+        image: pycolmap.Image,
+        model: pycolmap.Reconstruction,
+        positions: Mapping[str, Array],
+    ) -> _Resection | None:
+        """Return the best pose of an image by its tie points.
+
+        Args:
+            image: An image that is not in the model.
+            model: The model.
+            positions: Positions of its tie points, by name.
+
+        Returns:
+            Pose and camera, with a focal length that may have been unknown; None if too few tie
+            points agree.
+        """
         marks = self.points.marks(image)
-        if len(names := sorted(marks.keys() & places.keys())) < MIN_NUM_POINTS:
+        names = sorted(marks.keys() & positions.keys())
+        if len(names) < MIN_NUM_POINTS:
             return None
-        points, known = (np.array([at[name] for name in names]) for at in (marks, places))
+        points2d = np.array([marks[name] for name in names])
+        points3d = np.array([positions[name] for name in names])
         key = image.camera_id
         is_used = key in {camera.camera_id for camera in cameras_of(model).values()}
-        camera = copy.copy((model if is_used else self.grower.graph.cache).cameras[key])
+        camera = (model if is_used else self.grower.graph.cache).cameras[key]
         prior = self.grower.adjuster.priors[key]
         is_open = not is_used and prior.sigma > EXIF_SIGMA
+        trials = [copy.copy(camera)]
+        if is_open:
+            trials = [_with_focal(camera, zoom * prior.focal_px) for zoom in ZOOMS]
+        best: _Resection | None = None
+        for trial in trials:
+            found = self._resection(points2d, points3d, trial, refine_focal=is_open)
+            if found and (best is None or found.rank > best.rank):
+                best = found
+        return best
+
+    def _resection(
+        self, points2d: Array, points3d: Array, camera: pycolmap.Camera, *, refine_focal: bool
+    ) -> _Resection | None:
+        """Estimate a pose.
+
+        Args:
+            points2d: (N, 2) px.
+            points3d: (N, 3) positions.
+            camera: Changed in place if its focal length is refined.
+            refine_focal: Whether that is to be done.
+
+        Returns:
+            Pose and camera; None if too few points agree.
+        """
         estimation = pycolmap.AbsolutePoseEstimationOptions(ransac=self._ransac(AGREEING_PX))
         refinement = pycolmap.AbsolutePoseRefinementOptions(
-            refine_focal_length=is_open, loss_function_scale=SIGMA_PX
+            refine_focal_length=refine_focal, loss_function_scale=SIGMA_PX
         )
-        best, most = None, (MIN_NUM_POINTS - 1, 0.0)
-        for zoom in ZOOMS if is_open else (1.0,):
-            trial = copy.copy(camera)
-            for index in trial.focal_length_idxs() if is_open else ():
-                trial.params[index] = zoom * prior.focal_px
-            found = pycolmap.estimate_and_refine_absolute_pose(
-                points, known, trial, estimation, refinement
-            )
-            if found:
-                rank = found["num_inliers"], -prior.cost(trial.mean_focal_length())
-                matrix = found["cam_from_world"].matrix()
-                if rank > most:
-                    best, most = ((matrix[:, :3], matrix[:, 3]), trial), rank
-        return best
+        found = pycolmap.estimate_and_refine_absolute_pose(
+            points2d, points3d, camera, estimation, refinement
+        )
+        if not found or found["num_inliers"] < MIN_NUM_POINTS:
+            return None
+        matrix = found["cam_from_world"].matrix()
+        prior = self.grower.adjuster.priors[camera.camera_id]
+        focal_cost = prior.cost(camera.mean_focal_length())
+        pose = matrix[:, :3], matrix[:, 3]
+        return _Resection(pose, camera, found["num_inliers"], focal_cost)
 
     def _ransac(self, max_error: float) -> pycolmap.RANSACOptions:
         seed = max(self.grower.native.random_seed, 0)
         return pycolmap.RANSACOptions(max_error=max_error, random_seed=seed)
+
+
+def _with_focal(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
+    """Return a copy of a camera with another focal length."""
+    changed = copy.copy(camera)
+    for index in changed.focal_length_idxs():
+        changed.params[index] = focal_px
+    return changed
+
+
+def _not_inside(models: Sequence[MappedModel], whole: MappedModel) -> list[MappedModel]:
+    """Leave out models all of whose images another one has."""
+    inside = set(whole.reconstruction.reg_image_ids())
+    found = list[MappedModel]()
+    for mapped in models:
+        if not inside.issuperset(mapped.reconstruction.reg_image_ids()):
+            found.append(mapped)
+    return found

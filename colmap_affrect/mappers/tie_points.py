@@ -7,6 +7,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,15 +19,25 @@ from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.project.report import Residual
 
 AGREEING_PX = 4.0 * SIGMA_PX  # residuals up to which a tie point agrees with a pose
-AGREES_IF_RIGHT, AGREES_BY_CHANCE = 0.9, 0.05
-"""Shares of tie points that agree with right places, as some marks are wrong, and with others."""
-MIN_NUM_POINTS = 4  # that must agree to place an image: three do so, of which others are the test
-MOST = 2.5  # nats: of images that six tie points alone hold twelve of thirteen stand right
-NUM_FREE = 3  # tie points that any place of an image can agree with
-NEAR, NUM_NEAR = 0.1, 5
-"""Depths of so many points near a mark, up to this part of the longer side, stand for its own."""
-ImageResidual = tuple[str, int, float]
-"""Name of a point, id of an image, and the reprojection error of the one in the other in px."""
+# Shares of tie points that agree (judged).
+AGREES_IF_RIGHT = 0.9  # with right poses: some marks are wrong
+AGREES_BY_CHANCE = 0.05  # with wrong poses
+MIN_NUM_POINTS = 4  # that must agree to register an image: three always do, the others are the test
+MAX_LOG_ODDS = 2.5
+"""Of an image by its tie points. Measured: of images that six tie points alone register, twelve of
+thirteen are right."""
+NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P)
+# A tie point that one image alone sees has the median depth of the points near its mark (judged).
+NEIGHBOR_RADIUS = 0.1  # of the longer side of the image
+NUM_NEIGHBORS = 5
+
+
+class ImageResidual(NamedTuple):
+    """How far a tie point is from its mark in an image."""
+
+    point: str  # name
+    image_id: int
+    error_px: float  # reprojection error
 
 
 @dataclass(frozen=True)
@@ -38,24 +49,10 @@ class TiePoints:
     def observe(self, model: pycolmap.Reconstruction) -> None:
         """Give a model a point for each tie point that two of its images see, with all of them."""
         for seen in self._seen(model).values():
-            if len(seen) < 2:
-                continue
-            marks = {i: model.images[i].points2D[k] for i, k in seen.items()}
-            known = {p.point3D_id for p in marks.values() if p.has_point3D()}
-            if len(known) == 1 and all(p.has_point3D() for p in marks.values()):
-                continue
-            places = {i: p.xy for i, p in marks.items()}
-            place = triangulated(model, places)
-            if place is None:  # they do not meet, and the residuals say so
-                place = _place_by_neighbors(model, *next(iter(places.items())))
-            if place is None:
-                continue
-            for point_id in known:
-                model.delete_point3D(point_id)
-            track = pycolmap.Track()
-            for image_id, keypoint in seen.items():
-                track.add_element(image_id, keypoint)
-            model.add_point3D(place, track)
+            if len(seen) > 1 and not _is_observed(model, seen):
+                position = _position(model, _marks(model, seen))
+                if position is not None:
+                    _replace_point(model, seen, position)
 
     def observed(
         self, model: pycolmap.Reconstruction
@@ -69,106 +66,166 @@ class TiePoints:
 
     def residuals(self, model: pycolmap.Reconstruction) -> list[ImageResidual]:
         """Return the residuals of all that a model observes."""
-        places = (
-            (n, i, m.xy, model.points3D[m.point3D_id].xyz) for n, i, m in self.observed(model)
-        )
-        return [(n, i, _errors_px(model, {i: xy}, place)[0]) for n, i, xy, place in places]
+        found = list[ImageResidual]()
+        for name, image_id, mark in self.observed(model):
+            position = model.points3D[mark.point3D_id].xyz
+            error_px = _error_px(model, image_id, mark.xy, position)
+            found.append(ImageResidual(name, image_id, error_px))
+        return found
 
     def report(self, model: pycolmap.Reconstruction) -> tuple[Residual, ...]:
         """Return the residuals as a report has them, the worst first."""
-        found = sorted(self.residuals(model), key=lambda residual: -residual[2])
-        return tuple(Residual(n, model.images[i].name, round(px, 2)) for n, i, px in found)
+        found = list[Residual]()
+        for residual in sorted(self.residuals(model), key=lambda residual: -residual.error_px):
+            name = model.images[residual.image_id].name
+            found.append(Residual(residual.point, name, round(residual.error_px, 2)))
+        return tuple(found)
 
-    def places(self, model: pycolmap.Reconstruction) -> dict[str, Array]:
-        """Return where a model has tie points: by two images, or else by depths near a mark."""
+    def positions(self, model: pycolmap.Reconstruction) -> dict[str, Array]:
+        """Return the (3,) positions in a model, by two images or else by depths near a mark."""
         found = {}
         for name, seen in self._seen(model).items():
-            xy = {i: model.images[i].points2D[k].xy for i, k in seen.items()}
-            place = triangulated(model, xy) if len(xy) > 1 else None
-            if place is None and xy:
-                place = _place_by_neighbors(model, *next(iter(xy.items())))
-            if place is not None:
-                found[name] = place
+            position = _position(model, _marks(model, seen)) if seen else None
+            if position is not None:
+                found[name] = position
         return found
 
     def misplaced(self, model: pycolmap.Reconstruction) -> list[int]:
-        """Return images of most of whose tie points two others agree that they are elsewhere."""
-        far, num = Counter[int](), Counter[int]()
+        """Return images that at least half of their tie points, by two other images, contradict."""
+        num_points = Counter[int]()
+        num_far = Counter[int]()
         for seen in self._seen(model).values():
-            xy = {i: model.images[i].points2D[k].xy for i, k in seen.items()}
-            for image_id in xy if len(xy) > 2 else ():
-                others = {i: mark for i, mark in xy.items() if i != image_id}
-                place = triangulated(model, others)
-                if place is None or max(_errors_px(model, others, place)) > AGREEING_PX:
+            if len(seen) < 3:
+                continue
+            marks = _marks(model, seen)
+            for image_id, xy in marks.items():
+                others = {i: mark for i, mark in marks.items() if i != image_id}
+                position = triangulated(model, others)
+                if position is None or _max_error_px(model, others, position) > AGREEING_PX:
                     continue
-                num[image_id] += 1
-                far[image_id] += _errors_px(model, {image_id: xy[image_id]}, place)[0] > AGREEING_PX
-        return [i for i, count in far.items() if count >= max(MIN_NUM_POINTS, num[i] / 2)]
+                num_points[image_id] += 1
+                num_far[image_id] += _error_px(model, image_id, xy, position) > AGREEING_PX
+        found = list[int]()
+        for image_id, num in num_far.items():
+            if num >= max(MIN_NUM_POINTS, num_points[image_id] / 2):
+                found.append(image_id)
+        return found
 
     def marks(self, image: pycolmap.Image) -> dict[str, Array]:
-        """Return where the points are in an image, px."""
-        seen = ((name, keypoints.get(image.image_id)) for name, keypoints in self.keypoints.items())
-        return {name: image.points2D[key].xy for name, key in seen if key is not None}
+        """Return the (2,) px of the points in an image, by name."""
+        found = {}
+        for name, keypoints in self.keypoints.items():
+            if image.image_id in keypoints:
+                found[name] = image.points2D[keypoints[image.image_id]].xy
+        return found
 
     def _seen(self, model: pycolmap.Reconstruction) -> dict[str, dict[int, int]]:
+        """Return the keypoints of each tie point in the images of a model, by name and image id."""
         inside = set(model.reg_image_ids())
-        return {
-            name: {i: key for i, key in keypoints.items() if i in inside}
-            for name, keypoints in self.keypoints.items()
-        }
+        found = {}
+        for name, keypoints in self.keypoints.items():
+            found[name] = {i: key for i, key in keypoints.items() if i in inside}
+        return found
 
 
 NONE = TiePoints({})
 
 
-def tied_evidence(residuals: Sequence[ImageResidual]) -> dict[int, float]:
-    """Return what residuals say for the places of images, by image id, in nats.
+def tie_point_log_odds(residuals: Sequence[ImageResidual]) -> dict[int, float]:
+    """Return the log odds of right against wrong poses, by image id.
 
-    Of points that three images see or more: two nearly always agree.
+    Only points that three images or more see count: two nearly always agree.
     """
-    errors, views = defaultdict[int, list[float]](list), Counter(name for name, *_ in residuals)
-    for name, image_id, error_px in residuals:
-        if views[name] > 2:
-            errors[image_id].append(error_px)
-    agreeing = math.log(AGREES_IF_RIGHT / AGREES_BY_CHANCE)
-    differing = math.log((1.0 - AGREES_IF_RIGHT) / (1.0 - AGREES_BY_CHANCE))
+    num_views = Counter(residual.point for residual in residuals)
+    errors_px = defaultdict[int, list[float]](list)
+    for residual in residuals:
+        if num_views[residual.point] > 2:
+            errors_px[residual.image_id].append(residual.error_px)
+    log_ratio_agreeing = math.log(AGREES_IF_RIGHT / AGREES_BY_CHANCE)
+    log_ratio_differing = math.log((1.0 - AGREES_IF_RIGHT) / (1.0 - AGREES_BY_CHANCE))
     found = {}
-    for image_id, of_image in errors.items():
-        num = sum(error_px <= AGREEING_PX for error_px in of_image)
-        nats = max(0, num - NUM_FREE) * agreeing + (len(of_image) - num) * differing
-        found[image_id] = min(nats, MOST)
+    for image_id, of_image in errors_px.items():
+        num_agreeing = sum(error_px <= AGREEING_PX for error_px in of_image)
+        num_differing = len(of_image) - num_agreeing
+        log_odds = max(0, num_agreeing - NUM_FREE) * log_ratio_agreeing
+        log_odds += num_differing * log_ratio_differing
+        found[image_id] = min(log_odds, MAX_LOG_ODDS)
     return found
 
 
 def tie_points_of(task: MappingTask, graph: PairGraph) -> TiePoints:
     """Return the tie points of a task, by the ids of its images."""
     ids = {name: image_id for image_id, name in graph.names.items()}
-    found = task.tie_points.items()
-    return TiePoints({p: {ids[name]: key for name, key in seen.items()} for p, seen in found})
+    keypoints = {}
+    for point, seen in task.tie_points.items():
+        keypoints[point] = {ids[name]: keypoint for name, keypoint in seen.items()}
+    return TiePoints(keypoints)
 
 
-def _errors_px(
-    model: pycolmap.Reconstruction, marks: Mapping[int, Array], place: Array
-) -> list[float]:
-    """Return reprojection errors, those of a point behind the camera as large as the image."""
-    found = []
-    for image_id, xy in marks.items():
-        image = model.images[image_id]
-        camera, projected = model.cameras[image.camera_id], image.project_point(place)
-        largest = math.hypot(camera.width, camera.height)
-        found.append(largest if projected is None else min(largest, math.dist(projected, xy)))
-    return found
+def _marks(model: pycolmap.Reconstruction, seen: Mapping[int, int]) -> dict[int, Array]:
+    """Return the (2,) px of keypoints, by image id."""
+    return {i: model.images[i].points2D[keypoint].xy for i, keypoint in seen.items()}
 
 
-def _place_by_neighbors(model: pycolmap.Reconstruction, image_id: int, xy: Array) -> Array | None:
+def _is_observed(model: pycolmap.Reconstruction, seen: Mapping[int, int]) -> bool:
+    """Tell whether keypoints all observe one point of a model."""
+    marks = [model.images[i].points2D[keypoint] for i, keypoint in seen.items()]
+    points = {mark.point3D_id for mark in marks}
+    return len(points) == 1 and all(mark.has_point3D() for mark in marks)
+
+
+def _replace_point(
+    model: pycolmap.Reconstruction, seen: Mapping[int, int], position: Array
+) -> None:
+    """Let keypoints observe a new point, in the place of all that they have observed."""
+    track = pycolmap.Track()
+    for image_id, keypoint in seen.items():
+        mark = model.images[image_id].points2D[keypoint]
+        if mark.has_point3D():
+            model.delete_point3D(mark.point3D_id)
+        track.add_element(image_id, keypoint)
+    model.add_point3D(position, track)
+
+
+def _position(model: pycolmap.Reconstruction, marks: Mapping[int, Array]) -> Array | None:
+    """Return the position of a point with marks in some images, None where they do not tell it."""
+    position = triangulated(model, marks) if len(marks) > 1 else None
+    if position is not None:
+        return position
+    # Where rays do not meet, the residuals will say so.
+    image_id, xy = next(iter(marks.items()))
+    return _position_by_neighbors(model, image_id, xy)
+
+
+def _error_px(model: pycolmap.Reconstruction, image_id: int, xy: Array, position: Array) -> float:
+    """Return a reprojection error, at most the diagonal of the image, also of points behind it."""
+    image = model.images[image_id]
+    camera = model.cameras[image.camera_id]
+    diagonal = math.hypot(camera.width, camera.height)
+    projected = image.project_point(position)
+    return diagonal if projected is None else min(diagonal, math.dist(projected, xy))
+
+
+def _max_error_px(
+    model: pycolmap.Reconstruction, marks: Mapping[int, Array], position: Array
+) -> float:
+    return max(_error_px(model, image_id, xy, position) for image_id, xy in marks.items())
+
+
+def _position_by_neighbors(
+    model: pycolmap.Reconstruction, image_id: int, xy: Array
+) -> Array | None:
     """Return where the ray of a mark is as deep as the points that the image sees around it."""
-    image, camera = model.images[image_id], model.cameras[model.images[image_id].camera_id]
+    image = model.images[image_id]
+    camera = model.cameras[image.camera_id]
     seen = image.get_observation_points2D()
     distances = np.array([np.linalg.norm(point.xy - xy) for point in seen])
-    near = np.argsort(distances)[:NUM_NEAR]
-    if len(near) < NUM_NEAR or distances[near[-1]] > NEAR * max(camera.width, camera.height):
+    nearest = np.argsort(distances)[:NUM_NEIGHBORS]
+    if len(nearest) < NUM_NEIGHBORS:
+        return None
+    if distances[nearest[-1]] > NEIGHBOR_RADIUS * max(camera.width, camera.height):
         return None
     pose = image.cam_from_world()
-    depths = [(pose * model.points3D[seen[i].point3D_id].xyz)[2] for i in near]
+    depths = [(pose * model.points3D[seen[i].point3D_id].xyz)[2] for i in nearest]
     ray = np.append(np.asarray(camera.cam_from_img(xy)).ravel(), 1.0)
     return np.asarray(pose.inverse() * (np.median(depths) * ray))

@@ -1,6 +1,7 @@
-"""What a matcher is: it finds which features of two images may show the same.
+"""The protocol of matchers, their common options, and their registry.
 
-Entry points are in the group ``colmap_affrect.matchers``. Several threads may call an object.
+A matcher finds which features of two images may show the same point. Matchers of other packages
+are entry points of the group ``colmap_affrect.matchers``. Several threads may call one object.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,9 @@ from colmap_affrect.features.base import NetworkContext, NetworkOptions
 from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.options import Registry, within
 
-ROUNDING = np.float32(1e-6)  # similarities that near to 1 are equal: two copies have ratio 1
+# Rounding error of a float32 cosine of unit rows of 128 values. Distances below its root count as
+# equal, so that the ratio of two copies of one descriptor is 1.
+COSINE_ROUNDING = np.float32(1e-6)
 
 
 class MatcherOptions(NetworkOptions):
@@ -32,34 +35,48 @@ class MatcherOptions(NetworkOptions):
 
 @dataclass(frozen=True)
 class MatcherContext(NetworkContext):
-    """What a matcher works with."""
+    """What a matcher works with, beside its options."""
 
-    device: str = "auto"  # as given
-    num_similarities: float = 0  # about how many pairs of features will be compared in all
+    device: str = "auto"  # as given by the user
 
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What a matcher is given of an image."""
+    """The features of one image, as matchers get them."""
 
-    features: LocalFeatures  # also of warps (``rectification_ids``)
+    features: LocalFeatures  # those of warps too (``rectification_ids``)
     image_size: tuple[int, int]  # (width, height) of the stored image in px
-    extractor: str  # kind of the features, mostly the name of their extractor
+    extractor: str  # kind of the features, usually the name of their extractor
 
 
 @dataclass(frozen=True)
 class Matches:
     """Matches of two images before geometric verification, one to one."""
 
-    # (M, 2) int64 features of image 1 and 2, strictly rising in column 0, and no feature twice in
-    # column 1: verification and tracks count on it
+    # (M, 2) int64 features of image 1 and 2. Column 0 is strictly rising, and column 1 has no
+    # feature twice: verification and tracks rely on it.
     indices: Indices
     scores: Singles  # (M,) float32 in [0, 1], larger is better
 
     @classmethod
     def none(cls) -> Self:
-        """Return the result for images that have nothing in common."""
+        """Return the matches of images that have nothing in common."""
         return cls(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+
+    def fault(self, num_first: int, num_second: int) -> str:
+        """Say what is wrong for images with so many features; empty if nothing is."""
+        indices = np.asarray(self.indices)
+        scores = np.asarray(self.scores)
+        if not np.issubdtype(indices.dtype, np.integer):
+            return "indices that are no integers"
+        if indices.shape != (len(scores), 2) or scores.ndim != 1:
+            return f"indices of shape {indices.shape} and scores of shape {scores.shape}"
+        if (indices < 0).any() or (indices >= (num_first, num_second)).any():
+            return "indices of features that there are not"
+        rows, columns = indices.T
+        if (np.diff(rows) <= 0).any() or len(np.unique(columns)) < len(columns):
+            return "features that are matched twice, or not in order"
+        return "" if ((scores >= 0.0) & (scores <= 1.0)).all() else "scores that are not in [0, 1]"
 
 
 class Matcher(Protocol):
@@ -69,7 +86,15 @@ class Matcher(Protocol):
         """Return what :meth:`match` needs of an image, with its memory as attribute ``nbytes``."""
 
     def match(self, first: Any, second: Any) -> Matches:
-        """Match two prepared images one to one (:class:`Matches`). Either may have no features."""
+        """Match two prepared images.
+
+        Args:
+            first: prepared image 1.
+            second: prepared image 2; either may have no features.
+
+        Returns:
+            Matches, one to one.
+        """
 
 
 MATCHERS: Registry[Matcher] = Registry(
@@ -80,10 +105,16 @@ MATCHERS: Registry[Matcher] = Registry(
         "lightglue": "colmap_affrect.matchers.lightglue:LightGlue",
     },
     default="nearest",
+    protocol=Matcher,
+    options_base=MatcherOptions,
 )
 
 
-def distance_ratios(first: Singles, second: Singles) -> Singles:
-    """Return the ratios of distances of unit vectors with these similarities."""
-    distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
-    return np.asarray(np.sqrt(np.divide(*distances)))
+def distance_ratios(nearest_cosines: Singles, second_cosines: Singles) -> Singles:
+    """Return the (N,) ratios of the distances of unit rows to two neighbours.
+
+    Both arguments are (N,) cosines: with the nearest neighbour, and with the second nearest.
+    """
+    nearest_squares = np.maximum(1.0 - nearest_cosines, COSINE_ROUNDING)
+    second_squares = np.maximum(1.0 - second_cosines, COSINE_ROUNDING)
+    return np.asarray(np.sqrt(nearest_squares / second_squares))

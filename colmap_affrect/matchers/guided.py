@@ -1,12 +1,13 @@
-"""Guided matching: the features of a pair once more, where its two-view geometry allows a match.
+"""Guided matching: a verified pair is matched again, near its two-view geometry only.
 
-Only features near an epipolar line, or near the place that a homography gives, are compared; among
-these few many more pass the ratio test, which gives more tracks through three images.
+A feature is compared with those near its epipolar line, or near the position that a homography
+gives. Among so few of them many more matches pass the ratio test, which gives more tracks through
+three images.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
-from typing import Annotated, Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, Self
 
 import numpy as np
 
@@ -17,11 +18,18 @@ from colmap_affrect.geometry.two_views import homogeneous
 from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
 
-BANDS_BESIDE = 6.0  # distance, in bands, of the geometry beside that counts accidental matches
-MAX_ACCIDENTAL = 0.5  # share of guided matches that are found beside, above which none counts
-GROUP_ROWS = 48  # compared at once: more take longer in products, fewer in Python
+DISPLACEMENT_BANDS = 6.0
+"""Displacement, in half widths of the band, of the geometry whose matches are all accidental: the
+bands of both do not overlap, and image content is still similar there."""
+MAX_ACCIDENTAL_SHARE = 0.5
+"""Accidental matches for each guided match, above which guided matches prove nothing; judged."""
+HOMOGRAPHY_BANDS = 2.0
+"""Radius, in half widths of the band, around the position that a homography gives: planes are
+never quite plane; judged."""
+GROUP_SIZE = 48
+"""Features of image 1 compared at once: with more, products take longer, with fewer Python does."""
+SECOND_IS_OPPOSITE = -1.0  # cosine that stands in for a second neighbour where there is none
 TINY = np.finfo(float).tiny
-BANDS_OF_HOMOGRAPHY = 2.0  # radius round the place of a homography: planes are never quite plane
 
 
 class GuidedOptions(Options):
@@ -54,114 +62,206 @@ def guided_matches(
     inliers: Indices,
     options: GuidedOptions,
 ) -> Indices:
-    """Return the (M, 2) inliers of a pair and its guided matches, one to one, as (K, 2).
+    """Return the inliers of a pair together with its guided matches, one to one.
 
-    They rise by features of image 1; all inliers stay. There are no others where too many are
-    found beside the geometry (:data:`MAX_ACCIDENTAL`): they are accidental.
+    All inliers stay. No guided match is added where a displaced geometry, of which all matches are
+    accidental, has too many of them (:data:`MAX_ACCIDENTAL_SHARE`).
 
     Args:
         descriptors: (N, D) float32 rows of unit length of both images.
-        shapes: (N, 2, 2) linear parts of their frames, up to a factor; None without directions.
+        shapes: (N, 2, 2) linear parts of the LAFs, up to a factor; None without orientations.
         model: geometry of the pair, with the points of all features; those with NaN match nothing.
         inliers: (M, 2) features that are matched already.
         options: what counts as a match.
+
+    Returns:
+        (K, 2) features of image 1 and 2, rising in the first column.
     """
     sign = 1.0
     if shapes and model.has_sign:
-        sign = epipolar.common_sign(model.cosines(inliers[:, 0], inliers[:, 1], shapes))
+        cosines = model.cosines(inliers[:, 0], inliers[:, 1], shapes)
+        sign = epipolar.common_sign(cosines)
 
-    def matched(model: epipolar.PairModel) -> Indices:
-        matches = nearest_allowed(descriptors, model, options)
+    def match(geometry: epipolar.PairModel) -> Indices:
+        matches = match_near_geometry(descriptors, geometry, options)
         if not shapes:
             return matches
-        cosines = sign * model.cosines(matches[:, 0], matches[:, 1], shapes)
-        return np.asarray(matches[cosines >= np.cos(np.radians(options.max_angle_deg))])
+        cosines = sign * geometry.cosines(matches[:, 0], matches[:, 1], shapes)
+        is_consistent = cosines >= np.cos(np.radians(options.max_angle_deg))
+        return np.asarray(matches[is_consistent])
 
-    found, beside = matched(model), map(matched, _beside(model, options.band_px))
-    num_accidental = min(np.count_nonzero(~rows_in(matches, found)) for matches in beside)
-    if num_accidental > MAX_ACCIDENTAL * len(found):
+    found = match(model)
+    accidental_counts = []
+    for displaced in _displaced_geometries(model, options.band_px):
+        is_accidental = ~rows_in(match(displaced), found)
+        accidental_counts.append(np.count_nonzero(is_accidental))
+    if min(accidental_counts) > MAX_ACCIDENTAL_SHARE * len(found):
         return inliers
-    free = ~(np.isin(found[:, 0], inliers[:, 0]) | np.isin(found[:, 1], inliers[:, 1]))
-    both = np.concatenate([inliers, found[free]])
-    return np.asarray(both[np.argsort(both[:, 0], kind="stable")])
+    is_taken1 = np.isin(found[:, 0], inliers[:, 0])
+    is_taken2 = np.isin(found[:, 1], inliers[:, 1])
+    added = found[~(is_taken1 | is_taken2)]
+    matches = np.concatenate([inliers, added])
+    order = np.argsort(matches[:, 0], kind="stable")
+    return np.asarray(matches[order])
 
 
-def nearest_allowed(
-    descriptors: tuple[Singles, Singles], model: epipolar.PairModel, options: GuidedOptions
+def match_near_geometry(
+    descriptors: tuple[Singles, Singles],
+    model: epipolar.PairModel,
+    options: GuidedOptions,
 ) -> Indices:
-    """Return the (M, 2) mutual nearest neighbours that may match; see :func:`guided_matches`."""
-    (descriptors1, descriptors2), points2 = descriptors, model.points[1]
-    count1 = len(descriptors1)
-    forward, accepted = np.full(count1, -1), np.zeros(count1, bool)
-    backward, highest = np.full(len(points2), -1), np.full(len(points2), -1.0, np.float32)
-    for rows, near in _allowed(model, options.band_px):
-        columns = np.flatnonzero(near.any(axis=0))
-        if not len(columns):
+    """Return mutual nearest neighbours among the features that a geometry allows to match.
+
+    Args:
+        descriptors: (N, D) float32 rows of unit length of both images.
+        model: geometry of the pair, with the points of all features; those with NaN match nothing.
+        options: width of the band, smallest cosine and ratio test (FGINN).
+
+    Returns:
+        (M, 2) features of image 1 and 2, rising in the first column.
+    """
+    descriptors1, descriptors2 = descriptors
+    points2 = model.points[1]
+    nearest2 = np.full(len(descriptors1), -1)
+    is_distinctive = np.zeros(len(descriptors1), bool)
+    nearest1 = _NearestOfFirst.none(len(points2))
+    for features1, is_allowed in _allowed_groups(model, options.band_px):
+        features2 = np.flatnonzero(is_allowed.any(axis=0))
+        if not len(features2):
             continue
-        similarity = descriptors1[rows] @ descriptors2[columns].T
-        similarity[~near[:, columns]] = -1.0
-        best = similarity.argmax(axis=1)
-        value = similarity[np.arange(len(rows)), best]
-        forward[rows] = columns[best]
-        top = similarity.argmax(axis=0)
-        top_value = similarity[top, np.arange(len(columns))]
-        better = (top_value > highest[columns]) | (
-            (top_value == highest[columns]) & (rows[top] < backward[columns])
-        )
-        highest[columns[better]], backward[columns[better]] = top_value[better], rows[top[better]]
-        alike = np.flatnonzero(value > options.min_cosine)
-        chosen, others = points2[columns[best[alike]]], similarity[alike]
-        beside = np.linalg.norm(chosen[:, None] - points2[columns], axis=2)
-        others[beside <= options.min_contrast_distance_px] = -1.0
-        # A second neighbour that is missing is an opposite one.
-        ratios = distance_ratios(value[alike], others.max(axis=1))
-        accepted[rows[alike]] = ratios < options.max_ratio
-    kept = np.flatnonzero(accepted)
-    kept = kept[backward[forward[kept]] == kept]
-    return np.stack([kept, forward[kept]], axis=1)
+        cosines = descriptors1[features1] @ descriptors2[features2].T
+        cosines[~is_allowed[:, features2]] = SECOND_IS_OPPOSITE
+        nearest1.update(features1, features2, cosines)
+        best = cosines.argmax(axis=1)
+        nearest2[features1] = features2[best]
+        distinctive = _distinctive_rows(cosines, best, points2[features2], options)
+        is_distinctive[features1[distinctive]] = True
+    kept1 = np.flatnonzero(is_distinctive)
+    is_mutual = nearest1.features[nearest2[kept1]] == kept1
+    kept1 = kept1[is_mutual]
+    return np.stack([kept1, nearest2[kept1]], axis=1)
 
 
-def _beside(model: epipolar.PairModel, band_px: float) -> list[epipolar.PairModel]:
-    """Return geometries that are moved away in image 2: in one of them nothing is right.
+@dataclass
+class _NearestOfFirst:
+    """The most similar feature of image 1 so far, for each feature of image 2."""
 
-    Across most epipolar lines; of a homography along both axes, for what lies before or behind its
-    plane is along one direction only.
+    features: Indices  # (N,) of image 1; -1: none yet
+    cosines: Singles  # (N,) of their descriptors
+
+    @classmethod
+    def none(cls, num_features: int) -> Self:
+        cosines = np.full(num_features, -1.0, np.float32)
+        return cls(np.full(num_features, -1), cosines)
+
+    def update(self, features1: Indices, features2: Indices, cosines: Singles) -> None:
+        """Take in the cosines of some features of both images.
+
+        Args:
+            features1: (R,) of image 1.
+            features2: (C,) of image 2.
+            cosines: (R, C) of their descriptors.
+        """
+        best = cosines.argmax(axis=0)
+        best_cosines = cosines[best, np.arange(len(features2))]
+        known_cosines = self.cosines[features2]
+        # Among equal ones the first feature counts, whatever the order of groups.
+        is_earlier = features1[best] < self.features[features2]
+        is_better = best_cosines > known_cosines
+        is_better |= (best_cosines == known_cosines) & is_earlier
+        self.cosines[features2[is_better]] = best_cosines[is_better]
+        self.features[features2[is_better]] = features1[best[is_better]]
+
+
+def _distinctive_rows(
+    cosines: Singles, best: Indices, points2: Array, options: GuidedOptions
+) -> Indices:
+    """Return which of R features are similar to their nearest neighbour, and to no other.
+
+    Args:
+        cosines: (R, C) of the descriptors of R features of image 1 and C of image 2.
+        best: (R,) column of the nearest neighbour of each.
+        points2: (C, 2) px.
+        options: smallest cosine and ratio test.
+    """
+    best_cosines = cosines[np.arange(len(best)), best]
+    rows = np.flatnonzero(best_cosines > options.min_cosine)
+    other_cosines = cosines[rows]
+    nearest_points = points2[best[rows]]
+    distances = np.linalg.norm(nearest_points[:, None] - points2, axis=2)
+    other_cosines[distances <= options.min_contrast_distance_px] = SECOND_IS_OPPOSITE
+    ratios = distance_ratios(best_cosines[rows], other_cosines.max(axis=1))
+    return np.asarray(rows[ratios < options.max_ratio])
+
+
+def _displaced_geometries(model: epipolar.PairModel, band_px: float) -> list[epipolar.PairModel]:
+    """Return geometries whose points of image 2 are moved away: one of them has no true matches.
+
+    They are moved across most epipolar lines. Of a homography they are moved along both axes: what
+    lies before or behind its plane is displaced along one direction only.
     """
     points1, points2 = model.points
-    across = np.eye(2)
+    directions = np.eye(2)
     if isinstance(model, epipolar.EpipolarModel):
-        normals = epipolar.epipolar_lines(model.fundamental, points1, points2)[1][:, :2]
+        _, lines2 = epipolar.epipolar_lines(model.fundamental, points1, points2)
+        normals = lines2[:, :2]
         normals = normals[np.isfinite(normals).all(axis=1)]
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), TINY)
-        across = np.linalg.eigh(normals.T @ normals)[1][:, 1:].T
-    steps = BANDS_BESIDE * band_px * across
-    return [replace(model, points=(points1, points2 + step)) for step in steps]
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / np.maximum(lengths, TINY)
+        _, eigenvectors = np.linalg.eigh(normals.T @ normals)
+        directions = eigenvectors[:, 1:].T
+    displacements = DISPLACEMENT_BANDS * band_px * directions
+    return [replace(model, points=(points1, points2 + shift)) for shift in displacements]
 
 
-def _allowed(model: epipolar.PairModel, band_px: float) -> Iterator[tuple[Indices, Bools]]:
-    """Yield (R,) features of image 1, each once, and (R, N) which of image 2 they may match.
+def _allowed_groups(model: epipolar.PairModel, band_px: float) -> Iterator[tuple[Indices, Bools]]:
+    """Yield groups of features of image 1, and which features of image 2 they may match.
 
-    Those of a group lie beside each other, so that they may match few.
+    The features of a group have similar epipolar lines or positions, so that they may match few.
+
+    Args:
+        model: geometry of the pair, with the points of all features.
+        band_px: half width of the band around epipolar lines.
+
+    Yields:
+        (R,) features of image 1, each in one group, and (R, N) which of image 2 are allowed.
     """
-    points1, points2 = model.points
     if isinstance(model, epipolar.HomographyModel):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            places = project(model.matrix, points1)
-        radius = BANDS_OF_HOMOGRAPHY * band_px
-        for rows in _groups(places[:, 1]):
-            x, y = (places[rows, axis, None] - points2[:, axis] for axis in (0, 1))
-            yield rows, x**2 + y**2 <= radius**2
-        return
+        return _groups_near_positions(model, HOMOGRAPHY_BANDS * band_px)
+    return _groups_near_lines(model, band_px)
+
+
+def _groups_near_positions(
+    model: epipolar.HomographyModel, radius_px: float
+) -> Iterator[tuple[Indices, Bools]]:
+    points1, points2 = model.points
+    with np.errstate(divide="ignore", invalid="ignore"):
+        positions = project(model.matrix, points1)
+    for group in _groups_by(positions[:, 1]):
+        x = positions[group, 0, None] - points2[:, 0]
+        y = positions[group, 1, None] - points2[:, 1]
+        yield group, x**2 + y**2 <= radius_px**2
+
+
+def _groups_near_lines(
+    model: epipolar.EpipolarModel, band_px: float
+) -> Iterator[tuple[Indices, Bools]]:
+    """Compare Sampson's distance with the band, without a division for each pair of features."""
+    points1, points2 = model.points
     lines1, lines2 = epipolar.epipolar_lines(model.fundamental, points1, points2)
-    squares1, squares2 = ((lines[:, :2] ** 2).sum(axis=1) for lines in (lines1, lines2))
+    squares1 = (lines1[:, :2] ** 2).sum(axis=1)
+    squares2 = (lines2[:, :2] ** 2).sum(axis=1)
     homogeneous2 = homogeneous(points2)
-    _, scales, axes = np.linalg.svd(model.fundamental)
-    along = homogeneous(points1) @ axes[:2].T * scales[:2]
-    for rows in _groups(np.arctan2(along[:, 0], along[:, 1]) % np.pi):  # angles in the pencil
-        squares = squares2[rows, None] + squares1
-        yield rows, (lines2[rows] @ homogeneous2.T) ** 2 <= band_px**2 * squares
+    _, singular_values, axes = np.linalg.svd(model.fundamental)
+    coordinates = homogeneous(points1) @ axes[:2].T * singular_values[:2]
+    pencil_angles = np.arctan2(coordinates[:, 0], coordinates[:, 1]) % np.pi
+    for group in _groups_by(pencil_angles):
+        squares = squares2[group, None] + squares1
+        products = lines2[group] @ homogeneous2.T
+        yield group, products**2 <= band_px**2 * squares
 
 
-def _groups(values: Array) -> list[Indices]:
-    """Sort by values and cut into groups."""
-    return np.split(np.argsort(values), range(GROUP_ROWS, len(values), GROUP_ROWS))
+def _groups_by(values: Array) -> list[Indices]:
+    """Return groups of neighbours in the order of values."""
+    order = np.argsort(values)
+    return np.split(order, range(GROUP_SIZE, len(values), GROUP_SIZE))

@@ -1,8 +1,8 @@
 """LightGlue (Lindenberger, Sarlin, Pollefeys, ICCV 2023), built by kornia.
 
-LightGlue reads positions, so it takes the features of one view: the image, or one of its warps, in
-px of the view. Of images with warps the pairs of views with most mutual nearest neighbours are
-matched, and the matches united.
+LightGlue reads the positions of features, so it matches one view at a time, in px of that view: the
+image, or one of its warps. Of two images with warps, it matches the pairs of views with most mutual
+nearest neighbours, and the matches are merged.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import load_state_dict, unusable
-from colmap_affrect.geometry.arrays import Array, Indices, Singles
+from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.geometry.tilts import of_unit_area
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, MatcherOptions, Matches
@@ -31,9 +31,13 @@ from colmap_affrect.parallel.executor import one_openmp_thread
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-MIN_VIEW_FEATURES = 8  # of a view: no geometry could be verified by what fewer add
-CHUNK_ROWS = 1 << 10  # features whose similarities are held at once, which bounds memory
-DUPLICATE_RADIUS_PX = 2.0  # of nearer matches of several views, at both ends, the best stays
+MIN_VIEW_FEATURES = 8
+"""Features that a warp needs: matches of fewer could verify no two-view geometry (theory: the
+linear estimate of a fundamental matrix needs eight)."""
+DUPLICATE_RADIUS_PX = 2.0
+"""Of matches that are nearer than this in both images the best stays; the radius of a duplicate in
+:class:`.nearest.NearestOptions`."""
+CHUNK_ROWS = 1 << 10  # descriptors that are compared at once, which bounds memory
 
 
 class LightGlueOptions(MatcherOptions):
@@ -68,30 +72,32 @@ class LightGlueOptions(MatcherOptions):
 
 @dataclass(frozen=True)
 class PreparedView:
-    """One view of an image as the network takes it."""
+    """One view of an image, ready for the network."""
 
-    rows: Indices  # (N,) of the image's features
-    inputs: dict[str, Tensor]  # the network's, a batch of one
+    rows: Indices  # (N,) features of the image that the view has, rising
+    inputs: dict[str, Tensor]  # arguments of the network, a batch of one
 
 
 @dataclass(frozen=True)
-class PreparedViews:
-    """All views of an image that have features enough, and (N, 2) centres of all features, px."""
+class PreparedImage:
+    """All views of an image that have enough features."""
 
     views: tuple[PreparedView, ...]
-    keypoints: Array
+    keypoints: Array  # (N, 2) px of all features in the image
 
     @property
     def nbytes(self) -> int:
         """Memory of all arrays."""
-        tensors = (tensor for view in self.views for tensor in view.inputs.values())
-        return self.keypoints.nbytes + sum(tensor.nbytes for tensor in tensors)
+        total = self.keypoints.nbytes
+        for view in self.views:
+            total += sum(tensor.nbytes for tensor in view.inputs.values())
+        return total
 
 
 class LightGlue:
-    """Matches with one network, a pair of views at a time.
+    """Matches pairs of views with one network.
 
-    On a CPU each thread uses one core, so that results do not depend on their number.
+    On a CPU each thread uses one core, so that results do not depend on the number of threads.
     """
 
     Options = LightGlueOptions
@@ -100,58 +106,77 @@ class LightGlue:
         """Load the network; AffrectError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import resolve_device
 
-        self.options, self._device = options, resolve_device(context.device)
+        self.options = options
+        self._device = resolve_device(context.device)
         (key,) = options.weights
-        self._network = load_network(context.weights[key], options).to(self._device)
+        network = load_network(context.weights[key], options)
+        self._network = network.to(self._device)
         self._gpu_lock = threading.Lock()
 
-    def prepare(self, image: ImageFeatures) -> PreparedViews:
-        """Bring the features of each view into its own coordinates."""
+    def prepare(self, image: ImageFeatures) -> PreparedImage:
+        """Bring the features of each view into the coordinates of that view."""
         self.options.require_extractor(image.extractor)
         features = image.features
         views = []
-        for number in np.unique(features.rectification_ids):
-            rows = np.flatnonzero(features.rectification_ids == number)
-            if len(rows) < MIN_VIEW_FEATURES and number:
+        for view_id in np.unique(features.rectification_ids):
+            rows = np.flatnonzero(features.rectification_ids == view_id)
+            is_warp = view_id != 0
+            if is_warp and len(rows) < MIN_VIEW_FEATURES:
                 continue
             order = np.argsort(-features.responses[rows], kind="stable")
-            rows = np.sort(rows[order[: self.options.max_num_features]])
+            strongest = order[: self.options.max_num_features]
+            rows = np.sort(rows[strongest])
             inputs = network_inputs(features.select(rows), image.image_size)
             views.append(PreparedView(rows, inputs))
-        return PreparedViews(tuple(views), features.keypoints)
+        return PreparedImage(tuple(views), features.keypoints)
 
-    def match(self, first: PreparedViews, second: PreparedViews) -> Matches:
-        """Match two images; scores are the network's."""
-        pairs = list(product(first.views, second.views))
+    def match(self, first: PreparedImage, second: PreparedImage) -> Matches:
+        """Match two images; scores are the network's.
+
+        Args:
+            first: prepared image 1.
+            second: prepared image 2; either may have no features.
+
+        Returns:
+            Matches, one to one.
+        """
+        view_pairs = list(product(first.views, second.views))
         limit = self.options.max_num_view_pairs
-        if limit and len(pairs) > limit:
-            pairs = promising(first.views, second.views, limit)
-        parts = [self._match_views(*pair) for pair in pairs]
-        return parts[0] if len(parts) == 1 else united(parts, first.keypoints, second.keypoints)
+        if limit and len(view_pairs) > limit:
+            view_pairs = most_similar_views(first.views, second.views, limit)
+        parts = [self._match_views(*pair) for pair in view_pairs]
+        if len(parts) == 1:
+            return parts[0]
+        return merged_matches(parts, first.keypoints, second.keypoints)
 
     def _match_views(self, first: PreparedView, second: PreparedView) -> Matches:
         if not len(first.rows) or not len(second.rows):
             return Matches.none()
         import torch
 
-        torch.get_num_threads()  # lets torch set up this thread, which would undo the next line
-        alone = one_openmp_thread() if self._device.type == "cpu" else self._alone_on_gpu()
-        with torch.inference_mode(), alone:
-            found = self._network({
-                f"image{k}": {name: tensor.to(self._device) for name, tensor in view.inputs.items()}
-                for k, view in enumerate((first, second))
-            })  # fmt: skip
-            rows, columns = found["matches"][0].cpu().numpy().T
-            scores = found["scores"][0].float().cpu().numpy()
-        order = np.argsort(rows, kind="stable")
-        indices = np.stack([first.rows[rows], second.rows[columns]], axis=1)
+        torch.get_num_threads()  # lets torch set up this thread, which would undo the next lines
+        is_on_cpu = self._device.type == "cpu"
+        limited = one_openmp_thread() if is_on_cpu else self._alone_on_gpu()
+        with torch.inference_mode(), limited:
+            batch = {"image0": self._on_device(first), "image1": self._on_device(second)}
+            output = self._network(batch)
+            matched = output["matches"][0].cpu().numpy()
+            scores = output["scores"][0].float().cpu().numpy()
+        rows1 = first.rows[matched[:, 0]]
+        rows2 = second.rows[matched[:, 1]]
+        order = np.argsort(matched[:, 0], kind="stable")
+        indices = np.stack([rows1, rows2], axis=1)
         return Matches(indices[order], scores[order])
+
+    def _on_device(self, view: PreparedView) -> dict[str, Tensor]:
+        return {name: tensor.to(self._device) for name, tensor in view.inputs.items()}
 
     @contextmanager
     def _alone_on_gpu(self) -> Iterator[None]:
-        """Wait for other threads, and keep cuDNN out: it makes a plan for every number of features.
+        """Wait for other threads, and use no attention of cuDNN.
 
-        Nearly every layer has another one, and to make a plan takes longer than all else.
+        cuDNN makes a plan for each number of features, which takes longer than all else: nearly
+        every layer has another number.
         """
         from torch.nn.attention import SDPBackend, sdpa_kernel
 
@@ -161,7 +186,7 @@ class LightGlue:
 
 
 def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
-    """Build kornia's LightGlue with the parameters in a file, all of them, else AffrectError."""
+    """Build kornia's LightGlue with the parameters in a file; AffrectError unless it has all."""
     from kornia.feature import LightGlue as Network
 
     configuration = {
@@ -172,92 +197,140 @@ def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
         "filter_threshold": options.min_score,
     }
     network = Network(features=None, **configuration)  # type: ignore[arg-type]
-    state = {renamed(name): value for name, value in load_state_dict(path).items()}
-    not_these = "not the weights of LightGlue for ALIKED"
+    state = {}
+    for name, value in load_state_dict(path).items():
+        state[kornia_name(name)] = value
+    problem = "not the weights of LightGlue for ALIKED"
     try:
-        found = network.load_state_dict(state, strict=False)
+        loaded = network.load_state_dict(state, strict=False)
     except RuntimeError as error:
-        raise unusable(path, f"{not_these} (of another size)") from error
+        raise unusable(path, f"{problem} (of another size)") from error
     parameters = dict(network.named_parameters())
-    if missing := [name for name in found.missing_keys if name in parameters]:
-        raise unusable(path, f"{not_these} (no {missing[0]})")
+    for name in loaded.missing_keys:
+        if name in parameters:
+            raise unusable(path, f"{problem} (no {name})")
     return network.eval().requires_grad_(False)
 
 
-def renamed(name: str) -> str:
-    """Return kornia's name of a parameter in LightGlue's first files.
+def kornia_name(name: str) -> str:
+    """Return kornia's name of a parameter in the files of LightGlue's authors.
 
-    >>> renamed("self_attn.3.out_proj.bias")
+    >>> kornia_name("self_attn.3.out_proj.bias")
     'transformers.3.self_attn.out_proj.bias'
     """
     return re.sub(r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1.", name)
 
 
 def network_inputs(features: LocalFeatures, image_size: tuple[int, int]) -> dict[str, Tensor]:
-    """Return what the network reads of a view, in pixel-centre px as in training."""
-    import torch
+    """Return what the network reads of one view, in pixel-centre px as in training.
 
-    points, size = features.keypoints, np.asarray(image_size, np.float64)
+    The image has ``image_size``, (width, height) in px.
+    """
+    points = features.keypoints
+    size = np.asarray(image_size, np.float64)
     if features.rectification_ids[0]:
-        points, size = points_of_view(features.lafs)
-    values = {"keypoints": np.clip(points, 0.0, size), "image_size": size}
+        points, size = unwarped_points(features.lafs)
     return {
-        name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
-        for name, array in (*values.items(), ("descriptors", features.descriptors))
+        "keypoints": _as_batch(np.clip(points, 0.0, size)),
+        "image_size": _as_batch(size),
+        "descriptors": _as_batch(features.descriptors),
     }
 
 
-def points_of_view(lafs: Array) -> tuple[Array, Array]:
-    """Undo the warp of a view, whose frames were carried back into the image.
+def _as_batch(array: Floats) -> Tensor:
+    """Return an array as a float32 batch of one."""
+    import torch
 
-    Circles of one radius became the linear part of the warp. Returns (N, 2) points in px of the
-    view, and its (width, height): as far as they reach.
+    return torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
+
+
+def unwarped_points(lafs: Array) -> tuple[Array, Array]:
+    """Return the positions of features in the warp that they were detected in.
+
+    Their LAFs were carried back into the image: circles of one radius became the linear part of
+    the warp.
+
+    Args:
+        lafs: (N, 2, 3) in px of the image.
+
+    Returns:
+        (N, 2) points in px of the warp, and its (width, height): as far as the points reach.
     """
     shapes = of_unit_area(lafs[:, :, :2])
     (linear,) = of_unit_area(shapes.mean(axis=0, keepdims=True))
     points = (np.linalg.inv(linear) @ lafs)[:, :, 2]
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     return points - low, high - low + 1.0
 
 
-def promising(
+def most_similar_views(
     first: Sequence[PreparedView], second: Sequence[PreparedView], count: int
 ) -> list[tuple[PreparedView, PreparedView]]:
-    """Return the pairs of views with most mutual nearest neighbours among all features."""
-    descriptors1, descriptors2 = (
-        np.concatenate([view.inputs["descriptors"][0].numpy() for view in views])
-        for views in (first, second)
-    )
-    views1, views2 = (
-        np.repeat(np.arange(len(views)), [len(view.rows) for view in views])
-        for views in (first, second)
-    )
-    nearest1 = _nearest(descriptors1, descriptors2)
-    mutual = _nearest(descriptors2, descriptors1)[nearest1] == np.arange(len(views1))
-    shared = np.zeros((len(first), len(second)), np.int64)
-    np.add.at(shared, (views1[mutual], views2[nearest1[mutual]]), 1)
-    chosen = np.argsort(-shared, axis=None, kind="stable")[:count]
-    return [(first[i], second[j]) for i, j in zip(*np.divmod(chosen, len(second)), strict=True)]
+    """Return the pairs of views with most mutual nearest neighbours among all features.
+
+    Args:
+        first: views of image 1.
+        second: views of image 2.
+        count: pairs of views to return, at most as many as there are.
+
+    Returns:
+        Pairs of views, the most similar ones first.
+    """
+    descriptors1, views1 = _descriptors_and_views(first)
+    descriptors2, views2 = _descriptors_and_views(second)
+    nearest2 = _nearest(descriptors1, descriptors2)
+    nearest1 = _nearest(descriptors2, descriptors1)
+    is_mutual = nearest1[nearest2] == np.arange(len(views1))
+    num_mutual = np.zeros((len(first), len(second)), np.int64)
+    mutual_views = (views1[is_mutual], views2[nearest2[is_mutual]])
+    np.add.at(num_mutual, mutual_views, 1)
+    order = np.argsort(-num_mutual, axis=None, kind="stable")
+    numbers1, numbers2 = np.divmod(order[:count], len(second))
+    return [(first[i], second[j]) for i, j in zip(numbers1, numbers2, strict=True)]
+
+
+def _descriptors_and_views(views: Sequence[PreparedView]) -> tuple[Singles, Indices]:
+    """Return (N, D) descriptors of all views, and (N,) the number of the view of each."""
+    descriptors = [view.inputs["descriptors"][0].numpy() for view in views]
+    counts = [len(view.rows) for view in views]
+    return np.concatenate(descriptors), np.repeat(np.arange(len(views)), counts)
 
 
 def _nearest(queries: Singles, descriptors: Singles) -> Indices:
     """Return the most similar of (M, D) descriptors for each of (N, D) queries."""
-    chunks = (queries[i : i + CHUNK_ROWS] for i in range(0, len(queries), CHUNK_ROWS))
-    return np.concatenate([(chunk @ descriptors.T).argmax(axis=1) for chunk in chunks])
+    nearest = []
+    for begin in range(0, len(queries), CHUNK_ROWS):
+        cosines = queries[begin : begin + CHUNK_ROWS] @ descriptors.T
+        nearest.append(cosines.argmax(axis=1))
+    return np.concatenate(nearest)
 
 
-def united(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matches:
-    """Unite matches of several pairs of views: one-to-one, and each place once, the best first."""
-    if not sum(len(part.scores) for part in parts):
+def merged_matches(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matches:
+    """Merge matches of several pairs of views: one to one, and one match at each position.
+
+    Args:
+        parts: matches of pairs of views; of several that exclude each other the best score stays.
+        keypoints1: (N, 2) px of all features of image 1.
+        keypoints2: (M, 2) px of all features of image 2.
+
+    Returns:
+        The matches of both images.
+    """
+    if not any(len(part.scores) for part in parts):
         return Matches.none()
     indices = np.concatenate([part.indices for part in parts])
     scores = np.concatenate([part.scores for part in parts])
-    order = np.argsort(-scores, kind="stable")
-    indices, scores = indices[order], scores[order]
-    for column in (0, 1):  # the best match of each feature, in both images
-        best = np.sort(np.unique(indices[:, column], return_index=True)[1])
-        indices, scores = indices[best], scores[best]
-    places = keypoints1[indices[:, 0]], keypoints2[indices[:, 1]]
-    kept = np.flatnonzero(without_duplicates(*places, DUPLICATE_RADIUS_PX))
+    by_score = np.argsort(-scores, kind="stable")
+    indices = indices[by_score]
+    scores = scores[by_score]
+    for column in (0, 1):
+        _, best_of_feature = np.unique(indices[:, column], return_index=True)
+        kept = np.sort(best_of_feature)
+        indices = indices[kept]
+        scores = scores[kept]
+    points1 = keypoints1[indices[:, 0]]
+    points2 = keypoints2[indices[:, 1]]
+    kept = np.flatnonzero(without_duplicates(points1, points2, DUPLICATE_RADIUS_PX))
     rising = kept[np.argsort(indices[kept, 0])]
     return Matches(indices[rising], scores[rising])

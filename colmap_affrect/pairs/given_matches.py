@@ -20,6 +20,7 @@ from colmap_affrect.errors import OptionError, StoreError, damage, such_as
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair, split_line
 from colmap_affrect.project.given_h5 import GivenFile, opened
+from colmap_affrect.project.regular_files import read_regular_text
 
 MatchType = Literal["raw", "inliers"]
 """As COLMAP has it: matches to be verified, or verified ones."""
@@ -145,7 +146,7 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
     known = set(names)
     found: dict[Pair, Indices] = {}
     with damage(path, COMPLETE):
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_regular_text(path, "utf-8-sig").splitlines()
         number = 0
         while number < len(lines):
             line = lines[number].strip()

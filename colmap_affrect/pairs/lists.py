@@ -12,15 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Bools
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.regular_files import open_regular
 
 Pair = tuple[str, str]  # names of two photographs, in order
 
-SCORE = re.compile(r"[\s,]+[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?$")  # at the end of a line
+# At the end of a line; in the time of its length, however many blanks or digits it has.
+SCORE = re.compile(r"(?<![\s,])[\s,]+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?$")
+MAX_SUGGESTIONS = 8  # words of a line for which names that are like them are looked for
+LONGEST_LINE = 1 << 13  # characters: systems have no longer paths than half of it
 AT_ONCE = 1 << 16  # pairs that are given names together
 
 
@@ -28,7 +32,8 @@ class PairList(Sequence[Pair]):
     """Pairs as (N, 2) int32 ``numbers`` of their images in the sorted ``names``."""
 
     def __init__(self, names: Sequence[str], numbers: NDArray[np.integer]) -> None:
-        self.names, self.numbers = names, numbers.astype(np.int32, copy=False).reshape(-1, 2)
+        self.names = names
+        self.numbers = numbers.astype(np.int32, copy=False).reshape(-1, 2)
 
     @classmethod
     def of(cls, pairs: Iterable[Pair]) -> "PairList":
@@ -113,7 +118,8 @@ def most_similar_pairs(
     Each image is paired with half as many that are most similar to it; the rest goes to the most
     similar pairs of all. ``similarities`` has for each of N images its (N,) similarities with all.
     """
-    half, count = -(-num_neighbors // 2), len(names)
+    half = -(-num_neighbors // 2)
+    count = len(names)
     candidates = []
     for index, row in enumerate(similarities):
         values = row.astype(np.float32)
@@ -189,17 +195,18 @@ def read_pairs(path: Path, names: Sequence[str], image_path: Path | None = None)
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise AffrectError(f"{path}: cannot be read ({error})") from error
+        raise OptionError(f"{path}: cannot be read ({error})") from error
     if problems:
-        (count, line), more = problems[0], len(problems) - 1
-        raise AffrectError(
+        (count, line) = problems[0]
+        more = len(problems) - 1
+        raise OptionError(
             f"{path}: line {count}: {line!r} is not two names of images"
             f"{_suggestion(line, ordered)}" + f", nor are {more} more lines" * (more > 0)
         )
     found.sort()  # np.unique takes seven times as much memory
     found = found[np.flatnonzero(np.diff(found, prepend=-1))]
     if not len(found):
-        raise AffrectError(f"{path}: holds no pair of two different images")
+        raise OptionError(f"{path}: holds no pair of two different images")
     numbers = np.empty((len(found), 2), np.int32)
     np.divmod(found, len(ordered), out=(numbers[:, 0], numbers[:, 1]), casting="unsafe")
     return PairList(ordered, numbers)
@@ -216,9 +223,12 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
 
 def split_line(line: str, known: Collection[str]) -> Pair | None:
     """Return the two names of a line, either of which may hold separators."""
+    if len(line) > LONGEST_LINE:
+        return None
     for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
         for match in re.finditer(separator, line):
-            first, second = line[: match.start()], line[match.end() :]
+            first = line[: match.start()]
+            second = line[match.end() :]
             if first in known and second in known:
                 return first, second
     return None
@@ -226,6 +236,8 @@ def split_line(line: str, known: Collection[str]) -> Pair | None:
 
 def _split_of_others(line: str, known: Collection[str], folders: Sequence[str]) -> Pair | None:
     """Return the two names of a line that has a score, backslashes, or paths into a folder."""
+    if len(line) > LONGEST_LINE:
+        return None
     text = line.strip().replace("\\", "/")
     for folder in folders:
         text = re.sub(rf"(^|[\s,]){re.escape(folder)}/+", r"\1", text)
@@ -235,12 +247,14 @@ def _split_of_others(line: str, known: Collection[str], folders: Sequence[str]) 
 
 def _spellings(folder: Path) -> tuple[str, ...]:
     """Return how the path of a folder may begin those of the files in it, the longest first."""
-    paths = {folder, folder.absolute(), folder.resolve()}
+    paths = {folder, folder.absolute(), resolved(folder)}
     found = {path.as_posix() for path in paths} - {".", "/"}
     return tuple(sorted(found, key=len, reverse=True))
 
 
 def _suggestion(line: str, names: Sequence[str]) -> str:
-    unknown = [word for word in line.replace(",", " ").split() if word not in set(names)]
+    known = set(names)
+    words = line[:LONGEST_LINE].replace(",", " ").split()
+    unknown = [word for word in words if word not in known][:MAX_SUGGESTIONS]
     close = [match for word in unknown for match in difflib.get_close_matches(word, names, n=1)]
     return f" (did you mean {', '.join(close)}?)" if close else ""

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 from threadpoolctl import threadpool_limits
 
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.parallel.cluster_watch import ClusterWatch
 from colmap_affrect.parallel.executor import Result, Task, in_order
 
@@ -108,7 +108,7 @@ def connected(address: str) -> Iterator[Cluster]:
             f"--scheduler: {error.name} is not installed; pip install 'colmap-affrect[cluster]'"
         ) from error
     if not re.fullmatch(r"(tcp|tls)://.+:\d+", address):
-        raise AffrectError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
+        raise OptionError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
     security = Security()  # as dask's configuration has it
     for name in ("distributed", "distributed.client"):  # errors that matter are raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -167,7 +167,8 @@ class Cluster:
     """An :class:`~colmap_affrect.parallel.executor.Executor` on the workers of a cluster."""
 
     def __init__(self, client: Client, address: str) -> None:
-        self._client, self._address = client, address
+        self._client = client
+        self._address = address
         self._watch = ClusterWatch(client, address)
 
     def _result(self, future: Future) -> Any:
@@ -203,7 +204,8 @@ class Cluster:
 
         expected = environment(str(path) for path in files)
         job = pickle.dumps(function), tuple(expected.items())
-        name, numbers = f"{type(function).__name__}-{uuid.uuid4().hex}", count()
+        name = f"{type(function).__name__}-{uuid.uuid4().hex}"
+        numbers = count()
 
         def submit(task: Task) -> Future:
             key = f"{name}-{next(numbers)}"

@@ -27,7 +27,9 @@ class ClusterWatch:
     def __init__(
         self, client: Client, address: str, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._client, self._address, self._clock = client, address, clock
+        self._client = client
+        self._address = address
+        self._clock = clock
         self._heard: dict[str, tuple[float, float]] = {}  # when, by the scheduler and by us
         self._asked_s = -ASK_EVERY_S
         self._lost_since_s: float | None = None
@@ -53,7 +55,8 @@ class ClusterWatch:
         if not fault:
             if self._has_warned:
                 logger.warning("%s: the cluster is there again", self._address)
-            self._lost_since_s, self._has_warned = None, False
+            self._lost_since_s = None
+            self._has_warned = False
             return
         if self._lost_since_s is None:
             self._lost_since_s = now
@@ -94,7 +97,8 @@ class ClusterWatch:
 
     def _is_heard(self, address: str, worker: dict[str, Any]) -> bool:
         """Return whether a worker was heard of lately, by our clock."""
-        last, now = float(worker["last_seen"]), self._clock()
+        last = float(worker["last_seen"])
+        now = self._clock()
         known, when = self._heard.get(address, (last, now))
         if known != last:
             when = now

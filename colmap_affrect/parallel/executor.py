@@ -110,7 +110,9 @@ def map_ordered(
     the function is raised at the place of its task. Work that has not begun is dropped when the
     iteration ends early; KeyboardInterrupt does not wait for what has begun either.
     """
-    pool, is_waited_for, num_before = ThreadPoolExecutor(num_threads), True, cv2.getNumThreads()
+    pool = ThreadPoolExecutor(num_threads)
+    is_waited_for = True
+    num_before = cv2.getNumThreads()
     cv2.setNumThreads(max(1, num_before // num_threads))
     try:
         with threadpool_limits(1, user_api="blas"):

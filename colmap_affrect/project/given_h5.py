@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from colmap_affrect.errors import OptionError, StoreError, damage
 
 MAX_VALUES = 1 << 28  # an array of more values is taken for damage, and not read
+LARGE_BYTES = 1 << 26  # an array of so many may have been declared and never written
+MOST_COMPRESSED = 1100  # deflate makes no array smaller than by this factor
+MAX_DEPTH = 100  # of groups in groups; names of images have fewer folders
 MEND = "make it again with the program that wrote it"
 
 
@@ -45,6 +48,10 @@ class GivenFile:
         if np.prod([float(size) for size in stored]) > MAX_VALUES:
             raise StoreError(f"{self.path}: {key} of shape {stored} is too large to be true")
         with damage(self.path, MEND):
+            num_bytes = self.file[key].nbytes
+            stored_bytes = self.file[key].id.get_storage_size()
+            if num_bytes > max(LARGE_BYTES, MOST_COMPRESSED * stored_bytes):
+                raise ValueError(f"{key} of shape {stored} was never written, but for a small part")
             if self.file[key].dtype.kind not in kinds:
                 raise ValueError(f"{key} does not hold numbers, or no whole ones")
             return np.asarray(self.file[key][()])
@@ -58,6 +65,8 @@ def opened(path: Path) -> Iterator[GivenFile]:
     shapes: dict[str, tuple[int, ...]] = {}
 
     def visit(key: str, item: h5py.Group | h5py.Dataset) -> None:
+        if key.count("/") > MAX_DEPTH:
+            raise StoreError(f"{path}: has groups in groups, more than {MAX_DEPTH} deep; {MEND}")
         if isinstance(item, h5py.Dataset):
             if item.external or item.is_virtual:
                 raise StoreError(f"{path}: data in other files are not followed: {key}")

@@ -14,13 +14,14 @@ from tempfile import mkdtemp
 
 from filelock import FileLock, Timeout
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.project.atomic_files import (
     TEMPORARY_PREFIX,
     cannot_write,
     require_space,
     uninterrupted,
 )
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.regular_files import NotAFileError, open_regular, require_regular
 
 RESULTS = "results"  # folder of these in such a folder, whose names are the user's
@@ -67,7 +68,7 @@ def refuse_photographs(target: Path, names: Collection[str]) -> None:
     Work folders of ours are allowed: the search for photographs skips them. Raises OptionError.
     """
     inner = [name for name in names if not leads_outside(name)]
-    for folder in target.parent.resolve(), *target.parent.resolve().parents:
+    for folder in resolved(target.parent), *resolved(target.parent).parents:
         if not inner or is_output_folder(folder):
             return
         with suppress(OSError):  # a name that is too long, for one
@@ -139,22 +140,29 @@ def _refuse_existing(target: Path) -> None:
 def temporary_folder(parent: Path) -> Iterator[Path]:
     """Yield a new folder in a folder, in which those that killed processes left are removed."""
     missing = [path for path in (parent, *parent.parents) if not path.exists()]
-    try:
-        parent.mkdir(parents=True, exist_ok=True)
-        name = mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent)
-    except OSError as error:
-        _remove_empty(missing)
-        raise cannot_write(parent, error) from error
-    for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
-        if (left / LOCK).is_file() and not left.is_symlink():
-            with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
-                shutil.rmtree(left)  # its process has ended
     with ExitStack() as stack:
         stack.push(lambda failure, *_: _remove_empty(missing if failure else ()))
-        stack.callback(shutil.rmtree, name, ignore_errors=True)
-        with suppress(OSError):  # of file systems without locks leftovers are not tidied up
-            stack.enter_context(FileLock(Path(name) / LOCK))
-        yield Path(name)
+        folder = _new_folder(parent, stack)
+        while not folder.is_dir():  # a process that tidies up was faster than the lock
+            folder = _new_folder(parent, stack)
+        for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
+            if left != folder and (left / LOCK).is_file() and not left.is_symlink():
+                with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
+                    shutil.rmtree(left)  # its process has ended
+        yield folder
+
+
+def _new_folder(parent: Path, stack: ExitStack) -> Path:
+    """Make a folder that is locked, and removed in the end."""
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent))
+    except OSError as error:
+        raise cannot_write(parent, error) from error
+    stack.callback(shutil.rmtree, folder, ignore_errors=True)
+    with suppress(OSError):  # of file systems without locks leftovers are not tidied up
+        stack.enter_context(FileLock(folder / LOCK))
+    return folder
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
@@ -170,12 +178,21 @@ def database_files(path: Path) -> list[Path]:
 
 
 def remove_own(paths: Iterable[Path]) -> None:
-    """Remove what is ours in a work folder; of a link itself, not what it leads to."""
+    """Remove what is ours in a work folder; of a link itself, not what it leads to.
+
+    Raises WorkspaceError, which names it, where the system does not permit that.
+    """
     for path in paths:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        try:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        except OSError as error:  # of a file in it the name alone
+            why = error.strerror or error
+            raise WorkspaceError(
+                f"{path}: cannot be removed ({why}); permit that, and run the same command again"
+            ) from error
 
 
 def fitting_name(stem: str, suffix: str, most: int = MAX_NAME_BYTES) -> str:

@@ -1,34 +1,57 @@
 """Paths as users of the functions give them: as text, too."""
 
 import os
-from dataclasses import fields
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import BeforeValidator
 
 from colmap_affrect.errors import OptionError
 
 PathLike = str | os.PathLike[str]
 
 
-def as_path(given: PathLike) -> Path:
-    """Return a path; OptionError for bytes and anything else that is none."""
+def as_path(given: PathLike, argument: str = "") -> Path:
+    """Return a path.
+
+    Args:
+        given: what somebody has given as one.
+        argument: its name, for errors.
+
+    Raises:
+        OptionError: bytes, an empty text, and anything else that is no path.
+    """
     try:
-        return Path(given)
+        path = Path(given)
     except TypeError as error:
         kind = type(given).__name__
-        raise OptionError(f"{given!r}: give a path as str or os.PathLike, not {kind}") from error
+        named = f"{argument}={given!r}" if argument else repr(given)
+        raise OptionError(f"{named}: give a path as str or os.PathLike, not {kind}") from error
+    if not os.fspath(given):  # Path takes it for the current folder, and nobody means that
+        raise OptionError("an empty text is no path; the current folder is '.'")
+    if "\0" in str(path):
+        raise OptionError(f"{str(path)!r}: no path holds the character 0")
+    return path
+
+
+def as_path_or_none(given: PathLike | None, argument: str = "") -> Path | None:
+    """Return the same; None, and an empty text, stay what they say: nothing."""
+    return None if given is None or given == "" else as_path(given, argument)
+
+
+GivenPath = Annotated[Path, BeforeValidator(as_path)]
+"""Field of options that is given as text, too."""
 
 
 def resolved(path: Path) -> Path:
-    """Return a path without links; that of a pipe, which has no other name, as it is."""
-    whole = path.resolve()
+    """Return a path without links; that of a pipe, which has no other name, as it is.
+
+    Raises OptionError where links lead in a circle.
+    """
+    try:
+        whole = path.resolve()
+    except RuntimeError as error:  # so Python says it
+        raise OptionError(
+            f"{path}: links lead in a circle; give the path of a file or folder itself"
+        ) from error
     return path.absolute() if path.exists() and not whole.exists() else whole
-
-
-class TakesPaths:
-    """Base of dataclasses whose fields of paths may be given as text."""
-
-    def __post_init__(self) -> None:
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if field.type in (Path, Path | None) and value is not None:
-                object.__setattr__(self, field.name, as_path(value))  # of a frozen one, too

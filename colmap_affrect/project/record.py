@@ -121,10 +121,12 @@ def record_text(record: Mapping[str, Any]) -> str:
 
 def first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Say where options on record differ from those given now; empty if they do not."""
-    old, new = flat(known), flat(now)
+    old = flat(known)
+    new = flat(now)
     # The name of a part first: with another one most other options differ too.
     for key in sorted(old.keys() | new.keys(), key=lambda k: (k.rpartition(".")[2] != "name", k)):
-        before, after = old.get(key), new.get(key)
+        before = old.get(key)
+        after = new.get(key)
         if key.startswith(f"{WEIGHTS}.") and not (before and after):  # of a level that waits
             continue
         if before != after and not (key in PLACES and before and after):

@@ -4,6 +4,7 @@ A named pipe would let a reader wait for ever, a device may never end, and a lin
 of them. So what is no regular file is refused before it is opened.
 """
 
+import errno
 import hashlib
 import io
 import os
@@ -19,6 +20,7 @@ KINDS = {
 }
 """What else may have the name of a file, by its type."""
 CHUNK_BYTES = 1 << 20  # of a file that are in memory while it is digested
+MAX_TEXT_BYTES = 1 << 30  # of lists, tables and options
 NEVER_WAITS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # neither is everywhere
 
 
@@ -80,5 +82,10 @@ def sha256_of_regular(path: Path) -> str:
 
 
 def read_regular_text(path: Path, encoding: str = "utf-8") -> str:
-    """Return the text of a regular file, with line ends as Python has them; see its bytes."""
+    """Return the text of a regular file, with line ends as Python has them; see its bytes.
+
+    One that is longer than any list or table is refused; OSError.
+    """
+    if path.stat().st_size > MAX_TEXT_BYTES:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), os.fspath(path))
     return read_regular(path).decode(encoding).replace("\r\n", "\n").replace("\r", "\n")

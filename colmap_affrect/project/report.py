@@ -1,6 +1,7 @@
 """What stages and runs report: frozen, printable, JSON out."""
 
 import json
+import math
 import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,6 +10,7 @@ from importlib import metadata
 from typing import Any
 
 from colmap_affrect.errors import such_as
+from colmap_affrect.options import Summarized, documented
 
 NUM_WORST = 3  # tie points that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
@@ -19,11 +21,35 @@ SOURCES = {  # how a summary calls where focal lengths are from; others by their
 }  # fmt: skip
 
 OF_LARGEST = (  # what ``report.json`` has of the largest model under its own name
-    "registered_names", "probabilities", "doubtful", "mean_track_length",
+    "registered_names", "probabilities", "unsure", "doubtful", "mean_track_length",
     "mean_reprojection_error_px", "moves", "one_view",
 )  # fmt: skip
 
 SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
+MOST_CERTAIN = 0.999  # nothing is more probable than that
+
+
+def kept_probability(probability: float) -> float:
+    """Return a probability as it is kept: rounded down, so that it stays on its side of a limit.
+
+    >>> kept_probability(0.89999), kept_probability(0.49999), kept_probability(1.0)
+    (0.899, 0.499, 0.999)
+    """
+    return min(math.floor(1000.0 * probability + 1e-9) / 1000.0, MOST_CERTAIN)
+
+
+def probability_text(probability: float) -> str:
+    """Return a probability in percent: rounded down, and never 0 or 100.
+
+    >>> probability_text(0.499), probability_text(0.9), probability_text(0.998)
+    ('49%', '90%', '>99%')
+    """
+    percent = math.floor(100.0 * probability + 1e-9)
+    if percent < 1:
+        return "<1%"
+    return ">99%" if percent >= 99 and probability > 0.99 else f"{percent}%"
+
+
 MAX_EXIF_ERROR = 1.27  # of a focal length: three standard deviations of what EXIF usually has
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
@@ -68,6 +94,12 @@ def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
             f"in the model{more}; --ignore-exif leaves it out"
         )
     lenses_mm = sorted({camera["lens_mm"] for camera in cameras if camera.get("lens_mm")})
+    shared = [camera for camera in cameras if _is_found(camera)]
+    num_found = len({camera["refined_px"] for camera in shared})
+    if num_found < len(shared):
+        notes.append(
+            f"of those not known mapping makes {num_found}: photographs of one size share one"
+        )
     if lenses_mm:
         notes.append(
             f"EXIF has {', '.join(f'{mm:g}' for mm in lenses_mm[:3])} mm, and not the size of the "
@@ -75,6 +107,27 @@ def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
             "the focal length"
         )
     return notes
+
+
+def as_mapped(cameras: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return cameras, with those that mapping has made one as one, with all their photographs.
+
+    Args:
+        cameras: entries of ``report.json``.
+    """
+    found: dict[object, Mapping[str, Any]] = {}
+    for number, camera in enumerate(cameras):
+        key: object = number
+        if _is_found(camera):
+            key = camera["refined_px"], camera["focal_px"], camera["why"]
+        names = [*found[key]["names"], *camera["names"]] if key in found else camera["names"]
+        found[key] = {**camera, "names": names}
+    return list(found.values())
+
+
+def _is_found(camera: Mapping[str, Any]) -> bool:
+    """Return whether nothing but the model tells the focal length of a camera."""
+    return camera["source"] == "guess" and bool(camera.get("refined_px"))
 
 
 def _contradicts_exif(camera: Mapping[str, Any]) -> bool:
@@ -92,12 +145,15 @@ def by_story(stories: Mapping[str, str]) -> list[str]:
     return [f"{such_as(same, MAX_LINES)}: {story}" for story, same in names.items()]
 
 
+@documented
 @dataclass(frozen=True)
 class Advice:
     """What may help."""
 
     why: str
-    command: str = ""  # for a shell; empty where none does it
+    """What it would be good for."""
+    command: str = ""
+    """Command for a shell; empty where none does it."""
 
 
 LEVELS = {  # how pairs are matched again, by the kind of the level
@@ -106,13 +162,17 @@ LEVELS = {  # how pairs are matched again, by the kind of the level
 }  # fmt: skip
 
 
+@documented
 @dataclass(frozen=True)
 class MatchedAgain:
     """Pairs that were, or might be, matched again in one way."""
 
-    kind: str  # of the level, a key of ``LEVELS``
+    kind: str
+    """Kind of the level that matched them, a key of ``LEVELS``."""
     num_pairs: int
-    core_s: float  # about how many seconds of one core that takes
+    """How many pairs."""
+    core_s: float
+    """Seconds of one core that this takes, roughly."""
 
     def text(self) -> str:
         """Return a few words."""
@@ -120,16 +180,23 @@ class MatchedAgain:
         return f"{LEVELS.get(self.kind, self.kind)} {self.num_pairs} {pairs}"
 
 
+@documented
 @dataclass(frozen=True)
-class StageReport:
+class StageReport(Summarized):
     """One stage of a run."""
 
-    name: str  # extract, pairs, match, verify, escalate, guide or map
+    name: str
+    """``extract``, ``pairs``, ``match``, ``verify``, ``escalate``, ``guide`` or ``map``."""
     wall_s: float
-    num_done: int  # images, pairs, cameras or models made now
-    num_kept: int = 0  # those found done already
-    failures: dict[str, str] = field(default_factory=dict)  # image name to reason
-    warnings: dict[str, str] = field(default_factory=dict)  # to what went less well than asked
+    """Seconds that it took."""
+    num_done: int
+    """Images, pairs, cameras or models that were made now."""
+    num_kept: int = 0
+    """Those that were there already."""
+    failures: dict[str, str] = field(default_factory=dict)
+    """Why images cannot be used, by their names."""
+    warnings: dict[str, str] = field(default_factory=dict)
+    """What went less well than asked for, by what it is about."""
 
     def summary(self) -> str:
         """Return one line."""
@@ -144,19 +211,25 @@ def summed(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
     found = dict[str, StageReport]()
     for report in reports:
         before = found.get(report.name, replace(report, wall_s=0.0, num_done=0))
-        wall_s, num_done = before.wall_s + report.wall_s, before.num_done + report.num_done
+        wall_s = before.wall_s + report.wall_s
+        num_done = before.num_done + report.num_done
         found[report.name] = replace(report, wall_s=wall_s, num_done=num_done)
     return tuple(found.values())
 
 
+@documented
 @dataclass(frozen=True)
 class Bridge:
     """How one verified pair registered an image, with its scale by the depths of neighbours."""
 
-    by: str  # the image of the pair that had been there
-    num_agreeing: int  # depths that agree on the scale
-    num_ratios: int  # depths compared
-    scale_error_frac: float  # standard error of the scale
+    by: str
+    """The other image of the pair, which was registered before."""
+    num_agreeing: int
+    """Depths that agree on the scale."""
+    num_ratios: int
+    """Depths compared."""
+    scale_error_frac: float
+    """Standard error of the scale."""
 
     def text(self) -> str:
         """Return a few words."""
@@ -164,32 +237,52 @@ class Bridge:
         return f"bridged by {self.by}, {agreeing}, scale +-{self.scale_error_frac:.1%}"
 
 
+@documented
 @dataclass(frozen=True)
 class Residual:
     """How far a tie point is from where the model sees it, in px of the photograph."""
 
     point: str
+    """Name of the tie point."""
     image: str
+    """Name of the photograph."""
     error_px: float
+    """Distance from the mark to where the model sees the point."""
 
 
+@documented
 @dataclass(frozen=True)
 class ModelSummary:
     """One COLMAP model; mappings are by image name."""
 
     registered_names: tuple[str, ...]
+    """Names of the registered images."""
     num_points3D: int
+    """Number of points."""
     mean_track_length: float
-    mean_reprojection_error_px: float  # over observations
-    probabilities: dict[str, float] = field(default_factory=dict)  # to be right within 5 degrees
-    gains: dict[str, float] = field(default_factory=dict)  # what more matches may add to these
-    doubtful: dict[str, str] = field(default_factory=dict)  # rather wrong than right: why
-    bridges: dict[str, Bridge] = field(default_factory=dict)  # in no track through three images
-    taken_out: dict[str, str] = field(default_factory=dict)  # surely wrong: why
-    focals_px: dict[str, float] = field(default_factory=dict)  # of the cameras of the images
-    moves: tuple[str, ...] = ()  # what made the model, by the sparse mapper
-    tie_points: tuple[Residual, ...] = ()  # those by hand, the worst first
-    one_view: tuple[tuple[str, str], ...] = ()  # prints of one negative, or from one place
+    """Images that see a point, on average."""
+    mean_reprojection_error_px: float
+    """Mean over all observations."""
+    probabilities: dict[str, float] = field(default_factory=dict)
+    """Probability of each image that its pose is right within 5 degrees."""
+    gains: dict[str, float] = field(default_factory=dict)
+    """What more matches may add to these probabilities."""
+    doubtful: dict[str, str] = field(default_factory=dict)
+    """Why images are rather wrong than right."""
+    unsure: dict[str, str] = field(default_factory=dict)
+    """Why images are neither sure nor doubtful."""
+    bridges: dict[str, Bridge] = field(default_factory=dict)
+    """How images came in that are in no track through three images."""
+    taken_out: dict[str, str] = field(default_factory=dict)
+    """Why images that were surely wrong were taken out."""
+    focals_px: dict[str, float] = field(default_factory=dict)
+    """Focal length of the camera of each image."""
+    moves: tuple[str, ...] = ()
+    """What made the model, by the sparse mapper."""
+    tie_points: tuple[Residual, ...] = ()
+    """Residuals of the tie points by hand, the worst first."""
+    one_view: tuple[tuple[str, str], ...] = ()
+    """Pairs of prints of one negative, or of photographs from one place."""
 
     @property
     def sure(self) -> tuple[str, ...]:
@@ -204,6 +297,7 @@ class ModelSummary:
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
         lines = _some(f"joined      {name} {one.text()}" for name, one in self.bridges.items())
+        lines += _some(f"unsure      {line}" for line in by_story(self.unsure))
         lines += _some(f"doubtful    {line}" for line in by_story(self.doubtful))
         alike = (f"one view    {a} and {b}: no depth between them" for a, b in self.one_view)
         lines += _some(alike)
@@ -227,33 +321,50 @@ class ModelSummary:
         ]
 
 
+@documented
 @dataclass(frozen=True)
-class ReconstructionReport:
+class ReconstructionReport(Summarized):
     """A whole run; numbers of points and tracks are those of the largest model."""
 
     images_total: int
-    # image name to reason: unreadable, no features, no verified pair, not registered (with its
-    # best pairs), taken out, or in another model
+    """Number of photographs."""
     unregistered: dict[str, str]
-    models: tuple[ModelSummary, ...]  # largest first, as written to sparse/0, sparse/1, ...
+    """Why images are in no model or in a smaller one, by their names."""
+    models: tuple[ModelSummary, ...]
+    """The models, the largest first, as written to ``sparse/0``, ``sparse/1`` and so on."""
     num_verified_pairs: int
+    """Pairs with a two-view geometry."""
     num_pairs: int
+    """Pairs that were to be matched."""
     stages: tuple[StageReport, ...]
+    """What each stage did, and how long that took."""
     recipe: str
+    """Name of the recipe; empty for the database of another program."""
     versions: dict[str, str]
-    preset: str  # of mapping: ``sparse``, ``colmap`` or ``custom``
-    verification: dict[str, Any]  # options of two-view geometry
-    mapping: dict[str, Any]  # the mapper and its options
-    extended: tuple[str, ...] = ()  # names of the images of the model that was extended, if any
-    advice: tuple[Advice, ...] = ()  # what to try for images that are missing or doubtful
-    # ``pairs`` that guided matching gave more inliers, and these inliers ``matches_before`` and
-    # ``matches_after``; empty where no pair needed it
+    """Versions of Python and of the packages that decide results."""
+    preset: str
+    """Preset of mapping: ``sparse``, ``colmap`` or ``custom``."""
+    verification: dict[str, Any]
+    """Options of two-view geometry."""
+    mapping: dict[str, Any]
+    """The mapper and its options."""
+    extended: tuple[str, ...] = ()
+    """Names of the images of the model that was extended, if any."""
+    advice: tuple[Advice, ...] = ()
+    """What to try for images that are missing or doubtful."""
     guided: dict[str, int] = field(default_factory=dict)
-    cameras: tuple[dict[str, Any], ...] = ()  # see ``CameraRecord.to_report``
-    by_hand: tuple[str, ...] = ()  # what was done otherwise than matches alone say
-    effort: str = ""  # how much was tried for images in need; empty where nothing had to be
-    matched_again: tuple[MatchedAgain, ...] = ()  # for images that were in need
-    untried: tuple[MatchedAgain, ...] = ()  # what a greater effort would try for those that are
+    """``pairs`` that guided matching gave more inliers, and these inliers
+    ``matches_before`` and ``matches_after``; empty where no pair needed it."""
+    cameras: tuple[dict[str, Any], ...] = ()
+    """The cameras, and where their focal lengths are from."""
+    by_hand: tuple[str, ...] = ()
+    """What was done otherwise than matches alone say."""
+    effort: str = ""
+    """How much was tried for images in need; empty where nothing had to be."""
+    matched_again: tuple[MatchedAgain, ...] = ()
+    """How pairs of images in need were matched again."""
+    untried: tuple[MatchedAgain, ...] = ()
+    """What a greater effort would try for images that are in need."""
 
     @property
     def status(self) -> str:
@@ -335,7 +446,8 @@ class ReconstructionReport:
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
         lines += _some(f"by hand     {text}" for text in self.by_hand)
         if self.guided:
-            before, after = self.guided["matches_before"], self.guided["matches_after"]
+            before = self.guided["matches_before"]
+            after = self.guided["matches_after"]
             pairs = f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"
             lines += [f"guided      {pairs} matched again: {after} inliers, {before} before"]
         if self.matched_again:

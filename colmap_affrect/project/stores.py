@@ -104,7 +104,8 @@ def frame_datasets(lafs: Floats) -> dict[str, Singles]:
 class FeatureStore(GroupStore):
     """Local features by image name."""
 
-    format, stage = "colmap_affrect/features", "extract"
+    format = "colmap_affrect/features"
+    stage = "extract"
 
     def _entries(self) -> Entries:
         return _entries_of(self.path, stamp_of([self.path])) if self.path.exists() else {}
@@ -257,7 +258,8 @@ def hloc_matches(pair: PairMatches) -> dict[str, NDArray[Any]]:
 class MatchStore(GroupStore):
     """Raw matches by pair of image names."""
 
-    format, stage = "colmap_affrect/matches", "match"
+    format = "colmap_affrect/matches"
+    stage = "match"
 
     def write(
         self,
@@ -436,7 +438,8 @@ class GuidedPair:
 class GuidedStore(GroupStore):
     """Which pairs were matched again by their geometry."""
 
-    format, stage = "colmap_affrect/guided matches", "verify"
+    format = "colmap_affrect/guided matches"
+    stage = "verify"
 
     def write(self, pairs: Iterable[GuidedPair]) -> None:
         """Write a batch of pairs, in the place of what is there of them."""
@@ -454,6 +457,7 @@ class GuidedStore(GroupStore):
         with self._open("r") as file:
             found = []
             for _, group in sorted(complete_groups(file), key=lambda item: item[0]):
-                (first, second), num = group.attrs["names"], int(group.attrs["num_inliers"])
+                (first, second) = group.attrs["names"]
+                num = int(group.attrs["num_inliers"])
                 found.append(GuidedPair((str(first), str(second)), checked(group, "exact"), num))
         return found

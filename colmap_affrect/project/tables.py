@@ -4,6 +4,7 @@ import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import suggestion
@@ -21,43 +22,75 @@ def as_row(cells: Sequence[str]) -> str:
     return row.getvalue()
 
 
+class Row(NamedTuple):
+    """A row of a table."""
+
+    place: str  # the file and the line, for errors
+    cells: dict[str, str]  # by column, without empty ones
+
+
 def read_table(
     path: Path, where: str, columns: Sequence[str], key: str = "name", usual: Sequence[str] = ()
-) -> list[tuple[str, dict[str, str]]]:
-    """Return the rows of a CSV file, without empty cells, and for each the place to name.
+) -> list[Row]:
+    """Read a CSV file whose first line names its columns, in any order.
 
-    It may have the columns in any order, and must have ``key``: else OptionError, which begins
-    with ``where``, such as ``--cameras-path FILE``. A table with a ``usual`` header may
-    leave that out: then its first line names no column.
+    Args:
+        path: the file.
+        where: what an error begins with, such as ``--cameras-path FILE``.
+        columns: that the table may have.
+        key: column that it must have; empty for none.
+        usual: columns of a table without a header, whose first line names no column; empty where
+            a table must have one.
+
+    Returns:
+        The rows that have a cell which is not empty.
+
+    Raises:
+        OptionError: the file cannot be read, or is no such table.
     """
-    try:
-        reader = csv.reader(
-            read_regular_text(path, "utf-8-sig").splitlines(), skipinitialspace=True
-        )
-        lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise OptionError(f"{where}: cannot be read ({reason})") from error
-    rows = [(number, cells) for number, cells in lines if any(cells)]
-    header = [cell.lower() for cell in rows[0][1]] if rows else []
-    if usual and header and not {*header} & {*columns}:
-        header, rows = list(usual), [(0, []), *rows]
-    if len(header) == 1 and ";" in header[0]:
-        raise OptionError(f"{where}: separate cells by commas, and write numbers with a point")
-    if unknown := [column for column in header if column not in columns]:
-        raise OptionError(
-            f"{where}: unknown column '{unknown[0]}'{suggestion(unknown[0], columns)}"
-        )
-    if (key and key not in header) or len(set(header)) < len(header):
-        must = key or columns[0]
-        raise OptionError(f"{where}: its first line must have the column '{must}', and each once")
-    for number, cells in rows[1:]:
+    lines = _read_lines(path, where)
+    header = [cell.lower() for cell in lines[0][1]] if lines else []
+    if usual and header and not set(header).intersection(columns):
+        header = list(usual)
+    else:
+        lines = lines[1:]
+    _check_header(header, where, columns, key)
+    rows = []
+    for number, cells in lines:
         if len(cells) > len(header):
             raise OptionError(
                 f"{where}, line {number}: has {len(cells)} cells and the first line {len(header)}; "
                 'values with commas need quotes, "1437,1440,792,524"'
             )
-    return [
-        (f"{where}, line {number}", {k: v for k, v in zip(header, cells, strict=False) if v})
-        for number, cells in rows[1:]
-    ]
+        named = zip(header, cells, strict=False)
+        values = {column: cell for column, cell in named if cell}
+        rows.append(Row(f"{where}, line {number}", values))
+    return rows
+
+
+def _read_lines(path: Path, where: str) -> list[tuple[int, list[str]]]:
+    """Return the number and the cells of each line that is not empty."""
+    lines = []
+    try:
+        text = read_regular_text(path, "utf-8-sig")
+        reader = csv.reader(text.splitlines(), skipinitialspace=True)
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                lines.append((reader.line_num, cells))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OptionError(f"{where}: cannot be read ({reason})") from error
+    return lines
+
+
+def _check_header(header: Sequence[str], where: str, columns: Sequence[str], key: str) -> None:
+    """Refuse a header with other columns, twice the same one, or without the key; OptionError."""
+    if len(header) == 1 and ";" in header[0]:
+        raise OptionError(f"{where}: separate cells by commas, and write numbers with a point")
+    for column in header:
+        if column not in columns:
+            raise OptionError(f"{where}: unknown column '{column}'{suggestion(column, columns)}")
+    if (key and key not in header) or len(set(header)) < len(header):
+        must = key or columns[0]
+        raise OptionError(f"{where}: its first line must have the column '{must}', and each once")

@@ -11,9 +11,10 @@ from typing import Any, Self
 from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
-from colmap_affrect.errors import OptionError, StoreError, WorkspaceError
+from colmap_affrect.errors import ConflictError, OptionError, WorkspaceError
 from colmap_affrect.project import outputs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.record import (
     MADE_FROM,
     STAGES,
@@ -47,7 +48,8 @@ class Workspace:
 
     def __init__(self, path: Path, users_database: Path | None = None) -> None:
         """Name the folder, and a database of the user in the place of one there; never removed."""
-        self.path, self.users_database = path, users_database
+        self.path = path
+        self.users_database = users_database
         self.database = users_database or path / "database.db"
         self.mapped_database = path / "mapped.db"  # a copy with what is done by hand
         self.seal = path / "database.db.seal"  # what the last command left in it
@@ -68,6 +70,8 @@ class Workspace:
     @classmethod
     def beside(cls, database_path: Path) -> Self:
         """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
+        if database_path.is_dir():  # '.' and '/' have no names
+            raise OptionError(f"{database_path}: is a folder; give the path of a database")
         return cls(database_path.with_suffix(".affrect"), database_path)
 
     def branch(self, path: Path) -> "Workspace":
@@ -99,7 +103,7 @@ class Workspace:
 
         That of the photographs is refused, too; one inside it is allowed. Raises OptionError.
         """
-        if photographs and self.path.resolve() == photographs.resolve():
+        if photographs and resolved(self.path) == resolved(photographs):
             raise OptionError(
                 f"{self.path}: is the folder of the photographs; give another one as --output-path"
             )
@@ -236,6 +240,21 @@ class Workspace:
         if any(self.made_from(what) != digest for what, digest in digests.items()):
             self._write_record({**record, MADE_FROM: known})
 
+    def record_mapped(self, inputs: str) -> None:
+        """Put on record what the models that are there were made from, and how many they are."""
+        self.record_made_from(map=inputs, models=str(self.num_models()))
+
+    def num_models(self) -> int:
+        """Return how many models there are, 0, 1, ..."""
+        with suppress(OSError):
+            return sum(path.name.isdecimal() for path in self.sparse.iterdir())
+        return 0
+
+    def lacks_models(self) -> bool:
+        """Return whether models that were made are gone, removed by somebody or half removed."""
+        made = self.made_from("models")
+        return not self.sparse.exists() or (made.isdecimal() and self.num_models() < int(made))
+
     def record_options(
         self,
         stage: str,
@@ -250,18 +269,19 @@ class Workspace:
         ``plan`` has options of later stages, those of stages that have begun stay as they are;
         ``recipe`` is a name for the record only. ``overwrite`` discards the results of this stage
         and the later ones first; with the first stage their options are forgotten, too. Raises
-        StoreError when other options made the results that are there.
+        ConflictError when other options made the results that are there.
         """
         self._refuse_foreign_results(stage)
         outputs.remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
-        record, begun = self.recorded(), self.begun
+        record = self.recorded()
+        begun = self.begun
         if overwrite:
             self.refuse_foreign_models()
             outputs.remove_own(self._results(stage))
             begun = self._begun_before(stage)
             record = record if begun else {}
         if stage in begun and (why := first_difference(record[stage], options)):
-            raise StoreError(
+            raise ConflictError(
                 f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
             )
         begun = [name for name in STAGES if name in begun or name == stage]
@@ -273,10 +293,10 @@ class Workspace:
         """Remove the database and what was made from it, for inputs that have changed.
 
         The options of these stages stay on record, and models until others take their place.
-        Raises StoreError for a database of the user.
+        Raises ConflictError for a database of the user.
         """
         if self.users_database:
-            raise StoreError(f"{self.users_database}: {why}; {self._remedy}")
+            raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
         self.record_made_from(map="")
         outputs.remove_own(path for path in self._results("verify") if path != self.sparse)
         self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
@@ -290,25 +310,25 @@ class Workspace:
     def _refuse_foreign_results(self, stage: str) -> None:
         first = {"copy": "extract", "extract": "copy"}.get(stage)
         if first in self.begun:
-            raise StoreError(
+            raise ConflictError(
                 f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
                 "use another --output-path"
             )
         for path in () if self.begun else self._results("extract"):
             if path.exists() and path != self.users_database:
-                raise StoreError(
+                raise ConflictError(
                     f"{path}: exists and was not made here; it is left as it is, use "
                     "another --output-path"
                 )
 
     def refuse_foreign_models(self) -> None:
-        """Refuse to remove models beside which others have put something; StoreError."""
+        """Refuse to remove models beside which others have put something; ConflictError."""
         files = list(self.sparse.glob("*"))
         for folder in [path for path in files if path.is_dir() and path.name.isdecimal()]:
             files.remove(folder)
             files += [path for path in folder.iterdir() if path.name not in FILES_OF_MODEL]
         if foreign := [path for path in files if not path.name.startswith(".")]:
-            raise StoreError(
+            raise ConflictError(
                 f"{foreign[0]}: was not made by this run and would be removed with its models; "
                 "move it elsewhere, and run the same command again"
             )

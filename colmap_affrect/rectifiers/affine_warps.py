@@ -1,10 +1,10 @@
-"""Rectifiers by affine maps: of the whole photograph, or ``dense-shapes`` of its regions.
+"""Rectifiers by affine maps, of the whole photograph or (``dense-shapes``) of its regions.
 
-``dense-shapes`` covers the shapes of all blocks, and gives each block to its nearest centre: the
-paper's DenseAffNet (Sec. 3) with an exchangeable shape source.
+``dense-shapes`` covers the shapes of all blocks and assigns each block to its nearest centre. It is
+the paper's DenseAffNet (Sec. 3) with an exchangeable shape source.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -18,13 +18,14 @@ from colmap_affrect.rectifiers import base
 from colmap_affrect.rectifiers.regions import Region
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
-GAP_BLOCKS = 5  # groups of blocks closer than this are warped together
+GAP_BLOCKS = 5  # parts of a region that are closer than this are warped together; judged
 
 
 class IdentityOptions(base.RectifierOptions):
     """No warps."""
 
     name: Literal["identity"] = "identity"
+    warps: ClassVar[base.Warps] = "none"
 
 
 class Identity(base.WithInputs):
@@ -41,6 +42,7 @@ class AsiftOptions(base.AffineWarpOptions):
     """The same warps of the whole image for every photograph."""
 
     name: Literal["asift"] = "asift"
+    warps: ClassVar[base.Warps] = "all tilts"
     covering: Literal["near-optimal", "asift"] = "near-optimal"
     """``near-optimal``: 24 maps that with the identity cover all tilts to 5.8 (Rodriguez et al.
     2018); ``asift``: the 60 of ASIFT with tilts to 8 (Morel & Yu 2009, the paper)."""
@@ -53,13 +55,15 @@ class Asift(base.WithInputs):
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Warp the whole photograph by every map of the covering."""
-        return plan_whole_image(photograph.size, COVERINGS[self.options.covering](), self.options)
+        covering = COVERINGS[self.options.covering]
+        return plan_whole_image(photograph.size, covering(), self.options)
 
 
 class AffNetShapesOptions(base.CoverOptions):
     """The whole photograph is warped by every covering map of its shapes."""
 
     name: Literal["affnet-shapes"] = "affnet-shapes"
+    warps: ClassVar[base.Warps] = "some"
 
 
 class AffNetShapes(base.WithInputs):
@@ -69,14 +73,24 @@ class AffNetShapes(base.WithInputs):
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Warp the whole photograph by every covering map of its shapes."""
-        centers = self.options.cover(self.shapes.samples(photograph.gray).metrics).centers
-        return plan_whole_image(photograph.size, centers, self.options)
+        samples = self.shapes.samples(photograph.gray)
+        cover = self.options.cover(samples.metrics)
+        return plan_whole_image(photograph.size, cover.centers, self.options)
 
 
 def plan_whole_image(
     image_size: tuple[int, int], centers: Floats, options: base.AffineWarpOptions
 ) -> RectificationPlan:
-    """Warp an image of (width, height) as a whole by (K, 2) classes (tilt, angle_rad)."""
+    """Warp an image as a whole by every tilt class.
+
+    Args:
+        image_size: (width, height) in px.
+        centers: (K, 2) rows (tilt, angle_rad).
+        options: whether warps preserve areas.
+
+    Returns:
+        One warp for each class.
+    """
     items = []
     for tilt, angle in centers.tolist():
         linear = rectifying_affine(tilt, angle, area_preserving=options.area_preserving)
@@ -89,6 +103,7 @@ class DenseShapesOptions(base.CoverOptions):
     """Each block of the photograph is warped by the covering map nearest to its shape."""
 
     name: Literal["dense-shapes"] = "dense-shapes"
+    warps: ClassVar[base.Warps] = "some"
     min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.02
     """Regions of a smaller share of the image are not warped."""
     min_part_frac: Annotated[float, within(0.0, 1.0)] = 0.002
@@ -102,42 +117,65 @@ class DenseShapes(base.WithInputs):
     Options = DenseShapesOptions
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
-        """Plan one warp for each place of each region."""
+        """Plan one warp for each part of each region."""
         return plan_dense_shapes(self.shapes.grid(photograph.gray), photograph.size, self.options)
 
 
 def plan_dense_shapes(
     grid: ShapeGrid, image_size: tuple[int, int], options: DenseShapesOptions
 ) -> RectificationPlan:
-    """Turn a grid of shapes into disjoint regions of an image of (width, height), one warp each."""
-    cover = options.cover(grid.metrics.reshape(-1, 3), grid.textured.ravel().astype(np.float64))
+    """Turn a grid of shapes into disjoint regions of an image, each with one warp.
+
+    Args:
+        grid: shapes of the blocks of the image.
+        image_size: (width, height) in px.
+        options: of the cover, and which regions are large enough.
+
+    Returns:
+        One warp for each part of each region.
+    """
+    votes = grid.textured.ravel().astype(np.float64)
+    cover = options.cover(grid.metrics.reshape(-1, 3), votes)
     labels = cover.labels.reshape(grid.textured.shape)
+    min_region_blocks = options.min_region_frac * labels.size
+    min_part_blocks = options.min_part_frac * labels.size
     items: list[Rectification] = []
     for label, (tilt, angle) in enumerate(cover.centers.tolist()):
         blocks = (labels == label) & grid.textured
-        if np.count_nonzero(blocks) < options.min_region_frac * labels.size:
+        if np.count_nonzero(blocks) < min_region_blocks:
             continue
-        # The canvas of a warp is the bounding box of its region: for a region in several places one
+        # The canvas of a warp is the bounding box of its region. Of a region with several parts one
         # canvas for each is far smaller than one for all.
-        parts = _connected_groups(blocks, GAP_BLOCKS) if options.min_part_frac else [blocks]
+        parts = _connected_parts(blocks, GAP_BLOCKS) if options.min_part_frac else [blocks]
         for part in parts:
-            if np.count_nonzero(part) < options.min_part_frac * labels.size:
-                continue
-            items.append(options.warp(_region(part, grid, image_size), tilt, angle, label))
+            if np.count_nonzero(part) >= min_part_blocks:
+                region = _region_of_blocks(part, grid.step_px, image_size)
+                items.append(options.warp(region, tilt, angle, label))
     return RectificationPlan(image_size, tuple(items), replaces_original=True)
 
 
-def _region(blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int]) -> Region:
-    """Return the pixels of an image of (width, height) that some blocks of the grid cover."""
-    rows, columns = np.flatnonzero(blocks.any(axis=1)), np.flatnonzero(blocks.any(axis=0))
-    crop = blocks[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    left, top = int(columns[0]) * grid.step_px, int(rows[0]) * grid.step_px
-    mask = np.repeat(np.repeat(crop, grid.step_px, axis=0), grid.step_px, axis=1)
+def _region_of_blocks(blocks: Mask, step_px: int, image_size: tuple[int, int]) -> Region:
+    """Return the pixels that blocks of a grid cover.
+
+    Args:
+        blocks: (R, C) which blocks of the image.
+        step_px: width of a block.
+        image_size: (width, height) in px, which the last blocks may exceed.
+
+    Returns:
+        The region.
+    """
+    rows = np.flatnonzero(blocks.any(axis=1))
+    columns = np.flatnonzero(blocks.any(axis=0))
+    cropped = blocks[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    left = int(columns[0]) * step_px
+    top = int(rows[0]) * step_px
+    mask = np.repeat(np.repeat(cropped, step_px, axis=0), step_px, axis=1)
     return Region(mask[: image_size[1] - top, : image_size[0] - left], (left, top))
 
 
-def _connected_groups(mask: Mask, gap: int) -> list[Mask]:
-    """Split an (H, W) mask into groups of pixels that are at most ``gap`` - 1 px apart."""
+def _connected_parts(mask: Mask, gap: int) -> list[Mask]:
+    """Split an (H, W) mask into parts of pixels that are at most ``gap`` - 1 px apart."""
     joined = cv2.dilate(mask.astype(np.uint8), np.ones((gap, gap), np.uint8))
-    num_groups, groups = cv2.connectedComponents(joined, connectivity=8)
-    return [mask & (groups == group) for group in range(1, num_groups)]
+    num_labels, labels = cv2.connectedComponents(joined, connectivity=8)
+    return [mask & (labels == label) for label in range(1, num_labels)]

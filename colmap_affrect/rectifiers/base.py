@@ -1,10 +1,12 @@
-"""What a rectifier is: it decides which warps of a photograph to look at.
+"""The protocol of rectifiers, their common options, and their registry.
 
-Entry points are in the group ``colmap_affrect.rectifiers``. Several threads may call an object.
+A rectifier decides which warps of a photograph features are extracted from. Rectifiers of other
+packages are entry points of the group ``colmap_affrect.rectifiers``. Several threads may call one
+object.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from pydantic import BeforeValidator, SerializeAsAny
@@ -32,12 +34,19 @@ class RectifierInputs:
     """What a rectifier may read beside the photograph."""
 
     shapes: ShapeSource | None = None  # the source that its options name, if any
-    depth: DepthMaps | None = None  # None when the recipe needs no depth
+    depth: DepthMaps | None = None  # None if the recipe needs no depth
+
+
+Warps = Literal["none", "some", "all tilts"]
+"""Which views a rectifier adds to a photograph: none; those that its content or its depth asks
+for; all tilts, whatever the photograph shows."""
 
 
 class RectifierOptions(PartOptions):
     """Base of the options of all rectifiers."""
 
+    warps: ClassVar[Warps]
+    """Every rectifier declares it: what matching its views again costs and brings hangs on it."""
     uses_depth: ClassVar[bool] = False
     """Whether it reads a depth map of every photograph."""
 
@@ -50,10 +59,22 @@ class AffineWarpOptions(RectifierOptions):
     never magnifies (the paper)."""
 
     def warp(self, region: Region, tilt: float, angle_rad: float, segment_id: int) -> Rectification:
-        """Show a region by the affine map of the class (tilt, angle)."""
+        """Plan the warp of a region by the rectifying map of a tilt class.
+
+        Args:
+            region: part of the photograph.
+            tilt: of the class.
+            angle_rad: of the class.
+            segment_id: number of the region, for reports.
+
+        Returns:
+            The warp, on a canvas that just holds the region.
+        """
         linear = rectifying_affine(tilt, angle_rad, area_preserving=self.area_preserving)
-        canvas = fit_canvas(linear, region.outline(), MARGIN_PX)
-        return Rectification(*canvas, region.mask, tilt, angle_rad, region.origin, segment_id)
+        matrix, canvas_size = fit_canvas(linear, region.outline(), MARGIN_PX)
+        return Rectification(
+            matrix, canvas_size, region.mask, tilt, angle_rad, region.origin, segment_id
+        )
 
 
 class CoverOptions(AffineWarpOptions):
@@ -73,10 +94,20 @@ class CoverOptions(AffineWarpOptions):
     """Upper bound on the covering maps."""
 
     def cover(self, metrics: Floats, votes: Floats | None = None) -> Cover:
-        """Cover (N, 3) metrics, each with one vote unless (N,) votes are given."""
+        """Cover shapes, each with one vote by default.
+
+        Args:
+            metrics: (N, 3) unit metrics of the shapes.
+            votes: (N,) numbers >= 0.
+
+        Returns:
+            The centres, and to which of them each shape belongs.
+        """
+        if votes is None:
+            votes = np.ones(len(metrics))
         return cover_shapes(
             metrics,
-            np.ones(len(metrics)) if votes is None else votes,
+            votes,
             radius=self.tilt_radius,
             max_tilt=self.max_tilt,
             covered_frac=self.covered_frac,
@@ -85,7 +116,7 @@ class CoverOptions(AffineWarpOptions):
 
 
 class WithInputs:
-    """Base of our rectifiers: what their options ask for is there, as ``shapes`` and ``depth``."""
+    """Base of our rectifiers. ``shapes`` and ``depth`` are there if the options ask for them."""
 
     def __init__(self, options: Any, inputs: RectifierInputs) -> None:
         self.options = options
@@ -105,4 +136,6 @@ RECTIFIERS: Registry[Rectifier] = Registry(
         "dense-shapes": "colmap_affrect.rectifiers.affine_warps:DenseShapes",
     },
     default="dense-shapes",
+    protocol=Rectifier,
+    options_base=RectifierOptions,
 )

@@ -1,8 +1,9 @@
 """Rectifiers of planar segments: ``depth-planes``, as if seen from the front; ``depth-affnet``.
 
 Segments are those of the paper's depth-map-based rectification (Sec. 3) after Toft et al. 2020:
-normals from a depth map, their clusters on the sphere, connected segments of each cluster. The
-paper's DepthAffNet warps each as ``affnet-shapes`` does, by a cover of the shapes inside it.
+normals of a depth map are clustered on the sphere, and each connected region of a cluster is a
+segment. The paper's DepthAffNet warps each segment as ``affnet-shapes`` does, by a cover of the
+shapes inside it.
 """
 
 from collections.abc import Iterator
@@ -18,20 +19,20 @@ from colmap_affrect.geometry import planes
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.options import Options, within
-from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, WithInputs
+from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, Warps, WithInputs
 from colmap_affrect.rectifiers.regions import Region, homography_rectification
 
 MAX_DEPTH_SIZE_PX = 640
-"""Larger depth maps are shrunk to this: windows of 5 x 5 px of them see too little of a plane,
-and noise too much (the paper's maps have 512 px)."""
+"""Longer side to which larger depth maps are shrunk: in their windows of 5 x 5 px noise is too
+large for the small part of a plane (the paper's maps have 512 px); judged."""
 
 
 @dataclass(frozen=True)
 class PlanarSegment:
-    """Connected part of an image, and its (3,) unit normal in camera coordinates, facing us."""
+    """Connected part of an image that shows one plane."""
 
     region: Region
-    normal: Array
+    normal: Array  # (3,) unit, in camera coordinates, facing the camera
 
 
 class PlaneOptions(Options):
@@ -44,6 +45,7 @@ class PlaneOptions(Options):
     min_separation_deg: Annotated[float, within(0.0, 180.0)] = 87.5
     """Planes are at least this far apart."""
     max_num_planes: Annotated[int, within(1, 100)] = 3
+    """Most planes of a photograph."""
     min_votes_frac: Annotated[float, within(0.0, 1.0)] = 0.15
     """Share of the pixels that a plane must have."""
     max_angle_deg: Annotated[float, within(0.0, 85.0)] = 75.0
@@ -56,7 +58,9 @@ class DepthPlanesOptions(RectifierOptions):
     """One homography per planar region, as if seen from the front."""
 
     name: Literal["depth-planes"] = "depth-planes"
+    warps: ClassVar[Warps] = "some"
     planes: PlaneOptions = PlaneOptions()
+    """How planes are found in a depth map."""
     keep_original: Literal["everywhere", "outside"] = "everywhere"
     """Features of the photograph itself are kept ``everywhere`` or ``outside`` of the rectified
     regions (the paper)."""
@@ -70,13 +74,16 @@ class DepthPlanes(WithInputs):
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan one warp for each segment; DepthError when there is no usable depth map."""
-        segments = planar_segments(photograph, self.depth.depth(photograph), self.options.planes)
+        depth = self.depth.depth(photograph)
+        segments = planar_segments(photograph, depth, self.options.planes)
+        camera_matrix = photograph.camera_matrix
         items: list[Rectification] = []
         for number, segment in enumerate(segments):
-            turned = planes.fronto_parallel_homography(segment.normal, photograph.camera_matrix)
-            items.append(homography_rectification(segment.region, turned, number))
-        everywhere = self.options.keep_original == "everywhere"
-        outside = None if everywhere else ~_union(segments, photograph.size)
+            homography = planes.fronto_parallel_homography(segment.normal, camera_matrix)
+            items.append(homography_rectification(segment.region, homography, number))
+        outside = None
+        if self.options.keep_original == "outside":
+            outside = ~_union(segments, photograph.size)
         return RectificationPlan(photograph.size, tuple(items), outside)
 
 
@@ -85,14 +92,22 @@ def planar_segments(
 ) -> list[PlanarSegment]:
     """Segment a photograph into connected parts of planes.
 
-    A pixel belongs to the plane whose normal is nearest, if near enough, and if it sees it at no
-    more than ``max_angle_deg``, the angle between normal and ray. (The authors take the optical
-    axis, and keep a plane as a whole.) From the front an area grows by 1 / cos^3 of it, so far ends
-    are left out. ``depth`` is (h, w) z-depth of the whole photograph, of any size; NaN: unknown.
+    A pixel belongs to the plane with the nearest normal, if that is near enough, and if the angle
+    between normal and ray is at most ``max_angle_deg``. (The authors take the optical axis instead
+    of the ray, and keep a plane as a whole.) A rectified area is 1 / cos^3 of that angle times as
+    large, so far ends of planes are left out.
+
+    Args:
+        photograph: with its camera.
+        depth: (h, w) z-depth of the whole photograph, of any size; NaN where unknown.
+        options: which planes count.
+
+    Returns:
+        Segments, in the order of the planes.
     """
-    size_of_depth = (depth.shape[1], depth.shape[0])
-    depth, shrunk_from_depth = planes.shrink_depth(depth, MAX_DEPTH_SIZE_PX)
-    depth_from_image = shrunk_from_depth @ resized_from_original(photograph.size, size_of_depth)
+    given_size = (depth.shape[1], depth.shape[0])
+    depth, shrunk_from_given = planes.shrink_depth(depth, MAX_DEPTH_SIZE_PX)
+    depth_from_image = shrunk_from_given @ resized_from_original(photograph.size, given_size)
     clusters = planes.cluster_normals(
         planes.normals_from_depth(depth, depth_from_image @ photograph.camera_matrix),
         num_candidates=options.num_candidates,
@@ -101,14 +116,15 @@ def planar_segments(
         max_num_planes=options.max_num_planes,
         min_votes_frac=options.min_votes_frac,
     )
-    labels = _resampled(clusters.labels, depth_from_image, photograph.size)
-    min_cos = np.cos(np.deg2rad(options.max_angle_deg))
+    labels = _resampled_labels(clusters.labels, depth_from_image, photograph.size)
+    min_cosine = np.cos(np.deg2rad(options.max_angle_deg))
     min_area_px = options.min_region_frac * labels.size
     segments = []
     for label, normal in enumerate(clusters.normals):
         cosines = planes.viewing_cosines(normal, photograph.camera_matrix, photograph.size)
-        found = _connected_regions((labels == label) & (cosines >= min_cos), min_area_px)
-        segments += [PlanarSegment(region, normal) for region in found]
+        is_on_plane = (labels == label) & (cosines >= min_cosine)
+        for region in _connected_regions(is_on_plane, min_area_px):
+            segments.append(PlanarSegment(region, normal))
     return segments
 
 
@@ -116,24 +132,36 @@ def _connected_regions(mask: Mask, min_area_px: float) -> Iterator[Region]:
     """Yield the 4-connected regions that have enough pixels."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     for label, (left, top, width, height, area) in enumerate(stats.tolist()):
-        if label > 0 and area >= min_area_px:
-            yield Region(labels[top : top + height, left : left + width] == label, (left, top))
+        is_background = label == 0
+        if is_background or area < min_area_px:
+            continue
+        box = labels[top : top + height, left : left + width]
+        yield Region(box == label, (left, top))
 
 
-def _resampled(
+def _resampled_labels(
     labels: NDArray[np.int32], labels_from_image: Array, size: tuple[int, int]
 ) -> NDArray[np.int32]:
-    """Give each pixel of an image of (width, height) its nearest label; the map only scales."""
-    columns, rows = (
-        np.rint(labels_from_image[axis, axis] * np.arange(extent) + labels_from_image[axis, 2])
-        .astype(int)
-        .clip(0, labels.shape[1 - axis] - 1)
-        for axis, extent in enumerate(size)
-    )
+    """Return the nearest label of each pixel of an image.
+
+    Args:
+        labels: (h, w).
+        labels_from_image: (3, 3) map of pixel-centre px, which only scales and shifts.
+        size: (width, height) of the image.
+
+    Returns:
+        (height, width) labels.
+    """
+    width, height = size
+    x = np.rint(labels_from_image[0, 0] * np.arange(width) + labels_from_image[0, 2])
+    y = np.rint(labels_from_image[1, 1] * np.arange(height) + labels_from_image[1, 2])
+    columns = x.astype(int).clip(0, labels.shape[1] - 1)
+    rows = y.astype(int).clip(0, labels.shape[0] - 1)
     return np.asarray(labels[rows[:, None], columns])
 
 
 def _union(segments: list[PlanarSegment], size: tuple[int, int]) -> Mask:
+    """Return the pixels of all segments in an image of (width, height)."""
     mask = np.zeros(size[::-1], dtype=bool)
     for segment in segments:
         left, top = segment.region.origin
@@ -146,7 +174,9 @@ class DepthAffNetOptions(CoverOptions):
     """Planar regions from depth, each warped by a cover of the shapes inside it."""
 
     name: Literal["depth-affnet"] = "depth-affnet"
+    warps: ClassVar[Warps] = "some"
     planes: PlaneOptions = PlaneOptions()
+    """How planes are found in a depth map."""
     uses_depth: ClassVar[bool] = True
 
 
@@ -158,11 +188,13 @@ class DepthAffNet(WithInputs):
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan the warps of each segment, if its shapes are tilted; DepthError without depth."""
         options = self.options
-        segments = planar_segments(photograph, self.depth.depth(photograph), options.planes)
+        depth = self.depth.depth(photograph)
+        segments = planar_segments(photograph, depth, options.planes)
         samples = self.shapes.samples(photograph.gray)
         items: list[Rectification] = []
         for number, segment in enumerate(segments):
-            inside = segment.region.contains(samples.points)
-            for tilt, angle in options.cover(samples.metrics[inside]).centers.tolist():
+            is_inside = segment.region.contains(samples.points)
+            cover = options.cover(samples.metrics[is_inside])
+            for tilt, angle in cover.centers.tolist():
                 items.append(options.warp(segment.region, tilt, angle, number))
         return RectificationPlan(photograph.size, tuple(items))

@@ -1,4 +1,4 @@
-"""Execute a rectification plan: warp, detect, carry back, choose, describe, unite."""
+"""Execute a rectification plan: warp, detect, map back into the image, select, describe, merge."""
 
 from dataclasses import replace
 
@@ -16,15 +16,18 @@ from colmap_affrect.data import (
     union,
 )
 from colmap_affrect.features.base import FeatureExtractor
-from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
-from colmap_affrect.geometry.arrays import Singles
+from colmap_affrect.geometry.affine import ellipse_extents, transform_lafs
+from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.geometry.neighbors import neighbors_within
 from colmap_affrect.images.warping import mask_values, warp, warp_mask
 
 DUPLICATE_RADIUS_SIGMAS = 0.5
+"""Distance of the same feature in the image and in a warp, in its sigmas; judged."""
 MAX_DUPLICATE_RADIUS_PX = 4.0
-SAME_SCALE_RATIO = 2 ** (1 / 3)  # one layer of a scale space with three layers per octave
+"""Largest such distance that is searched: larger features rarely have a duplicate; judged."""
+SAME_SCALE_RATIO = 2 ** (1 / 3)
+"""Ratio of the scales of duplicates: one layer of a scale space with three layers per octave."""
 
 
 def extract_rectified(
@@ -36,96 +39,160 @@ def extract_rectified(
     with_original: bool = True,
     mask: Mask | None = None,
 ) -> LocalFeatures:
-    """Return the features of the image and of all planned warps, frames in image px.
+    """Return the features of the image and of all planned warps, LAFs in image px.
 
-    Of the features in warps the ``max_num_rectified`` strongest are kept, and those of the image
-    itself only ``with_original``. Only what stays is described, and all of it in one call. The
-    image is (H, W[, 3]) uint8, as the extractor asks; the mask (H, W) bool, where features may be.
+    Only features that are kept are described, and all of them in one call.
+
+    Args:
+        image: (H, W) or (H, W, 3) uint8, as the extractor asks.
+        plan: warps of the image.
+        extractor: detects and describes.
+        max_num_rectified: features of warps that are kept, those of the largest responses.
+        with_original: whether features of the image itself are extracted.
+        mask: (H, W) bool, where features may be.
+
+    Returns:
+        Described features; ``rectification_ids`` are 0 for the image, and numbers of warps from 1.
     """
-    rectifications: list[Rectification | None] = [None] if with_original else []
-    rectifications += plan.items
-    if not rectifications:
+    warps: list[Rectification | None] = [None] if with_original else []
+    warps += plan.items
+    if not warps:
         return LocalFeatures.empty(extractor.descriptor_size)
-    whole = image, None if mask is None else mask_values(mask)
-    source = image.astype(np.float32)
-    views = [whole if item is None else _warped(source, item, mask) for item in rectifications]
+    views = _views(image, warps, mask)
     detected = [extractor.detect(view) for view in views]
-    carried = [_carried(*pair) for pair in zip(detected, rectifications, strict=True)]
-    keep = [_usable(*pair, plan) for pair in zip(carried, rectifications, strict=True)]
+    keep = _kept(detected, warps, plan, max_num_rectified)
+    selected = [features.select(kept) for features, kept in zip(detected, keep, strict=True)]
+    described = extractor.describe([view[0] for view in views], selected)
     first_id = 0 if with_original else 1
-    _keep_strongest(keep[1 - first_id :], carried[1 - first_id :], max_num_rectified)
-    if with_original and plan.replaces_original and plan.items:
-        kept = [part.select(mask) for part, mask in zip(carried, keep, strict=True)]
-        keep[0] &= ~found_again(carried[0], union(kept[1:]))
-    chosen = [features.select(kept) for features, kept in zip(detected, keep, strict=True)]
-    described = extractor.describe([view[0] for view in views], chosen)
-    carried = [_carried(*pair) for pair in zip(described, rectifications, strict=True)]
-    numbered = enumerate(carried, first_id)
-    return union([features.with_rectification_id(number) for number, features in numbered])
+    parts = []
+    for number, (features, warp_plan) in enumerate(zip(described, warps, strict=True), first_id):
+        parts.append(_mapped_back(features, warp_plan).with_rectification_id(number))
+    return union(parts)
 
 
-def _warped(source: Singles, rectification: Rectification, mask: Mask | None) -> View:
-    size = (source.shape[1], source.shape[0])
-    inside = warp_mask(rectification, size)
-    if mask is not None:
-        unmasked = replace(rectification, region=mask, region_origin=(0, 0))
-        inside = np.minimum(inside, warp_mask(unmasked, size))
-    return warp(source, rectification), inside
+def _views(
+    image: GrayImage | ColorImage, warps: list[Rectification | None], mask: Mask | None
+) -> list[View]:
+    """Return the image (for None) and its warps, each with its mask."""
+    source = image.astype(np.float32)
+    views: list[View] = []
+    for item in warps:
+        if item is None:
+            views.append((image, None if mask is None else mask_values(mask)))
+        else:
+            views.append((warp(source, item), _warped_mask(item, mask, image.shape)))
+    return views
 
 
-def _carried(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:
+def _warped_mask(
+    rectification: Rectification, mask: Mask | None, image_shape: tuple[int, ...]
+) -> Bytes:
+    """Return where a warp shows its region, without what an (H, W) mask of the image excludes."""
+    image_size = (image_shape[1], image_shape[0])
+    inside = warp_mask(rectification, image_size)
+    if mask is None:
+        return inside
+    whole_image = replace(rectification, region=mask, region_origin=(0, 0))
+    return np.minimum(inside, warp_mask(whole_image, image_size))
+
+
+def _mapped_back(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:
+    """Map LAFs of a warp back into the image; those of the image itself (None) stay."""
     if rectification is None:
         return features
-    lafs = transform_frames(rectification.image_from_rectified, features.lafs)
+    lafs = transform_lafs(rectification.image_from_rectified, features.lafs)
     return replace(features, lafs=lafs)
 
 
-def _usable(
+def _kept(
+    detected: list[LocalFeatures],
+    warps: list[Rectification | None],
+    plan: RectificationPlan,
+    max_num_rectified: int,
+) -> list[Mask]:
+    """Return which features of each view are kept.
+
+    Args:
+        detected: features of each view, LAFs in its px.
+        warps: that the views are of, None for the image itself.
+        plan: of all warps.
+        max_num_rectified: features of warps that are kept, those of the largest responses.
+
+    Returns:
+        (N,) bool for each view.
+    """
+    mapped = []
+    keep = []
+    for features, rectification in zip(detected, warps, strict=True):
+        mapped.append(_mapped_back(features, rectification))
+        keep.append(_is_usable(mapped[-1], rectification, plan))
+    with_original = warps[0] is None
+    first_warp = 1 if with_original else 0
+    _keep_strongest(keep[first_warp:], mapped[first_warp:], max_num_rectified)
+    if with_original and plan.replaces_original and plan.items:
+        pairs = zip(mapped[1:], keep[1:], strict=True)
+        rectified = union([features.select(kept) for features, kept in pairs])
+        keep[0] &= ~is_in_warp(mapped[0], rectified)
+    return keep
+
+
+def _is_usable(
     features: LocalFeatures, rectification: Rectification | None, plan: RectificationPlan
 ) -> Mask:
-    """Return which features, frames in image px, belong to their part of the image.
+    """Return which features, LAFs in image px, belong to their part of the image.
 
-    Measurement regions of a warp's must be inside: what lies outside is invented by the warp.
+    Measurement regions of features of warps must be inside the image: outside, a warp shows
+    invented content.
     """
     if rectification is None:
         if plan.original_region is None:
             return np.ones(len(features), dtype=bool)
         return in_mask(plan.original_region, features.keypoints)
     extents = ellipse_extents(features.lafs[:, :, :2])
-    inside = is_inside(features.keypoints, plan.image_size, extents)
-    return np.asarray(inside & rectification.in_region(features.keypoints))
+    in_image = is_inside(features.keypoints, plan.image_size, extents)
+    return np.asarray(in_image & rectification.in_region(features.keypoints))
 
 
 def _keep_strongest(keep: list[Mask], features: list[LocalFeatures], limit: int) -> None:
-    """Clear in ``keep`` all but the ``limit`` strongest of the features of several views."""
+    """Clear in ``keep`` all but the ``limit`` strongest features of several views.
+
+    Args:
+        keep: (N,) bool for each view, which are changed.
+        features: of each view.
+        limit: features that are kept of all views together.
+    """
     if not keep:
         return
     responses = np.concatenate([part.responses for part in features])
     candidates = np.flatnonzero(np.concatenate(keep))
-    weak = np.zeros(len(responses), dtype=bool)
-    weak[candidates[np.argsort(-responses[candidates], kind="stable")[limit:]]] = True
-    for mask, part in zip(keep, np.split(weak, np.cumsum(list(map(len, keep)))[:-1]), strict=True):
-        mask[part] = False
+    order = np.argsort(-responses[candidates], kind="stable")
+    is_weak = np.zeros(len(responses), dtype=bool)
+    is_weak[candidates[order[limit:]]] = True
+    begin = 0
+    for kept in keep:
+        kept[is_weak[begin : begin + len(kept)]] = False
+        begin += len(kept)
 
 
-def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
-    """Return which features of the image itself a warp shows at the same place and scale.
+def is_in_warp(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
+    """Return which features of the image itself a warp has too, at the same position and scale.
 
     Centres are within half a sigma and scales within ``SAME_SCALE_RATIO``, whatever the
-    orientation. The rectified one stays: in its region its residual tilt is smaller.
+    orientation. The feature of the warp is the better one: its residual tilt is smaller.
     """
-    scales1, scales2 = original.scales, rectified.scales
-    radius = DUPLICATE_RADIUS_SIGMAS / MEASUREMENT_SIGMAS * scales1
-    again = np.zeros(len(original), dtype=bool)
+    found = np.zeros(len(original), dtype=bool)
     if not len(original) or not len(rectified):
-        return again
+        return found
     points = np.concatenate([original.keypoints, rectified.keypoints])
-    # Larger frames than this have no counterpart worth the search for it.
-    neighbors = neighbors_within(points, min(float(radius.max()), MAX_DUPLICATE_RADIUS_PX))
-    rows, others = neighbors.of(np.arange(len(original)))
-    between = others >= len(original)
-    rows, others = rows[between], others[between] - len(original)
-    distances = np.linalg.norm(original.keypoints[rows] - rectified.keypoints[others], axis=1)
-    same_scale = np.abs(np.log(scales1[rows] / scales2[others])) < np.log(SAME_SCALE_RATIO)
-    again[rows[(distances < radius[rows]) & same_scale]] = True
-    return again
+    radii = DUPLICATE_RADIUS_SIGMAS / MEASUREMENT_SIGMAS * original.scales
+    search_radius = min(float(radii.max()), MAX_DUPLICATE_RADIUS_PX)
+    rows, others = neighbors_within(points, search_radius).of(np.arange(len(original)))
+    is_rectified = others >= len(original)
+    rows = rows[is_rectified]
+    others = others[is_rectified] - len(original)
+    offsets = original.keypoints[rows] - rectified.keypoints[others]
+    is_near = np.linalg.norm(offsets, axis=1) < radii[rows]
+    log_ratios = np.log(original.scales[rows] / rectified.scales[others])
+    is_same_scale = np.abs(log_ratios) < np.log(SAME_SCALE_RATIO)
+    found[rows[is_near & is_same_scale]] = True
+    return found

@@ -1,4 +1,4 @@
-"""Show what a recipe does to an image: one level after the other, as sheets to look at.
+"""Show what a recipe does to an image, a sheet for each level.
 
 A sheet has the photograph with its regions, its features, and the warps.
 """
@@ -10,34 +10,46 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from colmap_affrect.data import ColorImage, LocalFeatures, Mask, Photograph, RectificationPlan, View
+from colmap_affrect.data import (
+    ColorImage,
+    LocalFeatures,
+    Mask,
+    Photograph,
+    RectificationPlan,
+    View,
+)
 from colmap_affrect.features.base import FeatureExtractor
-from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Bytes
-from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.outputs import fitting_name, new_results
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.sheets import (
+    PALETTE,
+    Color,
+    Panel,
+    Point,
+    encode_png,
+    rgb,
+    row_of,
+    text_row,
+)
 from colmap_affrect.stages.one_image import ImageExtractor
 
-Color = tuple[int, int, int]
-Marks = dict[tuple[float, float], str]  # text by place, px
-
-PALETTE: Sequence[str] = (
-    "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#882255",
-)  # fmt: skip
-"""Okabe and Ito's colours for all kinds of colour vision, and one of Paul Tol's."""
-TINT = 0.45  # share of the colour over a region
-WIDTH_PX, PANELS_PER_ROW, WARPS_PER_ROW, MAX_NUM_WARPS = 1596, 2, 6, 24
-TITLE_PX, MARGIN_PX = 24, 4
-MAX_NUM_FEATURES, MAX_NUM_WARP_FEATURES = 1500, 120  # drawn, the strongest
-FEATURE_SIGMAS = 2.0  # radius of the ellipses drawn for features
-TURN = np.linspace(0.0, 2.0 * np.pi, 25)
-UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
-DARK: Color = (85, 85, 85)
+# What is drawn was chosen by eye, so that a sheet stays readable.
+PANELS_PER_ROW = 2  # photographs
+WARPS_PER_ROW = 6
+MAX_NUM_WARPS = 24  # the largest
+MAX_NUM_FEATURES = 1500  # on a photograph, the strongest
+MAX_NUM_WARP_FEATURES = 120  # on a warp, the strongest
+MAX_NUM_NUMBERS = 3  # of warps of one region
+TINT = 0.45  # share of the colour of a region in its pixels
+MASK_DIMMING = 3  # masked pixels have this part of their brightness
+FEATURE_FADING = 2  # contrast of a photograph under its features is divided by it
+OUTSIDE_FADING = 4  # contrast outside of the mask of a warp is divided by it
+DARK: Color = (85, 85, 85)  # of features that are of no warp
 
 
 @dataclass(frozen=True)
@@ -49,125 +61,114 @@ class InspectedLevel:
 
     photograph: Photograph
     plan: RectificationPlan
-    warning: str  # why it was not rectified though it was to be; empty if all went well
-    # by rectification id, 0 for the photograph itself: what features were looked for in, and all
-    # that were detected there, frames in px of the view
-    seen: Mapping[int, tuple[View, LocalFeatures]]
-    features: LocalFeatures  # those of all views that were kept
+    warning: str  # why the photograph was not rectified as asked; empty if it was
+    # by rectification id, 0 for the photograph itself: the view in which features were detected,
+    # and all of them, LAFs in px of the view
+    detected: Mapping[int, tuple[View, LocalFeatures]]
+    features: LocalFeatures  # of all views, without those that were discarded
     seconds: float
 
 
 def draw_sheet(level: InspectedLevel, summary: str, path: Path) -> None:
-    """Draw one level under its summary, and write it as PNG.
+    """Draw one level and write it as PNG.
 
-    Above the photograph with the regions and their warps in one colour each, beside it its
-    features; below the largest warps with theirs.
+    The summary comes first, then the photograph with its regions beside its features, then the
+    largest warps with their features. A region and its warp have one colour.
+
+    Args:
+        level: what is drawn.
+        summary: text above the sheet.
+        path: the PNG file, which is replaced.
     """
-    colors, items = warp_colors(level.plan), level.plan.items
-    largest = sorted(range(len(items)), key=lambda index: -items[index].canvas_area_px)
-    warps = [_warp(level, index, colors[index]) for index in sorted(largest[:MAX_NUM_WARPS])]
-    rows = [row_of([(np.zeros((0, WIDTH_PX, 3), np.uint8), summary)], 1)]
-    rows.append(row_of([_regions(level), _features(level, colors)], PANELS_PER_ROW))
+    colors = warp_colors(level.plan)
+    warps = [_warp(level, index, colors[index]) for index in _largest_warps(level.plan)]
+    photographs = [_regions(level), _features(level, colors)]
+    rows = [text_row(summary), row_of(photographs, PANELS_PER_ROW)]
     for first in range(0, len(warps), WARPS_PER_ROW):
         rows.append(row_of(warps[first : first + WARPS_PER_ROW], WARPS_PER_ROW))
-    _, data = cv2.imencode(".png", np.concatenate(rows)[:, :, ::-1])
-    replace_bytes(path, data.tobytes())
+    replace_bytes(path, encode_png(rows))
 
 
-def _regions(level: InspectedLevel) -> tuple[ColorImage, str]:
+def _largest_warps(plan: RectificationPlan) -> list[int]:
+    """Return the indices of the largest warps, in the order of the plan."""
+    indices = range(len(plan.items))
+    by_area = sorted(indices, key=lambda index: -plan.items[index].canvas_area_px)
+    return sorted(by_area[:MAX_NUM_WARPS])
+
+
+def _regions(level: InspectedLevel) -> Panel:
+    """Draw the photograph with its regions, each with the numbers of its warps."""
     image = tinted(level.photograph, level.plan)
+    masked = ""
     if level.photograph.mask is not None:
-        image[~level.photograph.mask] //= 3
-    numbers = defaultdict(list)
-    for number, item in enumerate(level.plan.items, 1):
-        if item.region is not None:
-            rows, columns = np.nonzero(item.region)
-            middle = columns.mean() + item.region_origin[0], rows.mean() + item.region_origin[1]
-            numbers[middle].append(str(number))
-    marks = {place: ", ".join(alike[:3]) for place, alike in numbers.items()}
-    dark = "; dark: masked" if level.photograph.mask is not None else ""
-    title = f"regions by number of warp{dark}" if marks else f"no regions{dark}"
-    return panel_of(image, PANELS_PER_ROW, marks=marks), title
-
-
-def _features(level: InspectedLevel, colors: Sequence[Color]) -> tuple[ColorImage, str]:
-    features = level.features
-    palette = [DARK, *colors]
-    drawn = [palette[number] for number in features.rectification_ids.tolist()]
-    pale = 255 - (255 - level.photograph.gray) // 2
-    image = panel_of(pale, PANELS_PER_ROW, features, drawn, MAX_NUM_FEATURES)
-    shown = min(len(features), MAX_NUM_FEATURES)
-    return image, f"the strongest {shown} of {len(features)} features; gray: without a warp"
-
-
-def _warp(level: InspectedLevel, index: int, color: Color) -> tuple[ColorImage, str]:
-    item = level.plan.items[index]
-    (image, mask), found = level.seen[index + 1]
-    kept = level.features.select(level.features.rectification_ids == index + 1)
-    if mask is not None:
-        outside = 255 - (255 - image) // 4
-        image = np.where(mask if image.ndim == 2 else mask[:, :, None], image, outside)
-    features = replace(kept, lafs=transform_frames(item.rectified_from_image, kept.lafs))
-    panel = panel_of(image, WARPS_PER_ROW, features, [color] * len(kept), MAX_NUM_WARP_FEATURES)
-    return panel, f"{index + 1}: tilt {item.tilt:.2f}, {len(kept)} of {len(found)} features"
-
-
-def panel_of(
-    image: Bytes,
-    per_row: int,
-    features: LocalFeatures | None = None,
-    colors: Sequence[Color] = (),
-    max_num: int = 0,
-    marks: Marks | None = None,
-) -> ColorImage:
-    """Show an (H, W[, 3]) image as large as fits, with its strongest features, and texts."""
-    side, height, width = WIDTH_PX // per_row - MARGIN_PX, *image.shape[:2]
-    scale = side / max(width, height)
-    size = max(1, round(scale * width)), max(1, round(scale * height))
-    shrunk = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    panel: ColorImage = np.empty((*size[::-1], 3), np.uint8)
-    panel[:] = shrunk.reshape(*size[::-1], -1)
-    panel_from_image = resized_from_original((width, height), size)
-    if features is not None:
-        order = np.argsort(-features.responses, kind="stable")[:max_num]
-        lafs = transform_frames(panel_from_image, features.lafs[order])
-        outlines = lafs[:, :, :2] @ UNIT_CIRCLE * (FEATURE_SIGMAS / MEASUREMENT_SIGMAS)
-        points = np.rint(np.swapaxes(outlines + lafs[:, :, 2:], 1, 2)).astype(np.int32)
-        for index, outline in zip(order.tolist(), points, strict=True):
-            cv2.polylines(panel, [outline], True, colors[index], 1, cv2.LINE_AA)
-    for place, text in (marks or {}).items():
-        x, y = np.rint(project(panel_from_image, np.array([place]))[0]).astype(int).tolist()
-        _write(panel, text, (x, y))
+        image[~level.photograph.mask] //= MASK_DIMMING
+        masked = "; dark: masked"
+    labels = _region_labels(level.plan)
+    title = "regions by number of warp" if labels else "no regions"
+    panel = Panel.fit(image, PANELS_PER_ROW, title + masked)
+    panel.draw_labels(labels)
     return panel
 
 
-def row_of(panels: Sequence[tuple[ColorImage, str]], per_row: int) -> ColorImage:
-    """Put panels side by side, each below its title."""
-    height = max(len(panel) for panel, _ in panels) + TITLE_PX
-    row = np.full((height, WIDTH_PX, 3), 255, np.uint8)
-    for place, (panel, title) in enumerate(panels):
-        left = place * WIDTH_PX // per_row
-        row[TITLE_PX : TITLE_PX + len(panel), left : left + panel.shape[1]] = panel
-        _write(row, title, (left + MARGIN_PX, TITLE_PX - 8))
-    return row
+def _region_labels(plan: RectificationPlan) -> dict[Point, str]:
+    """Return the numbers of the warps of each region, by the middle of the region."""
+    numbers = defaultdict[Point, list[str]](list)
+    for number, item in enumerate(plan.items, 1):
+        if item.region is not None:
+            rows, columns = np.nonzero(item.region)
+            left, top = item.region_origin
+            middle = (columns.mean() + left, rows.mean() + top)
+            numbers[middle].append(str(number))
+    return {middle: ", ".join(same[:MAX_NUM_NUMBERS]) for middle, same in numbers.items()}
 
 
-def _write(image: ColorImage, text: str, place: tuple[int, int]) -> None:
-    """Write black on white, from the left end of the base line on."""
-    for gray, thickness in ((255, 3), (0, 1)):
-        how = cv2.FONT_HERSHEY_SIMPLEX, 0.4, (gray,) * 3, thickness, cv2.LINE_AA
-        cv2.putText(image, text, place, *how)
+def _features(level: InspectedLevel, colors: Sequence[Color]) -> Panel:
+    """Draw the features on the faded photograph, in the colours of the warps they are of."""
+    features = level.features
+    palette = [DARK, *colors]
+    feature_colors = [palette[number] for number in features.rectification_ids.tolist()]
+    num_shown = min(len(features), MAX_NUM_FEATURES)
+    title = f"the strongest {num_shown} of {len(features)} features; gray: without a warp"
+    panel = Panel.fit(_faded(level.photograph.gray, FEATURE_FADING), PANELS_PER_ROW, title)
+    panel.draw_features(features, feature_colors, MAX_NUM_FEATURES)
+    return panel
+
+
+def _warp(level: InspectedLevel, index: int, color: Color) -> Panel:
+    """Draw a warp with those of its features that were kept."""
+    item = level.plan.items[index]
+    rectification_id = index + 1
+    (image, mask), detected = level.detected[rectification_id]
+    is_of_warp = level.features.rectification_ids == rectification_id
+    kept = level.features.select(is_of_warp)
+    if mask is not None:
+        inside = mask if image.ndim == 2 else mask[:, :, None]
+        image = np.where(inside, image, _faded(image, OUTSIDE_FADING))
+    counts = f"{len(kept)} of {len(detected)} features"
+    title = f"{rectification_id}: tilt {item.tilt:.2f}, {counts}"
+    panel = Panel.fit(image, WARPS_PER_ROW, title)
+    features = replace(kept, lafs=transform_lafs(item.rectified_from_image, kept.lafs))
+    panel.draw_features(features, [color] * len(kept), MAX_NUM_WARP_FEATURES)
+    return panel
+
+
+def _faded(image: Bytes, factor: int) -> Bytes:
+    """Return an image with its contrast divided by a factor, white staying white."""
+    return 255 - (255 - image) // factor
 
 
 def warp_colors(plan: RectificationPlan) -> list[Color]:
-    """Choose colours, the same for warps of one segment or of one class of the whole image."""
-    keys = [
-        (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
-        for item in plan.items
-    ]
-    groups = list(dict.fromkeys(keys))
-    texts = [PALETTE[groups.index(key) % len(PALETTE)] for key in keys]
-    return [(int(text[1:3], 16), int(text[3:5], 16), int(text[5:], 16)) for text in texts]
+    """Return a colour for each warp.
+
+    Warps of one segment have the same colour, and so have those of the whole image with one tilt.
+    """
+    numbers: dict[tuple[float, float] | int, int] = {}  # of colours, by tilt or segment
+    colors = []
+    for item in plan.items:
+        key = (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
+        number = numbers.setdefault(key, len(numbers))
+        colors.append(rgb(PALETTE[number % len(PALETTE)]))
+    return colors
 
 
 def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
@@ -176,8 +177,10 @@ def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
     for item, color in zip(plan.items, warp_colors(plan), strict=True):
         if item.region is not None:
             rows, columns = np.nonzero(item.region)
-            pixels = rows + item.region_origin[1], columns + item.region_origin[0]
-            mixed = (1.0 - TINT) * photograph.gray[pixels][:, None] + TINT * np.array(color)
+            left, top = item.region_origin
+            pixels = (rows + top, columns + left)
+            grays = photograph.gray[pixels][:, None]
+            mixed = (1.0 - TINT) * grays + TINT * np.array(color)
             image[pixels] = np.rint(mixed).astype(np.uint8)
     return image
 
@@ -185,54 +188,82 @@ def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
 def inspect_image(
     extractor: ImageExtractor, path: Path, output_path: Path, mask: Mask | None = None
 ) -> str:
-    """Carry out a recipe on one image, draw every level, and return a summary for people.
+    """Carry out a recipe on one image and draw every level.
 
     ``<stem>-inspection.png`` is the level of every image, ``<stem>-inspection-level-<k>.png`` level
     k of escalation. Where a depth map cannot be used the level has no warps, as in extraction.
-    ``mask`` is (H, W) bool of the stored image. Raises ImageError when the file cannot be read,
-    OptionError for an output folder that is not ours.
+
+    Args:
+        extractor: carries out the recipe.
+        path: the photograph.
+        output_path: folder of the sheets.
+        mask: (H, W) bool of the image as it is stored, False where it is not to be used.
+
+    Returns:
+        A line for each level and for each sheet.
+
+    Raises:
+        ImageError: the photograph cannot be read.
+        OptionError: the output folder is not ours.
     """
     workspace = Workspace(output_path)
     workspace.require_own(path.parent)
     numbers = list(extractor.rectifiers)
-    read = [extractor.photograph(path, mask=mask, level=number)[0] for number in numbers]
+    photographs = []
+    sheets = []
+    for number in numbers:
+        photograph, _ = extractor.photograph(path, mask=mask, level=number)
+        photographs.append(photograph)
+        suffix = f"-level-{number}" if number else ""
+        sheets.append(output_path / fitting_name(path.stem, f"-inspection{suffix}.png"))
     workspace.begin()
     lines = []
-    suffixes = [f"-level-{number}" if number else "" for number in numbers]
-    ends = [f"-inspection{suffix}.png" for suffix in suffixes]
-    sheets = [output_path / fitting_name(path.stem, end) for end in ends]
     with new_results(*sheets, replaces=True) as new_sheets:
-        for number, photograph, sheet in zip(numbers, read, new_sheets, strict=True):
+        for number, photograph, sheet in zip(numbers, photographs, new_sheets, strict=True):
             level = inspect_level(extractor, photograph, number)
             name = extractor.options.levels[number].rectifier.name
-            text = f"level {number}, {name}: {_summary(level)}"
-            draw_sheet(level, text, sheet)
-            lines.append("; ".join(filter(None, (text, level.warning))))
+            line = f"level {number}, {name}: {_summary(level)}"
+            draw_sheet(level, line, sheet)
+            lines.append(f"{line}; {level.warning}" if level.warning else line)
     return "\n".join([*lines, *map(str, sheets)])
 
 
 def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int) -> InspectedLevel:
-    """Carry out level ``number`` of a recipe as extraction does, and keep all that passes by."""
+    """Carry out one level of a recipe as extraction does, and keep what it works with.
+
+    Args:
+        extractor: carries out the recipe.
+        photograph: at the size of processing of the level.
+        number: of the level.
+
+    Returns:
+        The plan, the views, and the features before and after their selection.
+    """
     start = time.perf_counter()
     plan, warning = extractor.plan(photograph, number)
     recorder = _Recorder(extractor.extractors[number])
-    recorders = {**extractor.extractors, number: recorder}
-    features = replace(extractor, extractors=recorders).execute(photograph, plan, number)
-    first_id = 0 if extractor.options.levels[number].base == number else 1
-    seen, seconds = dict(enumerate(recorder.seen, first_id)), time.perf_counter() - start
-    return InspectedLevel(photograph, plan, warning, seen, features, seconds)
+    extractors = {**extractor.extractors, number: recorder}
+    recorded = replace(extractor, extractors=extractors)
+    features = recorded.execute(photograph, plan, number)
+    looks_at_photograph = extractor.options.levels[number].base == number
+    first_id = 0 if looks_at_photograph else 1
+    detected = dict(enumerate(recorder.detected, first_id))
+    seconds = time.perf_counter() - start
+    return InspectedLevel(photograph, plan, warning, detected, features, seconds)
 
 
 class _Recorder:
-    """A feature extractor that keeps in order what another one is shown and finds."""
+    """A feature extractor that keeps the views another one gets, and the features it detects."""
 
     def __init__(self, extractor: FeatureExtractor) -> None:
-        self.extractor, self.descriptor_size = extractor, extractor.descriptor_size
-        self.seen: list[tuple[View, LocalFeatures]] = []
+        self.extractor = extractor
+        self.descriptor_size = extractor.descriptor_size
+        self.detected: list[tuple[View, LocalFeatures]] = []
 
     def detect(self, view: View) -> LocalFeatures:
-        self.seen.append((view, self.extractor.detect(view)))
-        return self.seen[-1][1]
+        features = self.extractor.detect(view)
+        self.detected.append((view, features))
+        return features
 
     def describe(
         self, images: Sequence[Bytes], detected: Sequence[LocalFeatures]
@@ -241,12 +272,13 @@ class _Recorder:
 
 
 def _summary(level: InspectedLevel) -> str:
-    count = len(level.plan.items)
-    if not count:
+    num_warps = len(level.plan.items)
+    if not num_warps:
         return f"no warps; {len(level.features)} features; {level.seconds:.1f} s"
+    warps = "warp" if num_warps == 1 else "warps"
     warped_share = level.plan.rectified_area_px / math.prod(level.plan.image_size)
     from_warps = int(np.count_nonzero(level.features.rectification_ids))
     return (
-        f"{count} warp{'s' * (count != 1)} of {warped_share:.2f} image areas;"
+        f"{num_warps} {warps} of {warped_share:.2f} image areas;"
         f" {len(level.features)} features, {from_warps} of them in warps; {level.seconds:.1f} s"
     )

@@ -4,14 +4,16 @@ import hashlib
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
 from colmap_affrect.errors import shown
-from colmap_affrect.progress import Progress
+from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.report.pictures import base64_text, thumbnails
 from colmap_affrect.report.scene import View3D
 
@@ -24,31 +26,48 @@ FOLDERS = re.compile(r"(?<![^\s'\"(=\[])(?:[A-Za-z]:[\\/]|~?/)(?:[^/\\\s'\"]+[/\
 """The folders at the beginning of a path of this machine."""
 
 
-def write_page(
-    path: Path,
-    template: Path,
-    content: Mapping[str, Any],
-    names: Sequence[str],
-    image_path: Path | None,
-    views: Iterable[tuple[View3D, Mapping[str, str]]],
-    progress: Progress,
-) -> Path:
-    """Fill a template, write it as one file that loads nothing, and return its path.
+@dataclass(frozen=True)
+class Page:
+    """What a page is made of."""
 
-    The template extends ``base.html`` and may use ``parts.html``. It gets thumbnails of the
-    photographs that are called ``names``, and models with the kind of each camera by its name. No
-    folder of this machine is in the page, since pages are sent to others. Raises WorkspaceError
-    when it cannot be written.
+    template: Path  # extends ``base.html`` and may use ``parts.html``
+    content: Mapping[str, Any]  # variables of the template
+    names: Sequence[str]  # of the photographs, in the order of their numbers
+    image_path: Path | None  # their folder; without it there are no thumbnails
+    views: Sequence[View3D]  # models, which the script draws
+    inlier_matrix: str = ""  # base64: (N, N) uint16 numbers of inliers
+    tie_points: Mapping[str, Any] | None = None  # what the tool for tie points begins with
+    can_mark: bool = False  # whether the page has that tool
+
+
+def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
+    """Fill a template and write it as one file that loads nothing.
+
+    No folder of this machine is in the page, since pages are sent to others.
+
+    Args:
+        path: the HTML file, which is replaced.
+        page: what is in it; its template gets thumbnails of the photographs, too.
+        progress: where to show it.
+
+    Returns:
+        The path.
+
+    Raises:
+        WorkspaceError: the page cannot be written.
     """
-    folders = [folder.resolve() for folder in (path.parent, image_path) if folder]
-    known = [f"{place}{os.sep}" for folder in folders for place in (folder, folder.parent)]
-    hidden = sorted(known, key=len, reverse=True)
+    folders = []
+    for folder in (path.parent, page.image_path):
+        if folder:
+            whole = resolved(folder)
+            folders += [f"{whole}{os.sep}", f"{whole.parent}{os.sep}"]
+    folders.sort(key=len, reverse=True)
 
     def finalized(value: Any) -> Any:
-        return shown(without_folders(value, hidden)) if type(value) is str else value
+        return shown(without_folders(value, folders)) if type(value) is str else value
 
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader([template.parent, TEMPLATES], encoding="utf-8"),
+        loader=jinja2.FileSystemLoader([page.template.parent, TEMPLATES], encoding="utf-8"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -56,34 +75,49 @@ def write_page(
         finalize=finalized,
     )
     environment.tests["contains"] = lambda values, value: value in values
-    files = ["page.js", *(["tie_points.js"] if content.get("can_mark") else [])]
-    scripts = [(TEMPLATES / name).read_text(encoding="utf-8") for name in files]
-    environment.globals |= {
+    digests = {}  # of scripts, as the Content-Security-Policy of the page wants them
+    for name in ("page.js", "tie_points.js") if page.can_mark else ("page.js",):
+        script = (TEMPLATES / name).read_text(encoding="utf-8")
+        digests[script] = base64_text(hashlib.sha256(script.encode()).digest())
+    content = {
+        **page.content,
+        "inlier_matrix": page.inlier_matrix,
+        "can_mark": page.can_mark,
         "inlier_colors": INLIER_COLORS,
-        "scripts": {s: base64_text(hashlib.sha256(s.encode()).digest()) for s in scripts},
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
+        "scripts": digests,
+        "script_data": _script_data(page),
+        "thumbnails": (
+            thumbnails(page.image_path, page.names, progress) if page.image_path else {}
+        ),
     }
-    index = {name: number for number, name in enumerate(names)}
-    data = {
-        "names": list(map(shown, names)),
-        "starts": list(INLIER_COLORS),
-        "colors": list(INLIER_COLORS.values()),
-        "matrix": content.get("matrix", ""),
-        "tie_points": content.get("tie_points"),
-        "views": [view.script_data(index, kinds) for view, kinds in views],
-    }
-    pictures = thumbnails(image_path, names, progress) if image_path else {}
-    page = environment.get_template(template.name)
-    replace_text(path, page.render({**content, "thumbnails": pictures, "script_data": data}))
+    replace_text(path, environment.get_template(page.template.name).render(content))
     return path
 
 
-def without_folders(text: str, known: Iterable[str] = ()) -> str:
-    r"""Leave of paths of this machine their last part, and of those in known folders what is below.
+def _script_data(page: Page) -> dict[str, Any]:
+    """Return what the scripts of a page read, as JSON has it."""
+    index = {name: number for number, name in enumerate(page.names)}
+    return {
+        "names": list(map(shown, page.names)),
+        "starts": list(INLIER_COLORS),
+        "colors": list(INLIER_COLORS.values()),
+        "matrix": page.inlier_matrix,
+        "tie_points": page.tie_points,
+        "views": [view.script_data(index) for view in page.views],
+    }
+
+
+def without_folders(text: str, folders: Iterable[str] = ()) -> str:
+    r"""Shorten paths of this machine to their last part, and those in known folders less.
+
+    Args:
+        text: with paths in it.
+        folders: of which only what is below them stays, with a separator at the end.
 
     >>> without_folders(r"/home/me/a.jpg: damaged, see C:\x\b.txt and c/d.jpg or 1/2")
     'a.jpg: damaged, see b.txt and c/d.jpg or 1/2'
     """
-    for folder in known:
+    for folder in folders:
         text = text.replace(folder, "")
     return FOLDERS.sub("", text)

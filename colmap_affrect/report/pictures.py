@@ -2,8 +2,9 @@
 
 import base64
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
 from colmap_affrect.data import ColorImage
 from colmap_affrect.errors import ImageError
@@ -11,23 +12,28 @@ from colmap_affrect.images.reading import encode_jpeg, read_color
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress
 
+# Chosen so that a page of any number of photographs has a few MB, which can be sent by mail.
 JPEG_QUALITY = 70
-MAX_TOTAL_PX, MAX_SIDE_PX = 12_000_000, 640  # of all thumbnails of a page, and of each
+MAX_TOTAL_PX = 12_000_000  # of all thumbnails of a page
+MAX_SIDE_PX = 640  # longer side of a thumbnail
 MAX_NUM_THUMBNAILS = 1000
+ASPECT_RATIO = 4 / 3  # of usual photographs
 
 
-class Picture(NamedTuple):
-    """An image of some px as text: a ``data:`` address with the whole file."""
+@dataclass(frozen=True)
+class Picture:
+    """An image as text."""
 
-    uri: str
-    width: int
-    height: int
+    uri: str  # a ``data:`` address with the whole file
+    width: int  # px
+    height: int  # px
 
     @classmethod
-    def of(cls, image: ColorImage) -> Self:
+    def from_image(cls, image: ColorImage) -> Self:
         """Encode an (H, W, 3) image."""
+        height, width = image.shape[:2]
         data = base64_text(encode_jpeg(image, JPEG_QUALITY))
-        return cls(f"data:image/jpeg;base64,{data}", image.shape[1], len(image))
+        return cls(f"data:image/jpeg;base64,{data}", width, height)
 
 
 def base64_text(data: bytes) -> str:
@@ -38,20 +44,31 @@ def base64_text(data: bytes) -> str:
 def thumbnails(
     folder: Path, names: Sequence[str], progress: Progress = SILENT
 ) -> dict[str, Picture]:
-    """Read photographs as stored, shrunk for a page of that many; unreadable ones are left out."""
+    """Read photographs and shrink them for a page.
+
+    Args:
+        folder: of the photographs.
+        names: of the photographs of the page; the more there are, the smaller are the pictures.
+        progress: where to show it.
+
+    Returns:
+        Pictures of the first ``MAX_NUM_THUMBNAILS`` photographs by name, without unreadable ones.
+    """
     shown = names[:MAX_NUM_THUMBNAILS]
-    size_px = int(min(MAX_SIDE_PX, (4 / 3 * MAX_TOTAL_PX / max(1, len(names))) ** 0.5))
+    area_px = MAX_TOTAL_PX / max(1, len(names))
+    side_px = int(min(MAX_SIDE_PX, (ASPECT_RATIO * area_px) ** 0.5))
 
     def picture(name: str) -> Picture | None:
         try:
-            return Picture.of(read_color(folder / name, size_px))
+            return Picture.from_image(read_color(folder / name, side_px))
         except ImageError:
             return None
 
     found = {}
     with progress.stage("pictures", len(shown), "images") as advance:
-        for name, made in zip(shown, map_ordered(picture, shown, available_cores()), strict=True):
-            if made:
-                found[name] = made
+        pictures = map_ordered(picture, shown, available_cores())
+        for name, thumbnail in zip(shown, pictures, strict=True):
+            if thumbnail:
+                found[name] = thumbnail
             advance(1)
     return found

@@ -2,12 +2,13 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.colmap.database import read_cameras
 from colmap_affrect.errors import such_as
@@ -18,14 +19,16 @@ from colmap_affrect.project.report import (
     SOURCES,
     ModelSummary,
     ReconstructionReport,
+    as_mapped,
     by_story,
     camera_notes,
+    probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.page import TEMPLATES, write_page
-from colmap_affrect.report.pairs import KINDS as LINES
+from colmap_affrect.report.page import TEMPLATES, Page, write_page
+from colmap_affrect.report.pairs import LEGEND, PairPicture
 from colmap_affrect.report.pictures import base64_text
-from colmap_affrect.report.scene import read_view
+from colmap_affrect.report.scene import View3D, read_view
 
 KINDS = {
     "tracks": "registered by common points",
@@ -35,6 +38,7 @@ KINDS = {
 }
 """How cameras came in; each has a colour of this name."""
 
+# More would make a page too large to be read or sent.
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_MODELS = 6  # that are drawn
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
@@ -42,130 +46,204 @@ MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 
 @dataclass(frozen=True)
 class Card:
-    """What became of a photograph."""
+    """A photograph on the contact sheet."""
 
     name: str
     kind: str  # one of ``KINDS``, or ``missing``
     text: str
-    groups: tuple[str, ...]
+    groups: tuple[str, ...]  # what the buttons above the sheet choose by
+
+
+@dataclass(frozen=True)
+class RunContent:
+    """What the page of a run has beside its report."""
+
+    names: Sequence[str]  # of all photographs
+    num_inliers: Mapping[Pair, int]  # of the verified pairs
+    image_path: Path | None = None  # folder of the photographs, if known
+    marks: Marks = field(default_factory=dict)  # of the tie points by hand
+    pairs_to_check: Sequence[PairPicture] = ()
 
 
 def write_run_page(
     workspace: Workspace,
     report: ReconstructionReport,
-    names: Sequence[str],
-    pair_inliers: Mapping[Pair, int],
-    image_path: Path | None,
+    content: RunContent,
     progress: Progress = SILENT,
-    *,
-    marks: Marks | None = None,
-    looks: Sequence[Mapping[str, Any]] = (),
 ) -> Path:
-    """Write ``report.html`` of a run, one file that loads nothing; WorkspaceError if it cannot.
+    """Write ``report.html`` of a run, one file that loads nothing.
 
-    ``names`` are those of all photographs, ``image_path`` their folder, if known; ``pair_inliers``
-    are of the verified pairs, ``marks`` those of the tie points by hand; ``looks`` see
-    :func:`.pairs.pairs_of_page`.
+    Args:
+        workspace: of the run.
+        report: of the run.
+        content: what else the page has.
+        progress: where to show it.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        WorkspaceError: the page cannot be written.
     """
+    names = content.names
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
-    cards = [_card(name, report, model) for name in names]
+    views = _views(workspace, report)
     known = set(names)
-    pair_inliers = {pair: n for pair, n in pair_inliers.items() if known >= set(pair)}
-    shown = report.models[:MAX_NUM_MODELS]
-    kinds = [{name: _card(name, report, m).kind for name in m.registered_names} for m in shown]
-    views = [read_view(workspace.sparse / str(k)) for k in range(len(shown))] or [read_view(None)]
-    counts = Counter(kind for of_model in kinds for kind in of_model.values())
-    content = {
-        "report": report,
-        "model": model,
-        "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
-        "doubts": _doubts(report, model),
-        "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
-        "max_num_lines": MAX_LINES,
-        "views": views,
-        "kinds": {kind: f"{text} ({counts[kind]})" for kind, text in KINDS.items() if counts[kind]},
-        "cards": cards,
-        "num_pairs": len(pair_inliers),
-        "looks": looks,
-        "line_colors": LINES,
-        "matrix": _matrix(names, pair_inliers),
-        **_cameras(report, names),
-        **_tie_points(workspace, model, names, marks or {}),
+    num_inliers = {
+        pair: count for pair, count in content.num_inliers.items() if known.issuperset(pair)
     }
-    template, drawn = TEMPLATES / "run.html", zip(views, kinds, strict=False)
-    return write_page(workspace.page, template, content, names, image_path, drawn, progress)
+    cameras = read_cameras(workspace.database) if workspace.database.exists() else {}
+    page = Page(
+        template=TEMPLATES / "run.html",
+        content={
+            "report": report,
+            "model": model,
+            "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
+            "doubts": _doubts(report, model),
+            "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
+            "max_num_lines": MAX_LINES,
+            "views": views or [read_view(None, {})],
+            "kinds": _kinds_legend(views),
+            "cards": [_card(name, report, model) for name in names],
+            "num_pairs": len(num_inliers),
+            "pairs_to_check": content.pairs_to_check,
+            "line_colors": LEGEND,
+            **_cameras(report, names),
+            "wants_marks": bool(content.marks) or len(model.registered_names) < len(names),
+            "residuals": [
+                f"{one.point} in {one.image}: {one.error_px:.1f} px" for one in model.tie_points
+            ],
+        },
+        names=names,
+        image_path=content.image_path,
+        views=views,
+        inlier_matrix=inlier_matrix(names, num_inliers),
+        tie_points=_tie_points(model, names, content.marks, cameras),
+        can_mark=len(cameras.keys() & known) > 1,
+    )
+    return write_page(workspace.page, page, progress)
+
+
+def _views(workspace: Workspace, report: ReconstructionReport) -> list[View3D]:
+    """Read the largest models, with the kinds of their cameras."""
+    views = []
+    for number, model in enumerate(report.models[:MAX_NUM_MODELS]):
+        kinds = {name: _card(name, report, model).kind for name in model.registered_names}
+        views.append(read_view(workspace.sparse / str(number), kinds))
+    return views
+
+
+def _kinds_legend(views: Sequence[View3D]) -> dict[str, str]:
+    """Return a text for each kind of cameras that there is."""
+    counts = Counter[str]()
+    for view in views:
+        counts.update(view.kinds.values())
+    return {kind: f"{text} ({counts[kind]})" for kind, text in KINDS.items() if counts[kind]}
 
 
 def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
-    if name not in set(model.registered_names):
+    """Return what became of a photograph."""
+    if name not in model.registered_names:
         text = report.unregistered.get(name, "not registered")
-        text += f": {report.failures[name]}" if name in report.failures else ""
+        if name in report.failures:
+            text += f": {report.failures[name]}"
         return Card(name, "missing", text, ("all", "missing"))
-    bridge = model.bridges.get(name)
-    kind, text = ("bridged", bridge.text()) if bridge else ("tracks", "registered")
+    kind = "tracks"
+    text = "registered"
+    if name in model.bridges:
+        kind = "bridged"
+        text = model.bridges[name].text()
     if name in report.extended:
-        kind, text = "existing", KINDS["existing"]
-    groups = ["all", kind, *(["added"] if name in report.added else [])]
+        kind = "existing"
+        text = KINDS["existing"]
+    groups = ["all", kind]
+    if name in report.added:
+        groups.append("added")
     if name in model.probabilities:
-        text += f", right with a probability of {model.probabilities[name]:.0%}"
+        text += f", right with a probability of {probability_text(model.probabilities[name])}"
+    if name in model.unsure:
+        why = model.unsure[name]
+        reasons = list(model.unsure.values())
+        text += "; not sure" + f": {why}" * (reasons.count(why) == 1)
     if name in model.doubtful:
-        why, reasons = model.doubtful[name], list(model.doubtful.values())
-        kind, text = "doubtful", f"{text}; doubtful" + f": {why}" * (reasons.count(why) == 1)
+        kind = "doubtful"
+        text += "; doubtful"
         groups.append("doubtful")
+        reason = model.doubtful[name]
+        if list(model.doubtful.values()).count(reason) == 1:  # else it is above the sheet only
+            text += f": {reason}"
     return Card(name, kind, text, tuple(groups))
 
 
 def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     """Return what cannot be trusted, or why there is no model and what became of photographs."""
     if report.models:
-        return by_story(model.doubtful)
+        unsure = [f"not sure: {line}" for line in by_story(model.unsure)]
+        return by_story(model.doubtful) + unsure
     why = report.why_no_model
     fates = {name: fate.partition(";")[0] for name, fate in report.unregistered.items()}
     return [f"{why[0].upper()}{why[1:]}.", *by_story(fates)]
 
 
 def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, Any]:
-    """Return the cameras that are listed, with photographs, and how many lengths are from where."""
-    numbered = {name: f"{number} {name}" for number, name in enumerate(names, 1)}
-    cameras = [
-        (camera, such_as(numbered[name] for name in camera["names"] if name in numbered))
-        for camera in report.cameras[:MAX_NUM_CAMERAS]
-    ]
-    counts = Counter(camera["source"] for camera in report.cameras).most_common()
-    notes = camera_notes(report.cameras)
+    """Return the first cameras, each with its photographs, and the sources of all focal lengths."""
+    numbers = {name: number for number, name in enumerate(names, 1)}
+    rows = []
+    for camera in as_mapped(report.cameras)[:MAX_NUM_CAMERAS]:
+        known = [name for name in camera["names"] if name in numbers]
+        photographs = such_as(f"{numbers[name]} {name}" for name in known)
+        rows.append((camera, photographs))
     return {
-        "cameras": cameras, "source_counts": counts, "source_texts": SOURCES, "camera_notes": notes,
-    }  # fmt: skip
-
-
-def _tie_points(
-    workspace: Workspace, model: ModelSummary, names: Sequence[str], marks: Marks
-) -> dict[str, Any]:
-    """Return what the tool for tie points begins with, sizes as stored and marks in px."""
-    cameras = read_cameras(workspace.database) if workspace.database.exists() else {}
-    sizes = {name: [name, camera.width, camera.height] for name, camera in cameras.items()}
-    index = {name: number for number, name in enumerate(names)}
-    errors = {(one.point, one.image): one.error_px for one in model.tie_points}
-    shown = [
-        [point, index[name], *place.tolist(), errors.get((point, name))]
-        for point, places in marks.items()
-        for name, place in places.items()
-    ]
-    return {
-        "tie_points": {"photographs": [sizes.get(name) for name in names], "marks": shown},
-        "can_mark": len(sizes.keys() & index.keys()) > 1,
-        "wants_marks": bool(marks) or len(model.registered_names) < len(names),
-        "residuals": [f"{r.point} in {r.image}: {r.error_px:.1f} px" for r in model.tie_points],
+        "cameras": rows,
+        "source_counts": Counter(one["source"] for one in report.cameras).most_common(),
+        "source_texts": SOURCES,
+        "camera_notes": camera_notes(report.cameras),
     }
 
 
-def _matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> str:
-    """Return the symmetric (N, N) uint16 inliers of pairs, row by row, as base64."""
+def _tie_points(
+    model: ModelSummary,
+    names: Sequence[str],
+    marks: Marks,
+    cameras: Mapping[str, pycolmap.Camera],
+) -> dict[str, Any]:
+    """Return what the tool for tie points begins with.
+
+    Args:
+        model: has the residuals of tie points.
+        names: of all photographs.
+        marks: (2,) px by point and photograph.
+        cameras: of the photographs in the database, which have their sizes.
+    """
+    index = {name: number for number, name in enumerate(names)}
+    errors_px = {(one.point, one.image): one.error_px for one in model.tie_points}
+    rows = []
+    for point, points in marks.items():
+        for name, (x, y) in points.items():
+            rows.append([point, index[name], float(x), float(y), errors_px.get((point, name))])
+    photographs = []
+    for name in names:
+        camera = cameras.get(name)
+        photographs.append([name, camera.width, camera.height] if camera else None)
+    return {"photographs": photographs, "marks": rows}
+
+
+def inlier_matrix(names: Sequence[str], num_inliers: Mapping[Pair, int]) -> str:
+    """Return the numbers of inliers of all pairs as a matrix.
+
+    Args:
+        names: of the (N,) photographs.
+        num_inliers: of pairs of these photographs.
+
+    Returns:
+        Base64 of the symmetric (N, N) uint16, row by row; empty for too many photographs.
+    """
     if len(names) > MAX_NUM_IN_MATRIX:
         return ""
     index = {name: number for number, name in enumerate(names)}
     counts = np.zeros((len(names), len(names)), dtype="<u2")
-    for (name1, name2), inliers in pair_inliers.items():
-        row, column = index[name1], index[name2]
+    for (name1, name2), inliers in num_inliers.items():
+        row = index[name1]
+        column = index[name2]
         counts[row, column] = counts[column, row] = min(inliers, np.iinfo(np.uint16).max)
     return base64_text(counts.tobytes())

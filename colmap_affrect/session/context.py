@@ -31,7 +31,7 @@ from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.outputs import database_files
-from colmap_affrect.project.paths import TakesPaths, resolved
+from colmap_affrect.project.paths import GivenPath, resolved
 from colmap_affrect.project.record import Content, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
@@ -73,7 +73,8 @@ class Inputs(Options):
 
     def names(self) -> list[str]:
         """Return the images of the list, else of the database, else of the folder."""
-        folder, listed = Path(self.image_path), Path(self.image_list_path)
+        folder = Path(self.image_path)
+        listed = Path(self.image_list_path)
         if not self.from_database:
             return list_images(folder, listed if self.image_list_path else None)
         known = read_names(Path(self.from_database))
@@ -84,7 +85,7 @@ class Inputs(Options):
         names = list_images(folder, listed)
         unknown = sorted(set(names) - set(known))
         if unknown:
-            raise ImageError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
+            raise OptionError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
         return names
 
     def contents(
@@ -116,11 +117,14 @@ class Inputs(Options):
                 "parameters, and other options of cameras"
             )
 
-    def check_names(self, names: Sequence[str]) -> None:
-        """Refuse photographs with the same key in hloc's files, or that cannot share cameras."""
+    def check_names(self, names: Sequence[str]) -> dict[str, str]:
+        """Refuse photographs with the same key in hloc's files, or whose cameras cannot be.
+
+        Returns what becomes of cameras otherwise than asked for, as a warning.
+        """
         refuse_colliding_keys(names)
-        if not self.from_database:
-            self.initial_cameras.check(names)
+        note = "" if self.from_database else self.initial_cameras.check(names)
+        return {"cameras": note} if note else {}
 
     @property
     def may_share(self) -> bool:
@@ -139,12 +143,13 @@ def source_files(path: Path) -> list[Path]:
     return sorted(file for file in files if file.is_file() and not file.name.endswith("-shm"))
 
 
-@dataclass(frozen=True)
-class Resources(TakesPaths):
+class Resources(Options):
     """What is needed from outside and does not change results."""
 
-    weights_path: Path | None = None  # folder with the weights of networks; None: the usual places
-    device: str = "auto"  # of networks and of matching: auto, cpu, cuda, cuda:1, mps
+    weights_path: GivenPath | None = None
+    """Folder with the weights of networks; None: the usual places."""
+    device: str = "auto"
+    """Of networks and of matching: ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``."""
 
     def require_device(self, *, uses_network: bool = False) -> str:
         """Return the device, if it is there; torch is loaded only to ask for one or use it."""
@@ -184,7 +189,8 @@ class OnRecord(Generic[Built]):
         self, stage: str, build: Callable[[Any, str], Built], beside: type[Options] | None = None
     ) -> None:
         """Take what builds them of values and of where these are; not of others ``beside`` them."""
-        self._stage, self._build = stage, build
+        self._stage = stage
+        self._build = build
         self._others = beside.model_fields if beside else {}
 
     def __get__(self, context: "Context", owner: object) -> Built:

@@ -42,7 +42,8 @@ def add_images(
 
 def write_images_and_keypoints(context: Context) -> dict[str, str]:
     """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
-    store, graph = context.features, context.graph
+    store = context.features
+    graph = context.graph
     counts = store.num_keypoints()
     has_database = context.workspace.database.exists()
     if has_database and context.workspace.cameras.exists() and counts == graph.num_keypoints:

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import CHECKS, keypoint_problems
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import DatabaseError, OptionError, StoreError
 from colmap_affrect.geometry.affine import lafs_from_keypoints
@@ -24,10 +26,10 @@ from colmap_affrect.pairs.given_matches import GivenMatches, MatchType
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, ordered_for_reuse
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.argument_types import checks_arguments
 
 SIFT_SIZE = 128  # values of the one kind of descriptors that whole numbers stand for
 IMAGES_IN_MEMORY = 60
-USUAL_FEATURES = 8000  # of an image, to tell how much there is to compare
 
 Arrays = tuple[Floats, Any]
 """(N, 2) keypoints in px, and the (N, D) descriptors of an image."""
@@ -60,6 +62,7 @@ def match_descriptors(
     return match_feature_sets(sets, [pair], options)[pair]
 
 
+@checks_arguments
 def match_feature_sets(
     features: Mapping[str, Arrays],
     pairs: Iterable[Pair] | None = None,
@@ -81,7 +84,7 @@ def match_feature_sets(
     Raises:
         OptionError: for arrays that do not fit, or pairs of other images.
     """
-    listed = exhaustive_pairs(list(features)) if pairs is None else list(pairs)
+    listed = exhaustive_pairs(list(features)) if pairs is None else list(map(_two, pairs))
     for name in {name for pair in listed for name in pair}:
         if name not in features:
             raise OptionError(f"{name}: is in a pair, and has no features")
@@ -103,13 +106,12 @@ def matched(
         read: returns (N, 2) keypoints and (N, D) descriptors of an image.
         options: of the matcher.
     """
-    context = MatcherContext(num_similarities=len(pairs) * USUAL_FEATURES**2)
-    matcher = NearestNeighbors(options or NearestOptions(), context)
+    matcher = NearestNeighbors(options or NearestOptions(), MatcherContext())
     sizes = dict[int, str]()
 
     @lru_cache(maxsize=IMAGES_IN_MEMORY)
     def prepared(name: str) -> Any:
-        image = _as_features(name, *read(name))
+        image = _as_features(name, read(name))
         sizes.setdefault(image.features.descriptors.shape[1], name)
         if len(sizes) > 1:
             first, second = sizes.items()
@@ -125,32 +127,60 @@ def matched(
     yield from zip(ordered, found, strict=True)
 
 
-def _as_features(name: str, keypoints: Floats, descriptors: Any) -> ImageFeatures:
+def _two(pair: Iterable[str]) -> Pair:
+    names = tuple(pair)
+    if len(names) != 2:
+        raise OptionError(f"pairs: {names!r} is not two names of images")
+    return names
+
+
+def _as_features(name: str, given: Arrays) -> ImageFeatures:
     """Check the arrays of an image, and return them as a matcher takes them."""
-    points, rows = np.asarray(keypoints, np.float64), np.asarray(descriptors)
+    try:
+        points, rows = map(_as_array, given)
+    except (TypeError, ValueError, RuntimeError) as error:  # of numpy and torch, or not two
+        why = " ".join(str(error).split())
+        raise OptionError(
+            f"{name}: give keypoints and descriptors as two arrays ({why})"
+        ) from error
     if points.ndim != 2 or points.shape[1] < 2 or rows.ndim != 2 or len(rows) != len(points):
         raise OptionError(
             f"{name}: keypoints {points.shape} and descriptors {rows.shape} do not fit; give "
             "(N, 2) places and (N, D) descriptors"
         )
+    if points.dtype.kind not in "fiu":
+        raise OptionError(f"{name}: keypoints are {points.dtype}; give numbers of px")
     if rows.dtype.kind not in "fiu" or (rows.dtype.kind in "iu" and rows.shape[1] != SIFT_SIZE):
         raise OptionError(
             f"{name}: descriptors are {rows.dtype} of {rows.shape[1]} values; whole numbers are "
             "taken for SIFT of 128 values, of others give floats (of bits -1.0 and 1.0)"
         )
     unit = unit_rows(rows)
-    if not (np.isfinite(points).all() and np.isfinite(unit).all()):
-        raise OptionError(f"{name}: keypoints or descriptors are not finite")
-    count = len(points)
-    lafs = lafs_from_keypoints(points[:, :2], np.ones(count), np.zeros(count))
+    if not np.isfinite(unit).all():
+        raise OptionError(f"{name}: descriptors are not finite")
+    places = points[:, :2].astype(np.float64)
+    for kind in keypoint_problems(places, None):
+        check = CHECKS[kind]
+        raise OptionError(f"{check['what']}: {name}; {check['advice']}")
+    count = len(places)
+    lafs = lafs_from_keypoints(places, np.ones(count), np.zeros(count))
     features = LocalFeatures(lafs, np.ones(count, np.float32), unit)
     return ImageFeatures(features, (0, 0), "")
 
 
+def _as_array(given: Any) -> NDArray[Any]:
+    """Return an array; ValueError where some of its values are masked."""
+    if np.ma.is_masked(given):
+        raise ValueError("some values are masked")
+    return np.asarray(given)
+
+
 def unit_rows(descriptors: Floats) -> Singles:
     """Return (N, D) descriptors of unit length; those of length 0 stay, and match nothing."""
+    exact = descriptors.astype(np.float64)
     with np.errstate(all="ignore"):  # what is not finite stays so
-        rows = descriptors.astype(np.float32)
+        _, exponents = np.frexp(np.abs(exact).max(axis=1, keepdims=True, initial=0.0))
+        rows = np.ldexp(exact, -exponents).astype(np.float32)  # whose squares are no 0 or infinity
         lengths = np.linalg.norm(rows, axis=1, keepdims=True)
         return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))
 

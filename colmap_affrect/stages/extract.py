@@ -5,14 +5,23 @@ import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
-from colmap_affrect.errors import DatabaseError, ImageError, StoreError, one_line, such_as
+from colmap_affrect.errors import (
+    ConflictError,
+    DatabaseError,
+    ImageError,
+    StoreError,
+    one_line,
+    such_as,
+)
 from colmap_affrect.features.weights import digests
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
+from colmap_affrect.project.paths import PathLike
 from colmap_affrect.project.record import WEIGHTS, Content, content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
@@ -31,7 +40,7 @@ def extract(
     inputs: Inputs,
     recipe: Recipe,
     *,
-    image_names: Sequence[str] = (),
+    image_names: Sequence[PathLike] = (),
     later: Mapping[str, Options] | None = None,
     overwrite: bool = False,
 ) -> StageReport:
@@ -43,30 +52,29 @@ def extract(
     in the place of a list on record.
     """
     start = time.perf_counter()
-    workspace, folder = context.workspace, Path(inputs.image_path)
+    workspace = context.workspace
+    folder = Path(inputs.image_path)
     inputs.check()
     workspace.require_own(folder)
     if inputs.from_database and not workspace.database.exists():
         refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)  # before it is on record
-    names = inputs.names()
-    names = checked_names(folder, image_names, "image_names") if image_names else names
-    options, known = recipe.extraction, {} if overwrite else context.features.contents()
+    if image_names:
+        names = checked_names(folder, image_names, "image_names")
+    else:
+        names = inputs.names()
+    options = recipe.extraction
+    known = {} if overwrite else context.features.contents()
     contents = inputs.contents(names, options, known)
-    if contents != known:  # else they were seen to be good
-        inputs.check_names(names)
+    # Those that were there before were seen to be good.
+    notes = inputs.check_names(names) if contents != known else {}
     whole = inputs.photographs.without_mask(names)
     extractor = one_image.prepare(options, context.resources, names, context.progress)
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
     weights = digests(extractor.weights)
-    workspace.record_options(
-        "extract",
-        {**inputs.to_mapping(), **options.to_mapping(), WEIGHTS: weights},
-        plan={s: x.to_mapping() for s, x in {**recipe.later_stages, **(later or {})}.items()},
-        recipe=recipe.name,
-        overwrite=overwrite,
-    )
-    warnings = _forget_changed(context, inputs, contents, are_all=not image_names)
+    given = {**inputs.to_mapping(), **options.to_mapping(), WEIGHTS: weights}
+    _record(workspace, given, recipe, later or {}, overwrite)
+    warnings = notes | _forget_changed(context, inputs, contents, are_all=not image_names)
     start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
     missing = [name for name in names if name not in done]
@@ -75,16 +83,36 @@ def extract(
         warnings |= not_named(folder, names) if inputs.from_database else left_out(folder)
     if whole:
         warnings["masks"] = f"{len(whole)} images have none and are used whole, as {whole[0]} is"
-    for kind, what in warnings.items():
-        logger.warning("%s: %s", kind, what)
+    _log_warnings(warnings)
     failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
     if len(failures) == len(names):
         why = f"none of the {len(names)} images can be used; the first: {failures[names[0]]}"
         raise ImageError(f"{folder}: {why}")
     failures |= write_images_and_keypoints(context)
-    new, kept = set(missing) - failures.keys(), done - failures.keys()
+    new = set(missing) - failures.keys()
+    kept = done - failures.keys()
     wall_s = time.perf_counter() - start
     return StageReport("extract", wall_s, len(new), len(kept), failures, warnings)
+
+
+def _record(
+    workspace: Workspace,
+    given: Mapping[str, Any],
+    recipe: Recipe,
+    later: Mapping[str, Options],
+    overwrite: bool,
+) -> None:
+    """Put what was given on record, and the options that later stages take where none are given."""
+    plan = dict[str, Any]()
+    for stage, options in {**recipe.later_stages, **later}.items():
+        plan[stage] = options.to_mapping()
+    workspace.record_options("extract", given, plan=plan, recipe=recipe.name, overwrite=overwrite)
+
+
+def _log_warnings(warnings: Mapping[str, str]) -> None:
+    """Log what the user should know of the photographs, by kind."""
+    for kind, what in warnings.items():
+        logger.warning("%s: %s", kind, what)
 
 
 def _extract_missing(
@@ -96,7 +124,8 @@ def _extract_missing(
     warnings: dict[str, str],
 ) -> dict[str, str]:
     """Extract images one by one; return why some cannot be used, and add to the warnings."""
-    store, images = context.features, [(name, 0) for name in names]
+    store = context.features
+    images = [(name, 0) for name in names]
     failures = dict[str, str]()
     faded = list[str]()
     white = list[str]()
@@ -152,12 +181,14 @@ def extract_images(
     files = inputs.photographs.files(images[0][0])
     if extractor.options.depth.path:
         files.append(Path(extractor.options.depth.path))
-    path, initial = context.workspace.database, inputs.initial_cameras
+    path = context.workspace.database
+    initial = inputs.initial_cameras
     known = context.graph.cameras if path.exists() else {}
     names = inputs.names() if extractor.options.uses_depth else []
 
     def task(name: str, level: int) -> ImageTask:
-        camera, intrinsics = known.get(name), None
+        camera = known.get(name)
+        intrinsics = None
         if extractor.options.uses_depth:
             matrix = colmap_database.camera_matrix
             intrinsics = matrix(camera) if camera else initial.matrix(name, names)
@@ -199,7 +230,7 @@ def _refuse_other_photographs(
     before = (workspace.planned("extract") or {}).get("image_path", image_path)
     known = {} if before == image_path else FeatureStore(workspace.features).contents()
     if known and len(_changed(known, contents)) == len(known.keys() & contents.keys()):
-        raise StoreError(
+        raise ConflictError(
             f"{workspace.path}: the extract stage was run there with image_path={before!r}, and "
             f"none of the photographs in {image_path} is one of them; use --overwrite to discard "
             "the results, or another --output-path"
@@ -221,12 +252,14 @@ def _forget_changed(
     again. ``contents`` are those of each image now; ``are_all`` says that there are no other
     images. Returns one line by the folder of the photographs, empty if nothing has changed.
     """
-    workspace, store = context.workspace, context.features
+    workspace = context.workspace
+    store = context.features
     known = store.contents()
     changed = _changed(known, contents)
     are_all = are_all and not workspace.users_database
     gone = sorted(known.keys() - contents.keys()) if are_all else []
-    cameras, before = content_of(inputs.camera_files).digest, workspace.made_from("cameras")
+    cameras = content_of(inputs.camera_files).digest
+    before = workspace.made_from("cameras")
     other_cameras = ["cameras are given by other files"] if before not in ("", cameras) else []
     lines = [*_counted(changed, "changed"), *_counted(gone, "gone"), *other_cameras]
     if lines:

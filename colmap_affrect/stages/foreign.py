@@ -22,7 +22,7 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.given_matches import MatchType, given_matches
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.project.paths import TakesPaths
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.session.context import Context, source_files
@@ -38,7 +38,7 @@ Records = dict[int, CameraRecord]
 
 
 @dataclass(frozen=True)
-class ForeignDatabase(TakesPaths):
+class ForeignDatabase:
     """A database of another program, and what is known beside it."""
 
     path: Path
@@ -51,16 +51,16 @@ class ForeignDatabase(TakesPaths):
     def to_record(self) -> dict[str, Any]:
         """Return what a run keeps of it; what is not given is not there."""
         record: dict[str, Any] = {
-            "database": str(self.path.resolve()),
-            "image_path": str(self.image_path.resolve()) if self.image_path else "",
+            "database": str(resolved(self.path)),
+            "image_path": str(resolved(self.image_path)) if self.image_path else "",
         }
         if self.cameras != CameraOptions():
             record["cameras"] = self.cameras.to_mapping()
         if self.matches_path:
-            record["matches"] = str(self.matches_path.resolve())
+            record["matches"] = str(resolved(self.matches_path))
             record["match_type"] = self.match_type
         if self.match_list_path:
-            record["match_list"] = str(self.match_list_path.resolve())
+            record["match_list"] = str(resolved(self.match_list_path))
         return record
 
     @classmethod
@@ -115,7 +115,8 @@ def copy_verified(
     DatabaseError when it cannot be used, or has neither matches nor descriptors.
     """
     start = time.perf_counter()
-    workspace, source = context.workspace, foreign.path
+    workspace = context.workspace
+    source = foreign.path
     foreign.check()
     workspace.require_own(foreign.image_path)
     digest = foreign.digest()

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.two_views import CALIBRATED, pair_model
 from colmap_affrect.colmap.verification import PairVerifier, weakly_connected_images
 from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
-from colmap_affrect.geometry.tilts import vary_singly
+from colmap_affrect.geometry.tilts import are_individual_shapes
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
 from colmap_affrect.pairs.lists import Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
@@ -130,7 +130,7 @@ class GuidedMatcher:
         """Return descriptors and, where frames were measured one by one, their linear parts."""
         features = self._store.read(name)
         shapes = features.lafs[:, :, :2]
-        if not (len(shapes) and vary_singly(shapes)):
+        if not (len(shapes) and are_individual_shapes(shapes)):
             shapes = shapes[:0]
         return features.descriptors, shapes
 

@@ -9,12 +9,13 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.model_files import model_folder
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import ConflictError
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, model_folders, read_summaries
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 
@@ -50,9 +51,9 @@ def map_images(
     workspace.require("verify")
     inputs = _inputs(context, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    known = workspace.made_from("map") if workspace.sparse.exists() else ""
+    known = "" if workspace.lacks_models() else workspace.made_from("map")
     if known != inputs and " " in known and not extend:
-        raise StoreError(
+        raise ConflictError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
         )
@@ -69,7 +70,7 @@ def map_images(
     workspace.record_made_from(map="")  # a run that is killed begins anew
     with context.progress.stage("map", len(context.graph.ids), "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
-    workspace.record_made_from(map=inputs)
+    workspace.record_mapped(inputs)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models)), models
 
@@ -85,8 +86,10 @@ def _models_before(sparse_path: Path, summaries: Sequence[ModelSummary]) -> list
 
 def _task(context: Context, extend: Extension | None, before: Sequence[MappedModel]) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
-    workspace, by_hand = context.workspace, context.by_hand
-    copied, path = workspace.is_foreign, workspace.database
+    workspace = context.workspace
+    by_hand = context.by_hand
+    copied = workspace.is_foreign
+    path = workspace.database
     workspace.mapped_database.unlink(missing_ok=True)
     tie_points: Mapping[str, Mapping[str, int]] = {}
     if by_hand != NOTHING:
@@ -97,7 +100,7 @@ def _task(context: Context, extend: Extension | None, before: Sequence[MappedMod
         workspace.photographs(),
         read_existing(extend, path) if extend else None,
         before,
-        unmeasured=frozenset() if copied else frozenset(unmeasured_pairs(context)),
+        unmeasured_pairs=frozenset() if copied else frozenset(unmeasured_pairs(context)),
         cameras=read_camera_records(workspace.cameras),
         may_share=not copied and context.inputs.may_share,
         tie_points=tie_points,
@@ -132,8 +135,8 @@ def _inputs(context: Context, extend: Extension | None) -> str:
     verified = context.verified_digest()
     if not extend:
         return verified
-    folder = model_folder(extend.model_path).resolve()
-    own = folder.is_relative_to(context.workspace.sparse.resolve())
+    folder = resolved(model_folder(extend.model_path))
+    own = folder.is_relative_to(resolved(context.workspace.sparse))
     return f"{verified} {'own' if own else extend.digest()}"
 
 

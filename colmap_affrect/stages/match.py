@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, PartError
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
@@ -39,7 +39,7 @@ MIN_GROWTH = 1.1  # of the matches that confirm each other, by all features; sma
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
 IMAGES_IN_MEMORY = 40  # of 13,000 features
-BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
+BYTES_PER_FEATURE = 614  # of a feature ready for matching, with descriptors of 128
 
 Found = TypeVar("Found")
 
@@ -269,7 +269,6 @@ class Matching:
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     max_num_features: int = 0  # of each image, those of the largest responses; 0: all
-    num_similarities: float = 0  # about how many pairs of features there will be to compare
     num_kept: int = IMAGES_IN_MEMORY
 
 
@@ -287,10 +286,8 @@ def iterate_matches(
     limit = matching.max_num_features
     if limit:
         counts = {name: min(count, limit) for name, count in counts.items()}
-    num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    known = replace(matching, num_similarities=num_similarities, num_kept=max(2, num_kept))
-    matcher = CachedMatcher(known)
+    matcher = CachedMatcher(replace(matching, num_kept=max(2, num_kept)))
     ordered = ordered_for_reuse(pairs, max(1, num_kept // 2))
     yield from executor.map(matcher, ordered, [matching.store.path])
 
@@ -318,7 +315,7 @@ class CachedMatcher:
         self._weights = resolve(options.weights, resources.weights_path)
         if sent is not None:
             require_same_files(self._weights, sent)
-        context = MatcherContext(self._weights, resources.device, matching.num_similarities)
+        context = MatcherContext(self._weights, resources.device)
         self.matcher = MATCHERS.make(options, context)
         self._images = lru_cache(matching.num_kept)(self._prepare)
         self._lock = threading.Lock()
@@ -331,6 +328,9 @@ class CachedMatcher:
         first = self.prepared(names[0])
         second = self.prepared(names[1])
         found = self.matcher.match(first.content, second.content)
+        if why := found.fault(len(first.indices), len(second.indices)):
+            name = self._matching.options.name
+            raise PartError(f"matcher '{name}': returned {why}")
         rows = first.indices[found.indices[:, 0]]
         columns = second.indices[found.indices[:, 1]]
         indices = np.stack([rows, columns], axis=1)

@@ -14,7 +14,7 @@ from colmap_affrect.data import LocalFeatures, Mask, Photograph, RectificationPl
 from colmap_affrect.errors import MEMORY_HINT, DepthError, ImageError, lacks_memory
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import digests, resolve
-from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import camera_matrix, is_inside, resized_from_original
 from colmap_affrect.images import reading
@@ -83,7 +83,8 @@ class ImageExtractor:
             if not lacks_memory(error):
                 raise
             return ImageError(f"{path}: {MEMORY_HINT}")
-        size, expected = found.image_size, task.camera_size
+        size = found.image_size
+        expected = task.camera_size
         if expected and expected != size:
             return ImageError(
                 f"{path}: is {size[0]} x {size[1]} px, and its camera in the database "
@@ -111,7 +112,7 @@ class ImageExtractor:
             features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
             resized = resized_from_original(original_size, photograph.size)
-            frames = transform_frames(np.linalg.inv(resized), features.lafs)
+            frames = transform_lafs(np.linalg.inv(resized), features.lafs)
             features = replace(features, lafs=frames)
         keep = is_inside(features.keypoints, original_size)
         if mask is not None:
@@ -206,7 +207,8 @@ def prepare(
     weights = resolve(keys, resources.weights_path, progress=progress)
     uses_network = any(level.uses_networks for level in options.levels)
     device = resources.require_device(uses_network=uses_network)
-    network, depth = NetworkContext(weights, device), None
+    network = NetworkContext(weights, device)
+    depth = None
     extractor = cache(lambda features: EXTRACTORS.make(features, network))
     extractors = {k: extractor(level.features) for k, level in levels.items()}
     if options.uses_depth:
@@ -216,7 +218,8 @@ def prepare(
     shapes = cache(lambda source, features: SHAPES.make(source, network, features))
 
     def rectifier(level: Level) -> Rectifier:
-        item, source = level.rectifier, None
+        item = level.rectifier
+        source = None
         if isinstance(item, CoverOptions):
             source = shapes(item.shape_source, level.features)
         return RECTIFIERS.make(item, RectifierInputs(source, depth if item.uses_depth else None))

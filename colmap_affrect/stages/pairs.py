@@ -37,7 +37,8 @@ def choose_pairs(
     by, StoreError when earlier pairs are missing in the list, or other options made them.
     """
     start = time.perf_counter()
-    workspace, options = context.workspace, options or context.pairing
+    workspace = context.workspace
+    options = options or context.pairing
     workspace.require("extract")
     listed = options.match_list_path
     if "exhaustive" in options.methods and not listed:
@@ -65,7 +66,8 @@ def choose_pairs(
 
 def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
     """Return the pairs that are listed or chosen by names and positions."""
-    names, pairs = context.features.names(), set[Pair]()
+    names = context.features.names()
+    pairs = set[Pair]()
     known = set(names)
     if "sequence" in options.methods:
         pairs |= set(lists.sequence_pairs(names, options.num_neighbors))
@@ -106,7 +108,8 @@ def _say_lonely(
 
 def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pair]) -> set[Pair]:
     """Return the pairs chosen by features; none when all images have pairs already."""
-    features, progress = context.features, context.progress
+    features = context.features
+    progress = context.progress
     names = [name for name, count in features.num_keypoints().items() if count]
     are_paired = {name for pair in there for name in pair}.issuperset(names)
     if len(names) < 2 or are_paired or "retrieval" not in options.methods:

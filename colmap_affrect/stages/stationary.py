@@ -3,7 +3,7 @@
 Such a thing is at the same place of many photographs, whatever they show. Its matches fit a
 camera that does not move, and may be more than those of the scene. So may those of the background
 where an object turns before a camera that stands still. What a camera turns about is also at the
-same place, but not to the pixel: see :mod:`colmap_affrect.geometry.stillness`.
+same place, but not to the pixel: see :mod:`colmap_affrect.geometry.stationary`.
 """
 
 import logging
@@ -16,7 +16,11 @@ import numpy as np
 
 from colmap_affrect.data import Mask
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
-from colmap_affrect.geometry.stillness import exactness, means_of_regions, num_moving_together
+from colmap_affrect.geometry.stationary import (
+    means_of_regions,
+    num_moving_together,
+    stationary_log_ratios,
+)
 from colmap_affrect.images.reading import grown
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.stores import STATIONARY, FeatureStore, MatchStore, PairMatches
@@ -29,7 +33,8 @@ MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
 MIN_SHARE = 0.5  # of the pairs that have a match in a cell
-MIN_PX, MIN_FRAC = 1.0, 0.001
+MIN_PX = 1.0
+MIN_FRAC = 0.001
 """Error of what stands still, px, or part of the longer side if that is more: large photographs are
 shrunk before features are found in them."""
 CONNECTED = 1  # cells by which those are grown that are looked at together
@@ -67,7 +72,8 @@ class StationaryFilter:
 
     def __init__(self, features: FeatureStore, matches: MatchStore) -> None:
         """Name the files; what is known of places is read now."""
-        self._features, self._matches = features, matches
+        self._features = features
+        self._matches = matches
         self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
         kept = matches.note(STATIONARY) or []  # the (N, 2) cells, column and row, by size
         self._places: dict[Size, Mask] = {
@@ -105,7 +111,8 @@ class StationaryFilter:
 
         A call that was killed may have dropped some: what it found is on record and counts too.
         """
-        found, idle = self._find(pairs), ""
+        found = self._find(pairs)
+        idle = ""
         for size, places in found.items():
             if not places.still.any():
                 continue
@@ -154,7 +161,8 @@ class StationaryFilter:
             likely &= images[size].sum(2) >= MIN_NUM_IMAGES
             if likely.any():
                 exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
-                num_likely, num_matched = likely.sum(), (counts >= MIN_NUM_PAIRS).sum()
+                num_likely = likely.sum()
+                num_matched = (counts >= MIN_NUM_PAIRS).sum()
                 is_most = bool(num_likely > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
                 places[size] = _Places(likely & exact, is_most)
         return places
@@ -175,14 +183,15 @@ class StationaryFilter:
             if not _at(likely, cells).any():
                 continue
             points, others = self._ends(found.names, found.indices[are_still])
-            ratios = exactness(points, others - points, tolerance_px, limit_px)
+            ratios = stationary_log_ratios(points, others - points, tolerance_px, limit_px)
             own += _means(cells, ratios)
             connected += _means(cells, means_of_regions(cells, ratios, NUM_CELLS, CONNECTED))
         return np.minimum(own, connected)
 
     def _moves_elsewhere(self, pairs: Sequence[Pair], size: Size, places: Mask) -> bool:
         """Tell whether enough matches of some pairs move together outside of places."""
-        num_pairs, names = 0, set[str]()
+        num_pairs = 0
+        names = set[str]()
         for found in self._matches.read([p for p in pairs if self._common_size(p) == size]):
             are_still, first, second = self._still(found.names, found.indices, size)
             are_moving = ~(are_still | _at(places, first) | _at(places, second))

@@ -86,7 +86,9 @@ def main() -> None:
     for text in arguments.methods:
         extraction = parse_method(text, depth).recipe.extraction
         both = extraction, without_warps(extraction)
-        extractors[text] = [prepare(options, Resources(arguments.weights)) for options in both]
+        extractors[text] = [
+            prepare(options, Resources(weights_path=arguments.weights)) for options in both
+        ]
     rounds = [
         [
             [np.mean([cost(way, path) for path in paths], axis=0) for way in both]

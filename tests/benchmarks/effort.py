@@ -25,6 +25,7 @@ from machine import parser_of, table
 from registration import SUBSETS, Subset
 
 from colmap_affrect.colmap.model_files import read_poses
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison.results import pose_scores
 from colmap_affrect.escalation import climb as climbing
 from colmap_affrect.escalation.escalate import Escalation
@@ -32,12 +33,14 @@ from colmap_affrect.escalation.policy import EFFORTS
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import read_summaries
+from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.options import EFFORT_NAMES, EffortName
-from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.pipeline import run
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import LOOKED_AT
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.session.context import Context
+from colmap_affrect.session.run_options import RunOptions
 
 Row = dict[str, Any]
 
@@ -85,14 +88,13 @@ def curve(
     names = names[subset.first :: subset.step]
     list_path = work_path / "names.txt"
     list_path.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
-    recipe_options = RunOptions()
     options = RunOptions(
         image_list_path=list_path,
         cameras=camera_options(scene_path, subset),
         effort=effort,
         max_minutes=max_minutes,
-        verification=recipe_options.verification.changed(random_seed=seed),
-        mapping=recipe_options.mapping.changed(random_seed=seed),
+        verification=VerificationOptions(random_seed=seed),
+        mapping=SparseOptions(random_seed=seed),
     )
     rows = list[Row]()
     begun_s = time.process_time()

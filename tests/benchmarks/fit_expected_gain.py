@@ -42,8 +42,12 @@ from colmap_affrect.stages.match import match, matched_at_level
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
 
-NUM_PAIRS, NUM_SLOW_PAIRS, NUM_ROWS = 21, 8, 6
-STRONG, ENOUGH, MAX_ERROR_DEG = 100, 50, 10.0
+NUM_PAIRS = 21
+NUM_SLOW_PAIRS = 8
+NUM_ROWS = 6
+STRONG = 100
+ENOUGH = 50
+MAX_ERROR_DEG = 10.0
 PRIOR = {"constant": -1.5, "consistent": 0.5, "inliers": 0.3, "tried": -0.5, "success_ratio": 0.3}
 RIDGE = {"constant": 0.9, "consistent": 6.0, "inliers": 6.0, "tried": 6.0, "success_ratio": 6.0}
 
@@ -107,7 +111,8 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
         verify_matches(context)
         context.workspace.record_options("escalate", EscalateOptions().to_mapping())
         escalation = Escalation(context, EscalateOptions())
-        states, features = escalation.state.states(), context.features
+        states = escalation.state.states()
+        features = context.features
         weak = [pair for pair, state in states.items() if state.num_inliers < STRONG]
         chosen = sorted(random.Random(0).sample(weak, min(NUM_PAIRS, len(weak))))
         rows: dict[tuple[str, str], Row] = {
@@ -174,7 +179,8 @@ def examples(rows: Sequence[Row], number: int) -> Iterator[tuple[dict[str, float
 
 def fitted(values: Array, outcome: Array) -> Array:
     """Return the weights of a logistic regression with a normal prior, by Newton's method."""
-    prior, ridge = np.array(list(PRIOR.values())), np.array(list(RIDGE.values()))
+    prior = np.array(list(PRIOR.values()))
+    ridge = np.array(list(RIDGE.values()))
     weights = prior.copy()
     for _ in range(50):
         chance = 1 / (1 + np.exp(-values @ weights))
@@ -221,7 +227,8 @@ def main() -> None:
         sets = [name for name, found in by_set.items() for _ in found]
         found = [example for part in by_set.values() for example in part]
         values = np.array([[known[term] for term in PRIOR] for known, _ in found])
-        outcome, which = np.array([float(right) for _, right in found]), np.array(sets)
+        outcome = np.array([float(right) for _, right in found])
+        which = np.array(sets)
         chance = np.zeros(len(outcome))
         for name in by_set:  # left out of the fit
             out = which == name
@@ -230,7 +237,8 @@ def main() -> None:
         kind = kind_of(levels[number])
         weights = np.round(fitted(values, outcome), 2).tolist()
         content[kind]["coefficients"] = dict(zip(PRIOR, weights, strict=True))
-        brier, mean = np.mean((chance - outcome) ** 2), np.var(outcome)
+        brier = np.mean((chance - outcome) ** 2)
+        mean = np.var(outcome)
         print(f"{kind}: {len(found) // NUM_ROWS} pairs, Brier {brier:.3f} (mean alone {mean:.3f})")
     arguments.output_path.write_text(json.dumps(content, indent=1) + "\n")
 

@@ -173,12 +173,14 @@ Job = tuple[Path, list[str], list[str]]
 
 def jobs() -> dict[str, Job]:
     """Return photographs, names and options of runs by what they are called."""
-    court, images = sorted(path.name for path in COURTYARD.glob("images/*")), COURTYARD / "images"
+    court = sorted(path.name for path in COURTYARD.glob("images/*"))
+    images = COURTYARD / "images"
     depth = ["--depth-path", str(COURTYARD / "depth")]
     preset = ["--mapper", "incremental", "--database-descriptors", "--preset", "colmap"]
     few = ["--pairs", "retrieval,sequence", "--num-neighbors", "2"]
     rectified = ["--recipe", "rectified"]
-    demand, with_depth = ["--recipe", "on-demand"], "depth-affnet-recommended"
+    demand = ["--recipe", "on-demand"]
+    with_depth = "depth-affnet-recommended"
     found: dict[str, Job] = {
         "courtyard rectified": (images, court, rectified),
         "courtyard on-demand": (images, court, demand),

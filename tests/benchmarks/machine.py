@@ -46,5 +46,6 @@ def span(values: Iterable[float | None], digits: int = 0) -> str:
     known = [value for value in values if value is not None]
     if not known:
         return "-"
-    low, high = f"{min(known):.{digits}f}", f"{max(known):.{digits}f}"
+    low = f"{min(known):.{digits}f}"
+    high = f"{max(known):.{digits}f}"
     return low if low == high else f"{fmean(known):.{digits + 1}f} [{low}-{high}]"

@@ -138,7 +138,8 @@ def main() -> None:
     parser.add_argument("--num-images", type=int, default=1000)
     parser.add_argument("options", nargs="*", help="of run, after --; default: --pairs retrieval")
     arguments = parser.parse_args()
-    photographs, out = arguments.output_path / "images", arguments.output_path / "run"
+    photographs = arguments.output_path / "images"
+    out = arguments.output_path / "run"
     photographs.mkdir(parents=True, exist_ok=True)
     take_photographs(photographs, arguments.num_images)
     parameters = f"{FOCAL_LENGTH_PX},{FOCAL_LENGTH_PX},{IMAGE_SIZE[0] / 2},{IMAGE_SIZE[1] / 2}"

@@ -46,11 +46,13 @@ def main() -> None:
     parser.add_argument("--shares", type=float, nargs="+", default=[0.1, 0.2, 0.3])
     arguments = parser.parse_args()
     context = Context(Workspace(arguments.output_path))
-    features, database_path = context.features, context.workspace.database
+    features = context.features
+    database_path = context.workspace.database
     names = {image_id: name for name, image_id in image_ids(database_path).items()}
     verified = verified_pairs(database_path, context.verification.min_num_inliers)
     inliers = {tuple(sorted((names[a], names[b]))): n for (a, b), n in verified.items()}
-    num_images, num_right = len(features.names()), len(inliers)
+    num_images = len(features.names())
+    num_right = len(inliers)
     num_pairs = num_images * (num_images - 1) // 2
     rows = []
     ways = ways_to_choose(features).items()

@@ -34,7 +34,9 @@ class Subset(NamedTuple):
     first: int = 0
 
 
-FOUNTAIN, HERZ, TEMPLE = "strecha_fountain_p11", "strecha_herz_jesus_p25", "temple_sparse_ring"
+FOUNTAIN = "strecha_fountain_p11"
+HERZ = "strecha_herz_jesus_p25"
+TEMPLE = "temple_sparse_ring"
 SUBSETS = {
     "fountain 0,5,10": Subset(FOUNTAIN, 5, True),
     "herz 0,8,16,24": Subset(HERZ, 8, True),

@@ -43,7 +43,8 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
 from colmap_affrect.comparison import results
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MappingTask
-from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS, measure
+from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS
+from colmap_affrect.mappers.reliability_features import features_of
 from colmap_affrect.project.report import DOUBTFUL, SURE
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
@@ -108,7 +109,9 @@ class Set:
     recipe: str = "rectified"
 
 
-FOUNTAIN, HERZ, TEMPLE = "strecha_fountain_p11", "strecha_herz_jesus_p25", "temple_sparse_ring"
+FOUNTAIN = "strecha_fountain_p11"
+HERZ = "strecha_herz_jesus_p25"
+TEMPLE = "temple_sparse_ring"
 SETS = {
     "fountain": Set(FOUNTAIN),
     "herz": Set(HERZ, 2),
@@ -146,7 +149,8 @@ SETS = {
 
 def make(name: str, scenes_path: Path, work_path: Path) -> Path:
     """Return the output folder of a run on a set, which is made if it is not there."""
-    some, out = SETS[name], work_path / name
+    some = SETS[name]
+    out = work_path / name
     if (out / "report.json").exists():
         return out
     paths = sorted((scenes_path / some.scene / "images").iterdir())[some.first :: some.step]
@@ -160,7 +164,8 @@ def make(name: str, scenes_path: Path, work_path: Path) -> Path:
             for path in paths:
                 shutil.copy(path, images)
         if some.spoil == "aged":
-            plain, images = images, Path(folder) / "aged"
+            plain = images
+            images = Path(folder) / "aged"
             tool = scenes_path.parent / "tools" / "age.py"
             subprocess.run([sys.executable, tool, plain, images], check=True)
         command = ["run", "--quiet", "--image-path", images, "--output-path", out]
@@ -199,9 +204,11 @@ def truth_of(
 
 def correct_images(poses: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, bool]:
     """Tell of each image whether it is registered correctly; those without a place are not."""
-    names, errors = sorted(poses.keys() & truth.keys()), {}
+    names = sorted(poses.keys() & truth.keys())
+    errors = {}
     for one, two in itertools.combinations(names, 2):
-        first, second = truth[one], truth[two]
+        first = truth[one]
+        second = truth[two]
         errors[one, two] = (180.0, 180.0)
         if first and second and first[0] == second[0]:
             relative = relative_pose(poses[one], poses[two])
@@ -229,7 +236,8 @@ def cameras_of(
 ) -> tuple[dict[int, CameraRecord], dict[int, Any]] | None:
     """Return records and cameras of a part with known or with wrong focal lengths."""
     factor = float(rng.choice(WRONG_FACTORS)) if kind == "wrong" else 1.0
-    changed, cameras = {}, {}
+    changed = {}
+    cameras = {}
     for key, record in records.items():
         if kind == "unknown":
             changed[key] = replace(record, source="guess", given=())
@@ -252,7 +260,8 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
     """Map parts of a set; return a row for each photograph whose place is known or is none."""
     pycolmap.logging.minloglevel = 3
     out = make(name, scenes_path, work_path)
-    rows, rng = [], np.random.default_rng(zlib.crc32(name.encode()))
+    rows = []
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
     records = read_camera_records(out / "cameras.json")
     with open_database(out / "database.db") as database:
         images = {image.name: image.image_id for image in database.read_all_images()}
@@ -278,7 +287,7 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
                 task = MappingTask(
                     path,
                     None,
-                    unmeasured=frozenset(pair for pair in unmeasured if {*part} >= {*pair}),
+                    unmeasured_pairs=frozenset(pair for pair in unmeasured if {*part} >= {*pair}),
                     cameras=told[0],
                     may_share=kind == "unknown",
                 )
@@ -308,9 +317,9 @@ def rows_of(
         {
             "image": image,
             "right": right[image],
-            "terms": {key: term.value(measures) for key, term in TERMS.items()},
+            "terms": {key: term.value(features) for key, term in TERMS.items()},
         }
-        for image, measures in measure(mapped, task).items()
+        for image, features in features_of(mapped, task).items()
         if image in right
     ]
 
@@ -319,7 +328,8 @@ def misplace(model: pycolmap.Reconstruction, rng: np.random.Generator) -> str:
     """Move a photograph around what it sees, by 20 to 90 degrees; return its name."""
     image = model.images[int(rng.choice(sorted(model.reg_image_ids())))]
     seen = [model.point3D(p.point3D_id).xyz for p in image.get_observation_points2D()]
-    middle, axis = np.median(seen, axis=0), rng.normal(size=3)
+    middle = np.median(seen, axis=0)
+    axis = rng.normal(size=3)
     turn = pycolmap.Rotation3d(np.deg2rad(rng.uniform(20, 90)) * axis / np.linalg.norm(axis))
     around = pycolmap.Rigid3d(turn, middle - turn.matrix() @ middle)
     image.frame.set_cam_from_world(image.camera_id, image.cam_from_world() * around)
@@ -355,11 +365,13 @@ def fitted(
     Maximum likelihood with a normal prior of the weights, by Newton's method; of terms in units of
     their deviation.
     """
-    mean, deviation = values.mean(axis=0), values.std(axis=0) + 1e-9
+    mean = values.mean(axis=0)
+    deviation = values.std(axis=0) + 1e-9
     scaled = np.column_stack([(values - mean) / deviation, np.ones(len(values))])
     kept = np.arange(scaled.shape[1])
     while True:
-        part, weights = scaled[:, kept], np.zeros(len(kept))
+        part = scaled[:, kept]
+        weights = np.zeros(len(kept))
         prior = np.diag([1.0] * (len(kept) - 1) + [0.0])
         for _ in range(MAX_ITERATIONS):
             probabilities = 1.0 / (1.0 + np.exp(-part @ weights))
@@ -391,7 +403,8 @@ def left_out(rows: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
 
 def scores(probabilities: NDArray[np.float64], right: NDArray[np.float64]) -> dict[str, float]:
     """Return how good probabilities are."""
-    sure, doubtful = probabilities >= SURE, probabilities < DOUBTFUL
+    sure = probabilities >= SURE
+    doubtful = probabilities < DOUBTFUL
     return {
         "photographs": len(right),
         "right": float(right.mean()),

@@ -47,7 +47,8 @@ def run_commands(method: Method, paths: Sequence[Path], resources: Resources) ->
         Seconds of each stage as ``extract_s``, ``match_s``, ``verify_s``, ``map_s``; numbers of
         ``images``, ``pairs``, ``features``, ``inliers`` (of all verified pairs).
     """
-    image_path, names = paths[0].parent, [path.name for path in paths]
+    image_path = paths[0].parent
+    names = [path.name for path in paths]
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "out"
         folder.mkdir()
@@ -97,7 +98,8 @@ def table_of(results: dict[str, list[Row]]) -> str:
     def each(rounds: Sequence[Row], key: str, unit: str) -> np.ndarray:
         return np.array([row[key] / row[unit] for row in rounds])
 
-    reference, rows = next(iter(results.values())), []
+    reference = next(iter(results.values()))
+    rows = []
     for name, rounds in results.items():
         cells = [name]
         for key, unit in (("extract_s", "images"), ("match_s", "pairs")):
@@ -129,7 +131,7 @@ def main() -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     paths = sorted(arguments.image_path.iterdir())[: arguments.num_images]
     methods = [parse_method(text) for text in arguments.methods]
-    resources = Resources(arguments.weights)
+    resources = Resources(weights_path=arguments.weights)
     commands: dict[str, list[Row]] = {method.label: [] for method in methods}
     for _ in range(arguments.num_rounds):
         for method in methods:

@@ -15,12 +15,13 @@ from PIL import Image
 from small_scene import write_photographs
 
 from colmap_affrect.cli import main
-from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
+from colmap_affrect.cli.parser import COMMANDS as ALL_COMMANDS
+from colmap_affrect.cli.parser import EXAMPLES, VOLUME, build_parser, epilog
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.reliability import Judgement
+from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 
@@ -54,6 +55,27 @@ def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
         parser.parse_args(example.replace("\\\n", " ").split())
     shown = epilog("map")
     assert shown.count("colmap-affrect ") == shown.count("colmap-affrect map ") == 2
+
+
+def test_help_of_many_flags_is_in_groups_that_lack_none() -> None:
+    parser = build_parser()
+    (choices,) = (action.choices for action in parser._actions if action.dest == "command")
+    for name, (_, flags) in ALL_COMMANDS.items():
+        words = re.split(r"[ |\n,]+", f"{flags} {VOLUME}")
+        given = {word.removesuffix("!").partition("@")[0] for word in words}
+        known = choices[name]._option_string_actions.keys()
+        assert {flag for flag in given if flag.startswith("-")} == known - {"-h", "--help"}, name
+    shown = choices["run"].format_help()
+    first = "usage: colmap-affrect run --image-path PATH --output-path PATH [options]\n"
+    assert shown.startswith(first)
+    titles = re.findall(r"^(\w[\w ]*):$", shown, re.MULTILINE)
+    assert titles == [
+        "options", "photographs", "cameras", "features and pairs", "models", "by hand",
+        "what is printed and drawn", "examples",
+    ]  # fmt: skip
+    most_used = shown.partition("photographs:\n")[0]
+    assert "--camera-mode MODE" in most_used
+    assert "--mapper" not in most_used
 
 
 def test_help_loads_no_heavy_package() -> None:
@@ -90,7 +112,8 @@ def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
     assert (done.code, done.stderr) == (0, [])
     path = tmp_path / "copy.toml"
     path.write_text(done.stdout)
-    copy, original = load_recipe(str(path)), load_recipe("on-demand")
+    copy = load_recipe(str(path))
+    original = load_recipe("on-demand")
     assert (copy.extraction, copy.matching) == (original.extraction, original.matching)
     assert "# Radius r of a covering ball as a tilt ratio. Paper: 1.7.\ntilt_radius" in done.stdout
 
@@ -170,7 +193,7 @@ def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(
     assert record["mapper_options"]["triangulation.min_angle"] == 1.25
     again = ["map", "--output-path", verified, "-q", "--preset", "colmap", "--mapper"]
     done = call(*again, "incremental")
-    assert (done.code, done.stdout) == (1, "")
+    assert (done.code, done.stdout) == (2, "")
     assert "init_min_num_inliers=40, and it is None now" in done.errors[0]
 
 
@@ -365,7 +388,8 @@ def test_what_is_printed_may_end_early() -> None:
 def test_finished_model_is_extended_and_another_database_mapped(
     photos: Path, tmp_path: Path, call: Call
 ) -> None:
-    first, out = tmp_path / "first", tmp_path / "out"
+    first = tmp_path / "first"
+    out = tmp_path / "out"
     listed = tmp_path / "names.txt"
     names = sorted(str(p.relative_to(photos)) for p in photos.rglob("*.png"))
     listed.write_text("\n".join(names[:2]))
@@ -377,7 +401,7 @@ def test_finished_model_is_extended_and_another_database_mapped(
     report = json.loads(done.stdout)
     assert (report["extended"], report["added"]) == (names[:2], names[2:])
     refused = call("map", "--output-path", out, "-q")
-    assert refused.code == 1
+    assert refused.code == 2
     assert "its model extends another one; give --extend again, or --over" in refused.errors[-1]
     copied = ["map", "--output-path", tmp_path / "copied", "--from-database", out / "database.db"]
     mapped = call(*copied, "--extend", model, "-q")
@@ -391,10 +415,10 @@ def test_finished_model_is_extended_and_another_database_mapped(
 def test_model_that_nobody_can_trust_ends_with_3(
     verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def judge(mapped: MappedModel, *_: object) -> dict[str, Judgement]:
-        return dict.fromkeys(model_poses(mapped.reconstruction), Judgement(0.3, "no parallax"))
+    def score(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
+        return dict.fromkeys(model_poses(mapped.reconstruction), Confidence(0.3, "no parallax"))
 
-    monkeypatch.setattr(mapping, "judge", judge)
+    monkeypatch.setattr(mapping, "score_images", score)
     assert main(["map", "--output-path", str(verified), "--overwrite"]) == 3
     printed = capfd.readouterr()
     assert "results " in printed.out

@@ -95,9 +95,15 @@ def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
 
 
 AS_PROCESS = """
-import collections, ctypes, itertools
+import collections, ctypes, itertools, time
 from colmap_affrect import __main__, cli
-cli.main = lambda: (print("begun", flush=True), WORK)
+def tidy_up_for_ever():
+    try:
+        time.sleep(60)
+    finally:
+        print("tidying up", flush=True)
+        time.sleep(60)
+cli.main = lambda begin: (begin(), print("begun", flush=True), WORK)
 __main__.main()
 """
 STUCK = "collections.deque(itertools.repeat(0), maxlen=0)"  # holds Python's lock for ever
@@ -128,6 +134,20 @@ def test_native_code_that_does_not_return_is_left(number: signal.Signals, send) 
         128 + number,
         ["interrupted; run the same command again to go on"],
     )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("send", [os.kill, os.killpg])
+def test_second_interrupt_ends_a_command_that_tidies_up_at_once(send) -> None:
+    with start_stuck("tidy_up_for_ever()") as process:
+        send(process.pid, signal.SIGINT)
+        assert process.stdout.readline() == "tidying up\n"
+        begin = time.monotonic()
+        send(process.pid, signal.SIGINT)
+        _, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert time.monotonic() - begin < 2.0
+    assert process.returncode == 130
+    assert stderr == "interrupted; run the same command again to go on\n"
 
 
 @pytest.mark.long
@@ -169,7 +189,8 @@ def test_streams_that_are_closed_stop_nothing(
 
 
 def test_native_code_that_ends_the_command_is_named() -> None:
-    code = "import os\nfrom colmap_affrect import __main__, cli\ncli.main = lambda: os._exit(1)\n"
+    code = "import os\nfrom colmap_affrect import __main__, cli\n"
+    code += "cli.main = lambda begin: os._exit(1)\n"
     done = subprocess.run(
         [sys.executable, "-c", f"{code}__main__.main()"],
         capture_output=True, text=True, check=False, timeout=TIMEOUT_S,

@@ -61,7 +61,7 @@ def test_marks_outside_of_their_photograph_are_refused(
     tmp_path: Path, database: Path, cells: str
 ) -> None:
     (tmp_path / "marks.csv").write_text(f"p,a,-1,481.5\np,b,{cells}\n")
-    by_hand = ByHand(tmp_path / "marks.csv")
+    by_hand = ByHand(tie_points_path=tmp_path / "marks.csv")
     words = r"line 2: .* is outside of b\.jpg, which is 640 x 480 px; give px of the photograph"
     with pytest.raises(OptionError, match=words):
         by_hand.marks(NAMES, lambda _: (640, 480))
@@ -93,7 +93,11 @@ def test_photographs_that_are_not_there_are_refused(by_hand: ByHand) -> None:
 def test_digests_tell_what_is_said(tmp_path: Path) -> None:
     table = tmp_path / "marks.csv"
     table.write_text(ROWS)
-    said = [ByHand(table), ByHand(left_out=("b.jpg",)), ByHand(rejected=(("b.jpg", "c.png"),))]
+    said = [
+        ByHand(tie_points_path=table),
+        ByHand(left_out=("b.jpg",)),
+        ByHand(rejected=(("b.jpg", "c.png"),)),
+    ]
     digests = [by_hand.digest() for by_hand in said]
     table.write_text(ROWS + "q,b,5,6\n")
     assert not NOTHING.digest()
@@ -117,7 +121,7 @@ def database(tmp_path: Path) -> Path:
 
 def test_the_copy_has_tie_points_behind_the_keypoints(tmp_path: Path, database: Path) -> None:
     (tmp_path / "marks.csv").write_text(ROWS + "q,b.jpg,5,6\n")
-    by_hand = ByHand(tmp_path / "marks.csv")
+    by_hand = ByHand(tie_points_path=tmp_path / "marks.csv")
     indices = by_hand.copy_database(database, tmp_path / "mapped.db")
     assert indices == {"p": {"old/a.jpg": 4, "b.jpg": 4}, "q": {"c.png": 0, "b.jpg": 5}}
     with open_database(tmp_path / "mapped.db") as copy:
@@ -141,7 +145,8 @@ def test_the_copy_lacks_rejected_pairs_and_those_of_images_left_out(
 
 
 def test_marks_are_triangulated_where_they_are_in_space() -> None:
-    place, model = np.array([0.4, -0.3, 5.0]), pycolmap.Reconstruction()
+    place = np.array([0.4, -0.3, 5.0])
+    model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
     camera.params = [500.0, 300.0, 250.0, 0.1]
     model.add_camera_with_trivial_rig(camera)

@@ -91,7 +91,8 @@ def test_healthy_database_has_no_problem(database_path: Path) -> None:
     assert tables.summary() == ("3 images, 1 camera, 21 keypoints, 3 matched and 3 verified pairs")
 
 
-GEOMETRIES, OF_13 = "two_view_geometries", f"WHERE pair_id = {pair_id(1, 3)}"
+GEOMETRIES = "two_view_geometries"
+OF_13 = f"WHERE pair_id = {pair_id(1, 3)}"
 OF_RIGS = [("rigs", "rig_id"), ("frames", "rig_id")]
 OF_CAMERAS = [
     ("cameras", "camera_id"), ("images", "camera_id"), ("rigs", "ref_sensor_id"),

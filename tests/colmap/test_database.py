@@ -27,7 +27,7 @@ from colmap_affrect.geometry.affine import (
     lafs_from_keypoints,
     rectifying_affine,
     rotation,
-    transform_frames,
+    transform_lafs,
 )
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.warping import warp
@@ -133,7 +133,7 @@ def test_elliptic_blob_of_30_degrees_keeps_its_axis_in_the_database(database_pat
     matrix, canvas = fit_canvas(linear, corners, margin_px=0.0)
     plan = Rectification(matrix, canvas, np.ones(image.shape, bool), 2.0, np.deg2rad(60.0))
     features = RootSift(SiftOptions()).detect((warp(image, plan), None))
-    lafs = transform_frames(plan.image_from_rectified, features.lafs)
+    lafs = transform_lafs(plan.image_from_rectified, features.lafs)
     best = np.linalg.norm(lafs[:, :, 2] - [110.3, 99.6], axis=1).argmin()
     laf = lafs[best : best + 1].copy()
     laf[0, :, :2] = laf[0, :, :2] @ rotation(np.deg2rad(77.0))  # which is not seen in the ellipse

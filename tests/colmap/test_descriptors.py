@@ -37,7 +37,8 @@ def float_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> Ma
         best, other = np.take_along_axis(rows, order, axis=1).T
         return np.where(best < MAX_RATIO * other, order[:, 0], -1)
 
-    forward, backward = nearest(angles), nearest(angles.T)
+    forward = nearest(angles)
+    backward = nearest(angles.T)
     return {(i, j) for i, j in enumerate(forward.tolist()) if j >= 0 and backward[j] == i}
 
 
@@ -56,12 +57,14 @@ def test_colmap_matches_what_float_descriptors_match(tmp_path: Path) -> None:
     colmap_affrect.extract_features(tmp_path / "a.db", tmp_path / "photos")
     context = Context(Workspace.beside(tmp_path / "a.db"))
     fill_descriptors(context.workspace.database, context.features)
-    path, store = context.workspace.database, context.features
+    path = context.workspace.database
+    store = context.features
     first, second = (store.read(name).descriptors for name in sorted(image_ids(path)))
-    expected, found = float_matches(first, second), colmap_matches(path)
+    expected = float_matches(first, second)
+    found = colmap_matches(path)
     assert len(expected) > 500
     old = tmp_path / "old.db"
-    assert export_database(path, old, store) == 2
+    assert export_database(path, old, descriptors=True) == 2
     with open_database(path) as database, closing(sqlite3.connect(old)) as copied:
         data = copied.execute("SELECT data FROM descriptors WHERE image_id = 1").fetchone()[0]
         assert data == np.asarray(database.read_descriptors(1).data).tobytes()
@@ -94,7 +97,8 @@ def test_signed_descriptors_of_networks_are_matched_too(tmp_path: Path) -> None:
     second[900:] = unit(rng.normal(size=(600, 128)))
     path = tmp_path / "a.db"
     written(path, first, second)
-    expected, found = float_matches(first, second), colmap_matches(path)
+    expected = float_matches(first, second)
+    found = colmap_matches(path)
     assert len(expected) > 600
     assert len(expected & found) >= 0.95 * len(expected)
 

@@ -68,11 +68,13 @@ def test_missing_cut_and_lengthened_files_are_errors_that_name_them(
 
 
 def test_damaged_models_are_an_error_or_can_be_used(model_path: Path, tmp_path: Path) -> None:
-    rng, num_errors = random.Random(2), 0
+    rng = random.Random(2)
+    num_errors = 0
     for _ in range(60):
         path = model_path / rng.choice(sorted(RECORDS))
         data = path.read_bytes()
-        changed, start = bytearray(data), rng.randrange(len(data))
+        changed = bytearray(data)
+        start = rng.randrange(len(data))
         for k in range(start, min(len(data), start + rng.choice([1, 8, 60]))):
             changed[k] = rng.choice([0, rng.randrange(256)])
         path.write_bytes(changed)
@@ -95,7 +97,8 @@ def test_tracks_and_keypoints_name_each_other(
         read_given_model(tmp_path)
     changed = pycolmap.Reconstruction(tmp_path)
     changed.delete_point3D(min(changed.points3D))
-    (other := tmp_path / "other").mkdir()
+    other = tmp_path / "other"
+    other.mkdir()
     changed.write(other)
     shutil.copy(other / "points3D.bin", tmp_path)
     what = "is not as it was written" if is_ours else "images and points are not of one model"
@@ -133,7 +136,9 @@ def name_twice(model: pycolmap.Reconstruction) -> None:
     _first(model).name = model.image(max(model.reg_image_ids())).name
 
 
-NAN, INF, UPRIGHT = float("nan"), float("inf"), [0.0, 0.0, 0.0, 1.0]
+NAN = float("nan")
+INF = float("inf")
+UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 UNSOUND: dict[str, tuple[Callable[[pycolmap.Reconstruction], None], str]] = {
     "rotation": (lambda model: set_pose(model, [NAN, 0.0, 0.0, 1.0], 0.0), "the pose of .* is not"),
     "no rotation": (lambda model: set_pose(model, [0.0] * 4, 0.0), "the pose of .* is not finite"),
@@ -155,7 +160,8 @@ def test_models_that_nothing_can_be_computed_with_are_refused(
     change, said = UNSOUND[case]
     model = pycolmap.Reconstruction(model_path)
     change(model)
-    (changed := tmp_path / "changed").mkdir()
+    changed = tmp_path / "changed"
+    changed.mkdir()
     model.write(changed)
     with pytest.raises(StoreError, match=said):
         read_given_model(changed)
@@ -174,7 +180,8 @@ def test_model_of_cameras_alone_needs_no_pose(model_path: Path) -> None:
 
 
 def test_folder_of_a_run_stands_for_its_largest_model(model_path: Path, tmp_path: Path) -> None:
-    (out := tmp_path / "out" / "sparse").mkdir(parents=True)
+    out = tmp_path / "out" / "sparse"
+    out.mkdir(parents=True)
     shutil.copytree(model_path, out / "0")
     for folder in (out.parent, out, out / "0"):
         assert model_folder(folder) == out / "0"

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.verification import (
     verified_pairs,
     verify,
 )
-from colmap_affrect.geometry.affine import project, rotation, transform_frames
+from colmap_affrect.geometry.affine import project, rotation, transform_lafs
 
 Array = NDArray[np.float64]
 Frames = tuple[Array, Array]
@@ -55,7 +55,7 @@ def frames_of(homographies: list[Array], num: int, seed: int) -> Frames:
     lafs[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, num)) * stretch
     lafs[:, :, 2] = rng.uniform((60, 50), (580, 430), (num, 2))
     parts = np.array_split(lafs, len(homographies))
-    seen = [transform_frames(h, part) for h, part in zip(homographies, parts, strict=True)]
+    seen = [transform_lafs(h, part) for h, part in zip(homographies, parts, strict=True)]
     return lafs, np.concatenate(seen)
 
 
@@ -121,7 +121,8 @@ def test_homography_is_judged_where_epipolar_lines_are_not_significant(frames_ag
     def estimated(**options: float) -> pycolmap.TwoViewGeometry:
         return estimate_geometry((sides[0], sides[1]), same, VerificationOptions(**options))
 
-    lines, plane = estimated(min_significance=0.0), estimated(min_significance=30.0)
+    lines = estimated(min_significance=0.0)
+    plane = estimated(min_significance=30.0)
     assert lines.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED
     if not frames_agree:
         assert len(plane.inlier_matches) == 0
@@ -161,7 +162,8 @@ def write_pairs(path: Path) -> None:
 
 
 def test_rejected_pair_is_done_and_not_verified(tmp_path: Path) -> None:
-    path, calls = tmp_path / "database.db", []
+    path = tmp_path / "database.db"
+    calls = []
     write_pairs(path)
     assert unverified_pairs(path).tolist() == [[1, 2], [3, 4]]
     verify(path, VerificationOptions(min_significance=5.0), advance=calls.append)
@@ -175,7 +177,8 @@ def test_rejected_pair_is_done_and_not_verified(tmp_path: Path) -> None:
 def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, options = tmp_path / "database.db", VerificationOptions(min_significance=5.0)
+    path = tmp_path / "database.db"
+    options = VerificationOptions(min_significance=5.0)
     write_pairs(path)
 
     def interrupted(sides: tuple[Side, Side], *given: object) -> pycolmap.TwoViewGeometry:
@@ -213,7 +216,8 @@ def test_preset_colmap_writes_what_pycolmap_does(tmp_path: Path) -> None:
 
 
 def test_threshold_grows_with_photographs_that_were_shrunk() -> None:
-    options, cameras = VerificationOptions(max_error_px=3.0), (camera(1, 2.5), camera(2))
+    options = VerificationOptions(max_error_px=3.0)
+    cameras = (camera(1, 2.5), camera(2))
     assert max_error_px(cameras, options, None) == 3.0
     assert max_error_px(cameras, options, 640) == pytest.approx(3.0 * (2.5 + 1.0) / 2)
     assert max_error_px(cameras, options, 6400) == 3.0
@@ -225,7 +229,7 @@ def with_caption(frames: Frames) -> Frames:
     """Add forty matches of print below, which is a little larger and elsewhere in image 2."""
     lafs, _ = frames_of([np.eye(3)], 40, 11)
     lafs[:, :, 2] = np.random.default_rng(12).uniform((200, 440), (350, 446), (40, 2))
-    moved = transform_frames(np.array([[1.05, 0.02, 60.0], [-0.02, 1.05, -390.0], [0, 0, 1]]), lafs)
+    moved = transform_lafs(np.array([[1.05, 0.02, 60.0], [-0.02, 1.05, -390.0], [0, 0, 1]]), lafs)
     return np.concatenate([frames[0], lafs]), np.concatenate([frames[1], moved])
 
 

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.comparison import compare as module
 from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.compare import CompareOptions, compare
-from colmap_affrect.comparison.method_run import MethodRun, _masks_for_colmap
+from colmap_affrect.comparison.method_run import MethodRun, masks_for_colmap
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.tables import to_json, verdict
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
@@ -111,7 +111,7 @@ def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> N
     for method in finished:
         assert method.failed == ""
         assert method.registered.min == method.registered.max == NUM_IMAGES
-        assert method.right.mean == NUM_IMAGES
+        assert method.trusted.mean == NUM_IMAGES
         assert list(method.failures) == ["broken.png"]
         assert method.peak_memory_bytes > 50e6
         assert {*method.stage_seconds} == {"extract", "match", "verify", "map"}
@@ -139,7 +139,7 @@ def test_finished_methods_are_not_run_again_where_photographs_moved_only(
     scene, options, compared, tmp_path, asked
 ) -> None:
     images = Path(shutil.copytree(scene / "images", tmp_path / "moved"))
-    chosen = replace(options, methods=METHODS[:2])
+    chosen = options.changed(methods=METHODS[:2])
     assert compare(images, compared[1], chosen).methods == compared[0].methods[:2]
     name = min(path.name for path in images.iterdir())
     (images / name).write_bytes((images / name).read_bytes() + b" ")
@@ -166,7 +166,7 @@ def test_other_options_than_before_are_refused(
     scene, options, compared, asked, changes, message
 ) -> None:
     with pytest.raises(StoreError, match=f"{message}.*; use --overwrite"):
-        compare(scene / "images", compared[1], replace(options, **changes))
+        compare(scene / "images", compared[1], options.changed(**changes))
     assert asked == []
 
 
@@ -186,9 +186,9 @@ def test_bad_input_is_refused_before_any_work(
     scene, options, tmp_path, changes, error, message
 ) -> None:
     with pytest.raises(error, match=message):
-        compare(scene / "images", tmp_path / "out", replace(options, **changes))
+        compare(scene / "images", tmp_path / "out", options.changed(**changes))
     write_ground_truth(tmp_path / "truth", ".jpg")
-    options = replace(options, ground_truth_path=tmp_path / "truth")
+    options = options.changed(ground_truth_path=tmp_path / "truth")
     with pytest.raises(AffrectError, match=r"shares no image name .* \(it has a.jpg, they"):
         compare(scene / "images", tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
@@ -240,7 +240,7 @@ def dying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_page", "dying")
 def test_record_of_many_photographs_reaches_the_process(scene, options, tmp_path, asked) -> None:
     """It is longer than an argument of a command may be."""
-    compare(scene / "images", tmp_path / "out", replace(options, methods=["sift"]))
+    compare(scene / "images", tmp_path / "out", options.changed(methods=["sift"]))
     many = replace(asked[0], inputs={"photographs": "x" * 200_000})
     assert "SIGSEGV" in worker.run_alone(many, "", SILENT)
 
@@ -248,7 +248,7 @@ def test_record_of_many_photographs_reaches_the_process(scene, options, tmp_path
 @pytest.mark.usefixtures("no_page", "dying")
 def test_method_whose_process_dies_is_reported(scene, options, tmp_path) -> None:
     (method,) = compare(
-        scene / "images", tmp_path / "out", replace(options, methods=["sift"])
+        scene / "images", tmp_path / "out", options.changed(methods=["sift"])
     ).methods
     assert method.failed.startswith("its process ended by SIGSEGV; ")
     assert method.failed.endswith("run.log may say why")
@@ -277,7 +277,7 @@ def killed(scene: Path, tmp_path: Path) -> Iterator[Path]:
 def test_killed_comparison_goes_on_and_ends_as_an_undisturbed_one(
     scene, options, compared, killed
 ) -> None:
-    options = replace(options, methods=[METHODS[1]], seeds=[0])
+    options = options.changed(methods=[METHODS[1]], seeds=[0])
     (method,) = compare(scene / "images", killed, options).methods
     expected = compared[0].methods[1]
     assert replace(method.seeds[0], wall_s={}) == replace(expected.seeds[0], wall_s={})
@@ -323,12 +323,12 @@ def test_colmaps_sift_has_the_masks_of_alpha_channels(tmp_path: Path) -> None:
     (tmp_path / "photos" / "side").mkdir(parents=True)
     image = np.full((40, 60, 4), 255, np.uint8)
     write_image(tmp_path / "photos" / "whole.png", image)
-    with _masks_for_colmap(photographs, ["whole.png"]) as folder:
+    with masks_for_colmap(photographs, ["whole.png"]) as folder:
         assert folder == str(tmp_path / "masks")
     image[:10, :, 3] = 0
     write_image(tmp_path / "photos" / "side" / "cut.png", image)
     write_image(tmp_path / "masks" / "whole.png", image[:, :, 0])
-    with _masks_for_colmap(photographs, ["side/cut.png", "whole.png"]) as folder:
+    with masks_for_colmap(photographs, ["side/cut.png", "whole.png"]) as folder:
         assert read_mask(Path(folder) / "side" / "cut.png.png").mean() == 0.75
         assert read_mask(Path(folder) / "whole.png.png").all()
 

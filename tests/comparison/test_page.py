@@ -10,7 +10,7 @@ from small_comparison import NAMES, make_comparison
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.comparison.page import cards_of, write_page
+from colmap_affrect.comparison.page import contact_sheet, write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.tables import table, verdict
 
@@ -99,7 +99,7 @@ def test_photographs_that_their_method_doubts_are_marked(comparison: Comparison)
         for seed in comparison.methods[2].seeds
     ]
     compared = replace(comparison, methods=(replace(comparison.methods[2], seeds=tuple(seeds)),))
-    cards = cards_of(compared)
+    cards = contact_sheet(compared)
     assert [card.name for card in cards if "uncertain" in card.groups] == [NAMES[1]]
 
 

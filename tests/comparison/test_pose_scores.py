@@ -39,11 +39,11 @@ def num_correct(estimated: Poses, truth: Poses) -> int:
 
 
 def test_similarity_of_the_world_changes_nothing(truth: Poses) -> None:
-    world, shift, scale = rotation((3, 1, 2), 50), np.array([7.0, -8, 9]), 0.2
-    estimated = {
-        name: (matrix @ world, matrix @ shift + scale * translation)
-        for name, (matrix, translation) in truth.items()
-    }
+    world = rotation((3, 1, 2), 50)
+    shift = np.array([7.0, -8, 9])
+    estimated = {}
+    for name, (matrix, translation) in truth.items():
+        estimated[name] = (matrix @ world, matrix @ shift + 0.2 * translation)
     scores = pose_scores(estimated, truth, list(truth))
     assert scores.correct_names == tuple(truth)
     assert scores.median_rotation_error_deg == pytest.approx(0, abs=1e-6)
@@ -63,6 +63,11 @@ def test_half_of_the_others_decides(truth: Poses) -> None:
     assert num_correct(estimated, truth) == 3
     del estimated["4.jpg"]
     assert num_correct(estimated, truth) == 0
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(4.9, 5), (5.1, 4)])
+def test_poses_are_correct_within_5_degrees(truth: Poses, degrees: float, expected: int) -> None:
+    assert num_correct(turned(truth, "4.jpg", degrees), truth) == expected
 
 
 @pytest.mark.parametrize("num_images", [0, 1])

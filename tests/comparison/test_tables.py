@@ -26,10 +26,20 @@ def method(
         scores = None
         if correct is not None:
             scores = PoseScores(tuple(correct), tuple(set(names) - set(correct)), 0.5)
-        sure = tuple(n for n in names if n not in doubtful)
-        models, times = (tuple(names),) if names else (), {"verify": 1.0, "map": 3.0 + 2 * seed}
-        figures = (50, 900, 3.0, 0.25)
-        seeds.append(SeedResult(seed, models, "", *figures, sure, doubtful, times, scores))
+        result = SeedResult(
+            seed=seed,
+            models=(tuple(names),) if names else (),
+            model_path="",
+            verified_pairs=50,
+            points3D=900,
+            mean_track_length=3.0,
+            mean_reprojection_error_px=0.25,
+            sure=tuple(name for name in names if name not in doubtful),
+            doubtful=doubtful,
+            wall_s={"verify": 1.0, "map": 3.0 + 2 * seed},
+            scores=scores,
+        )
+        seeds.append(result)
     return MethodResult(name, seeds=tuple(seeds), wall_s={"extract": 6.0})
 
 
@@ -37,7 +47,9 @@ def comparison(*methods: MethodResult) -> Comparison:
     return Comparison(NAMES, "photos", methods, (0, 1), 15, {}, {})
 
 
-SIFT, COLMAP, DEFAULT = method("sift", "abc"), method("sift-colmap", "ab"), method("default", NAMES)
+SIFT = method("sift", "abc")
+COLMAP = method("sift-colmap", "ab")
+DEFAULT = method("default", NAMES)
 FAILED = MethodResult("sift", failed="no weights")
 
 

@@ -22,7 +22,7 @@ from colmap_affrect.data import (
 )
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.features.sift import RootSift, SiftOptions
-from colmap_affrect.geometry.affine import lafs_from_keypoints, project, transform_frames
+from colmap_affrect.geometry.affine import lafs_from_keypoints, project, transform_lafs
 from colmap_affrect.geometry.conventions import camera_matrix, is_inside
 from colmap_affrect.matchers.base import ImageFeatures, Matcher
 from colmap_affrect.recipes import ExtractionOptions
@@ -130,7 +130,8 @@ class MatcherContract(Contract):
     def test_same_things_are_matched_in_rising_order_of_the_first_image(self, things) -> None:
         matcher: Matcher = self.make()
         order = np.random.default_rng(1).permutation(NUM_THINGS)[:45]
-        first, second = image_of(things, 2), image_of(things[order], 3)
+        first = image_of(things, 2)
+        second = image_of(things[order], 3)
         found = matcher.match(matcher.prepare(first), matcher.prepare(second))
         assert found.indices.dtype == np.int64
         assert found.indices.shape == (len(found.scores), 2)
@@ -145,7 +146,8 @@ class MatcherContract(Contract):
     def test_images_without_features_have_no_matches(self, things) -> None:
         matcher: Matcher = self.make()
         empty = ImageFeatures(LocalFeatures.empty(128), (420, 300), "")
-        some, none = matcher.prepare(image_of(things, 2)), matcher.prepare(empty)
+        some = matcher.prepare(image_of(things, 2))
+        none = matcher.prepare(empty)
         for pair in ((some, none), (none, some), (none, none)):
             found = matcher.match(*pair)
             assert (found.indices.shape, len(found.scores)) == ((0, 2), 0)
@@ -168,7 +170,8 @@ class RectifierContract(Contract):
 
     @pytest.mark.parametrize("kind", IMAGES)
     def test_plan_keeps_the_invariants_and_features_their_region(self, kind: str) -> None:
-        photograph, extractor = photograph_of(IMAGES[kind].copy()), self.extractor()
+        photograph = photograph_of(IMAGES[kind].copy())
+        extractor = self.extractor()
         plan, _ = extractor.plan(photograph)
         assert_array_equal(photograph.gray, IMAGES[kind])  # which is left alone
         assert plan.image_size == photograph.size
@@ -209,7 +212,7 @@ def check_rectification(item: Rectification, size: tuple[int, int]) -> None:
     assert (mapped >= -ROUNDING_PX).all()
     assert (mapped <= np.array(item.canvas_size) - 1 + ROUNDING_PX).all()
     frames = np.concatenate([np.tile(np.eye(2), (len(points), 1, 1)), points[:, :, None]], axis=2)
-    assert (np.linalg.det(transform_frames(matrix, frames)[:, :, :2]) > 0).all()
+    assert (np.linalg.det(transform_lafs(matrix, frames)[:, :, :2]) > 0).all()
 
 
 def assert_same_plan(first: RectificationPlan, second: RectificationPlan) -> None:

@@ -1,31 +1,52 @@
-"""The parts of ARCHITECTURE.md do their work, as entry points of another package."""
+"""The examples of ARCHITECTURE.md do their work, its parts as entry points of another package."""
 
 from __future__ import annotations
 
+import importlib.util
 import re
+import shutil
+import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+import small_run
 from contracts import test_mappers
-from contracts.contracts import ExtractorContract, MatcherContract
+from contracts.contracts import ExtractorContract, MatcherContract, RectifierContract
+from small_comparison import make_comparison
 from small_scene import NAMES
 from synthetic import texture, write_image
 
+from colmap_affrect.comparison import results, tables
 from colmap_affrect.errors import OptionError
+from colmap_affrect.escalation.expected_gain import kind_of
 from colmap_affrect.features.base import EXTRACTORS, FeatureExtractor, NetworkContext
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe
+from colmap_affrect.recipes import Level, load_recipe
+from colmap_affrect.rectifiers.base import RECTIFIERS, Rectifier, RectifierInputs
+from colmap_affrect.report import run_page
 from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 
-TEXT = (Path(__file__).parents[2] / "ARCHITECTURE.md").read_text(encoding="utf-8")
-PARTS = {"mutual": MATCHERS, "orb": EXTRACTORS, "plain": MAPPERS}
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+PARTS = {"mutual": MATCHERS, "orb": EXTRACTORS, "along-street": RECTIFIERS, "plain": MAPPERS}
+
+
+def example(name: str) -> tuple[str, str, str]:
+    """Return the path of the file of a part, its code, and the name of its class."""
+    line = re.search(rf'`"{name}":\s+"([\w.]+):(\w+)"`', TEXT)
+    assert line is not None
+    path = f"{line[1].replace('.', '/')}.py"
+    code = re.search(rf"```python\n(# {path}\n.*?)```", TEXT, re.DOTALL)
+    assert code is not None
+    return path, code[1], line[2]
 
 
 @pytest.fixture(autouse=True)
@@ -36,14 +57,10 @@ def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-affrect\nVersion: 1.0\n")
     points = []
     for name, registry in PARTS.items():
-        line = re.search(rf'`"{name}":\s+"([\w.]+):(\w+)"`', TEXT)
-        assert line is not None
-        package, _, module = line[1].rpartition(".")
-        path = f"{package}.{module}".replace(".", "/")
-        code = re.search(rf"```python\n(# {path}\.py\n.*?)```", TEXT, re.DOTALL)
-        assert code is not None
-        (tmp_path / f"{module}.py").write_text(code[1], encoding="utf-8")
-        points.append(f"[{registry.group}]\n{name} = {module}:{line[2]}\n")
+        path, code, part = example(name)
+        module = Path(path).stem
+        (tmp_path / f"{module}.py").write_text(code, encoding="utf-8")
+        points.append(f"[{registry.group}]\n{name} = {module}:{part}\n")
         monkeypatch.delitem(sys.modules, module, raising=False)
     (info / "entry_points.txt").write_text("\n".join(points))
     monkeypatch.syspath_prepend(tmp_path)
@@ -57,6 +74,109 @@ class TestMutual(MatcherContract):
 class TestOrb(ExtractorContract):
     def make(self) -> FeatureExtractor:
         return EXTRACTORS.make(EXTRACTORS.options("orb"), NetworkContext())
+
+
+class TestAlongStreet(RectifierContract):
+    def make(self) -> Rectifier:
+        return RECTIFIERS.make(RECTIFIERS.options("along-street"), RectifierInputs())
+
+
+def test_new_rectifier_is_escalated_to_as_what_it_declares_to_be() -> None:
+    recipe = load_recipe("default", ["rectifier=along-street", "rectifier.tilt=2.5"])
+    assert (recipe.rectifier.name, recipe.rectifier.warps) == ("along-street", "some")
+    level = Level(recipe.rectifier, recipe.features, 2400, None, 0)
+    assert kind_of(level) == "measured, warps"
+
+
+def needs(package: str) -> pytest.MarkDecorator:
+    missing = not importlib.util.find_spec(package)
+    return pytest.mark.skipif(missing, reason=f"{package} is not installed")
+
+
+@needs("ruff")
+@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("check", ["check", "format --check"])
+def test_example_passes_lint_where_it_is_to_be(name: str, check: str) -> None:
+    path, code, _ = example(name)
+    command = [sys.executable, "-m", "ruff", *check.split(), "--stdin-filename", path, "-"]
+    done = subprocess.run(
+        command, input=code, cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@needs("mypy")
+@pytest.mark.long
+def test_examples_pass_type_checks(tmp_path: Path) -> None:
+    files = []
+    for name in PARTS:
+        path, code, _ = example(name)
+        files.append(tmp_path / Path(path).name)
+        files[-1].write_text(code, encoding="utf-8")
+    command = [sys.executable, "-m", "mypy", "--config-file", "pyproject.toml", *map(str, files)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def patched(folder: Path) -> list[Path]:
+    """Apply the example of a column to copies of the files that it changes; return these."""
+    found = re.search(r"```diff\n(.*?)```", TEXT, re.DOTALL)
+    assert found is not None
+    lines = found[1].splitlines()
+    paths: list[Path] = []
+    for line, after in zip(lines, [*lines[1:], ""], strict=True):
+        if line.startswith("+++ b/"):
+            source = ROOT / line.removeprefix("+++ b/")
+            paths.append(folder / source.name)
+            shutil.copy(source, paths[-1])
+        elif not line.startswith(("---", "+", "@@")) and after.startswith("+"):
+            text = paths[-1].read_text(encoding="utf-8")
+            old = line[1:]
+            new = after[1:]
+            assert text.count(old) == 1, old
+            kept = f"{old}\n" if line.startswith(" ") else ""
+            paths[-1].write_text(text.replace(old, kept + new), encoding="utf-8")
+    return paths
+
+
+def loaded(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"patched_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_new_column_of_cameras_is_in_report_and_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    templates = tmp_path / "templates"
+    shutil.copytree(run_page.TEMPLATES, templates)
+    cameras, _ = patched(templates)
+    monkeypatch.setattr(run_page, "TEMPLATES", templates)
+    record = loaded(cameras).CameraRecord(("a.png",), "exif", 200.0, size=(320, 240))
+    camera = record.to_report(1, None)
+    assert camera["size_px"] == [320, 240]
+    report = small_run.small_report(tmp_path)
+    changed = report.__class__(**vars(report) | {"cameras": (camera,)})
+    monkeypatch.setattr(small_run, "small_report", lambda _: changed)
+    page = small_run.make_run_page(tmp_path).read_text(encoding="utf-8")
+    assert '<th scope="col">Size, px</th>' in page
+    assert "320 x 240" in page
+
+
+def test_new_column_of_comparisons_is_in_their_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (code,) = re.findall(r"```python\n(MEASURES.*?)```", TEXT, re.DOTALL)
+    monkeypatch.setattr(results, "MEASURES", dict(results.MEASURES))
+    monkeypatch.setattr(tables, "MEASURES", results.MEASURES)
+    exec(code, vars(results))
+    comparison = make_comparison(tmp_path)
+    columns = tables.table(comparison)
+    assert len(columns["models"]) == len(comparison.finished)
 
 
 task = test_mappers.task

@@ -58,7 +58,8 @@ def comparing(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 class TestMatchers(MatcherContract):
     @pytest.fixture(autouse=True)
     def _named(self, name: str, comparing: dict[str, Path]) -> None:
-        self.name, self.comparing = name, comparing
+        self.name = name
+        self.comparing = comparing
 
     def make(self) -> Matcher:
         return MATCHERS.make(MATCHERS.options(self.name), MatcherContext(self.comparing))
@@ -117,7 +118,8 @@ def test_shapes_are_unit_metrics_by_block_and_by_sample(
 ) -> None:
     source = SHAPES.make(SHAPES.options(name), NetworkContext(weights), None)
     image = IMAGES["textured"]
-    grid, samples = source.grid(image), source.samples(image)
+    grid = source.grid(image)
+    samples = source.samples(image)
     cells = tuple(ceil(length / STEP_PX) for length in image.shape)
     assert grid.textured.shape == cells
     assert grid.metrics.shape == (*cells, 3)

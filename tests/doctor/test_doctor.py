@@ -145,7 +145,8 @@ def test_what_is_broken_in_a_folder_is_the_one_finding(folders: Folders, case: s
 def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     folders: Folders, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model, out = folders.out / "sparse" / "0", str(folders.out)
+    model = folders.out / "sparse" / "0"
+    out = str(folders.out)
     edit_model(model)
     before = (model / "points3D.bin").read_bytes()
     target = ["--model-path", str(model), "--output-path", str(tmp_path / "new"), "--format=ply"]

@@ -159,8 +159,9 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     escalation = escalation_of(context)
-    better = replace(UNSURE, probabilities=dict.fromkeys(NAMES[:2], 0.9))
-    asked = with_models(monkeypatch, found=better, there=[UNSURE])
+    there = replace(UNSURE, probabilities=dict.fromkeys(NAMES, 0.6))
+    better = replace(UNSURE, probabilities=dict.fromkeys(NAMES, 0.85))
+    asked = with_models(monkeypatch, found=better, there=[there])
     learned = context.matches.learned(list(escalation.state.pairs))
     before = escalation.state.states()
     look_at_learned(escalation, mapper)
@@ -170,7 +171,7 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     assert choose_learned(escalation, at_once=False)
     looked_at = LookedAt.of(context)
     assert looked_at
-    assert (looked_at.score, looked_at.score_without) == pytest.approx((0.8, 0.2))
+    assert (looked_at.score, looked_at.score_without) == pytest.approx((2.4, 1.4))
     assert looked_at.is_chosen
     assert present_score(context) == looked_at.score
     assert context.matches.note(CLIMBING) == context.matches.note(FINISHED)  # are gone on from
@@ -203,6 +204,21 @@ def test_any_learned_model_is_chosen_at_once_where_there_is_none(
     with_models(monkeypatch, found=UNSURE, there=())
     look_at_learned(escalation_of(context), mapper)
     assert choose_learned(escalation_of(context), at_once=True)
+
+
+@pytest.mark.parametrize(("probability", "is_chosen"), [(0.45, True), (0.6, False)])
+def test_better_learned_models_are_gone_on_from_where_no_pose_is_expected_to_be_right(
+    context: Context,
+    mapper: Mapper,
+    monkeypatch: pytest.MonkeyPatch,
+    probability: float,
+    is_chosen: bool,
+) -> None:
+    there = replace(UNSURE, probabilities=dict.fromkeys(NAMES, probability))
+    better = replace(UNSURE, probabilities=dict.fromkeys(NAMES, 0.8))
+    with_models(monkeypatch, found=better, there=[there])
+    look_at_learned(escalation_of(context), mapper)
+    assert choose_learned(escalation_of(context), at_once=True) == is_chosen
 
 
 def test_learned_models_that_are_no_better_change_nothing(

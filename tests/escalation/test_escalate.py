@@ -36,7 +36,8 @@ from colmap_affrect.stages.verify import extracted_px
 
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images"
 NAMES = ["view_1_tilt00.jpg", "view_2_tilt30.jpg", "view_6_tilt75.jpg"]
-EASY, HARD = (NAMES[0], NAMES[1]), (NAMES[0], NAMES[2])
+EASY = (NAMES[0], NAMES[1])
+HARD = (NAMES[0], NAMES[2])
 CAMERAS = CameraOptions(mode="single", model="PINHOLE", params="720,720,360,270")
 SMALL = ["max_image_size_px=480", "features.max_num_features=1500",
          "features.max_num_rectified_features=3000"]  # fmt: skip
@@ -121,7 +122,7 @@ def test_device_that_is_not_there_discards_nothing(
     workspace = copy_of(escalated, tmp_path)
     before = database_content(workspace.database)
     ended = call("match", "--output-path", tmp_path, "--device", "cuda:99", "--overwrite")
-    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert (ended.code, len(ended.errors)) == (2, 1)
     assert "--device cuda:99" in ended.errors[0]
     with pytest.raises(AffrectError, match="--device cuda:99"):
         escalation.escalate(Context(workspace, Resources(device="cuda:99")))
@@ -180,8 +181,10 @@ def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: 
     recipe.write_text(OTHER_FEATURES)
     workspace = facade_run(photos, tmp_path / "out", str(recipe))
     escalate(workspace)
-    features, store = FeatureStore(workspace.features), MatchStore(workspace.matches)
-    ids, tried = image_ids(workspace.database), store.levels([EASY, HARD], "tried")
+    features = FeatureStore(workspace.features)
+    store = MatchStore(workspace.matches)
+    ids = image_ids(workspace.database)
+    tried = store.levels([EASY, HARD], "tried")
     assert max(tried.values()).bit_length() - 1 == 2
     sizes = extracted_px(Context(workspace))
     for name in HARD:
@@ -257,7 +260,8 @@ def test_photographs_that_are_likely_right_in_another_model_need_a_quarter(
 
 @pytest.mark.long
 def test_each_step_has_a_bar_that_ends_full(before: Workspace, tmp_path: Path) -> None:
-    workspace, shown = copy_of(before, tmp_path), io.StringIO()
+    workspace = copy_of(before, tmp_path)
+    shown = io.StringIO()
     with workspace.locked():
         escalation.escalate(Context(workspace, progress=Progress(shown)))
     lines = [line for line in shown.getvalue().splitlines() if line.startswith("escalate, ")]
@@ -284,7 +288,8 @@ def test_pairs_that_verify_well_escalate_nowhere(
 
 
 def test_features_of_levels_follow_one_another(escalated: Workspace, before: Workspace) -> None:
-    store, earlier = FeatureStore(escalated.features), FeatureStore(before.features)
+    store = FeatureStore(escalated.features)
+    earlier = FeatureStore(before.features)
     for name in NAMES:
         ends = [part.stop for part in store.level_ranges(name).values()]
         first = store.read(name).select(store.level_indices(name, 0))
@@ -320,7 +325,8 @@ def killed_at(patch: pytest.MonkeyPatch, where: str) -> None:
 
 def killed_after(patch: pytest.MonkeyPatch, path: Path, number: int) -> None:
     """Kill a run when it has changed a file so many times."""
-    changed, commit = list[Path](), FileTransaction.commit
+    changed = list[Path]()
+    commit = FileTransaction.commit
 
     def killed(changes: FileTransaction) -> None:
         commit(changes)

@@ -20,7 +20,8 @@ from colmap_affrect.escalation.expected_gain import (
 from colmap_affrect.recipes import Level, load_recipe, recipe_names
 
 LEVELS = load_recipe("default").levels
-COVERS, LEARNED = LEVELS[1], LEVELS[2]
+COVERS = LEVELS[1]
+LEARNED = LEVELS[2]
 
 
 @pytest.mark.parametrize(("counts", "weak", "expected"), [
@@ -79,7 +80,8 @@ def gains(
         for pair, count in inliers.items()
     }
     sizes = dict.fromkeys("abcdef", 1.0)
-    weak, lacking = set(given.get("weakly_connected", "")), set(given.get("lacking", ""))
+    weak = set(given.get("weakly_connected", ""))
+    lacking = set(given.get("lacking", ""))
     registered = given.get("registered", "abc")
     return ExpectedGain(states, weak, weights, sizes, [2, 4], lacking, registered, 100)
 

@@ -78,7 +78,8 @@ def test_images_that_measured_frames_hold_need_no_others(context: Context) -> No
     """Only one that is not there does, or one without a pair with a likely image."""
     own = without_matches(context, NAMES[3])
     names = tuple(sorted(NAMES))
-    escalation, states = escalation_of(context), escalation_of(context).state.states()
+    escalation = escalation_of(context)
+    states = escalation_of(context).state.states()
     model = ModelSummary(names, 9, 2.0, 0.5, doubtful={NAMES[0]: "few matches"})
     assert escalation.state._anchored(model, states) == set(NAMES) - {NAMES[3]}
     all_doubtful = replace(model, doubtful=dict.fromkeys(names, "few matches"))
@@ -125,7 +126,9 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
 
 @pytest.mark.long
 def test_images_that_other_pairs_alone_tie_come_in(context: Context) -> None:
-    workspace, escalation, last = context.workspace, escalation_of(context), NAMES[3]
+    workspace = context.workspace
+    escalation = escalation_of(context)
+    last = NAMES[3]
     escalation.match_at(without_matches(context, last), 1)
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
     _, models = stage.map_images(context, mapper)

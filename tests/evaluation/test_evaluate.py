@@ -23,7 +23,8 @@ from colmap_affrect.evaluation.truths import ScoreOptions, TrueHomography
 from colmap_affrect.stages.one_image import ImageExtractor
 
 Done = tuple[Path, Evaluation]
-Patch, Calls = pytest.MonkeyPatch, Counter[str]
+Patch = pytest.MonkeyPatch
+Calls = Counter[str]
 PLAIN = "unrectified-rootsift"
 RECIPES = (PLAIN, "rectified=rectified:max_image_size_px=120")
 NAMES = ["cafe", "dance", "shop"]
@@ -54,8 +55,11 @@ def changed(dataset: Path, tmp_path: Path) -> Path:
 def calls(monkeypatch: Patch) -> Calls:
     """Count images extracted and pairs scored."""
     counts: Calls = Counter()
-    extract, score = ImageExtractor.extract_file, TrueHomography.score
-    for owner, function in ((ImageExtractor, extract), (TrueHomography, score)):
+    counted_functions = (
+        (ImageExtractor, ImageExtractor.extract_file),
+        (TrueHomography, TrueHomography.score),
+    )
+    for owner, function in counted_functions:
 
         def counted(*given: Any, function: Any = function) -> Any:
             counts[function.__name__] += 1

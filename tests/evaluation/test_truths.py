@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose, relative_pose
+from colmap_affrect.evaluation import truths
 from colmap_affrect.evaluation.truths import (
     Correspondences,
     PairResult,
@@ -26,7 +28,8 @@ from colmap_affrect.evaluation.truths import (
 from colmap_affrect.geometry.conventions import pixel_from_colmap
 
 TRUTH = np.array([[0.9, 0.2, 30.0], [-0.1, 1.1, -20.0], [3e-4, -1e-4, 1.0]])
-SIZE1, SIZE2 = (320, 200), (240, 260)
+SIZE1 = (320, 200)
+SIZE2 = (240, 260)
 ROUNDING_PX = 1e-9  # double precision on coordinates of some hundred px
 OPTIONS = ScoreOptions(max_num_iterations=10_000)
 
@@ -78,8 +81,30 @@ def test_matches_of_which_half_are_wrong_give_the_homography() -> None:
     assert (found.num_inliers, found.num_correct, found.solved) == (30, 30, 1.0)
     turned = homography_score(points2, points1)
     assert (turned.error > 10.0, turned.solved) == (True, 0.0)
+    four = homography_score(points1[1:8:2], points2[1:8:2])
+    assert (four.num_inliers, four.solved) == (4, 1.0)
     none = homography_score(points1[:3], points1[:3])
     assert none == PairScore(math.inf, 0, 0, kind="homographies")
+
+
+@pytest.mark.parametrize(
+    ("offset_px", "num_correct", "solved"),
+    [(2.9, 40, 1.0), (3.1, 0, 1.0), (4.9, 0, 1.0), (5.1, 0, 0.0)],
+)
+def test_matches_are_correct_within_3_px_and_a_pair_is_solved_within_5_px(
+    offset_px: float, num_correct: int, solved: float
+) -> None:
+    points1 = np.random.default_rng(5).uniform(0, SIZE1, (40, 2))
+    points2 = cv2.perspectiveTransform(points1[:, None], TRUTH)[:, 0]
+    found = homography_score(points1, points2 + np.array([0.0, offset_px]))
+    assert found.error == pytest.approx(offset_px, abs=1e-3)
+    assert (found.num_correct, found.solved) == (num_correct, solved)
+
+
+def test_error_of_a_homography_is_a_mean_over_every_fourth_pixel() -> None:
+    visible = TrueHomography(np.eye(3), SIZE1, SIZE1).visible
+    np.testing.assert_array_equal(np.unique(visible[:, 0]), np.arange(0, SIZE1[0], 4))
+    np.testing.assert_array_equal(np.unique(visible[:, 1]), np.arange(0, SIZE1[1], 4))
 
 
 def turn(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
@@ -118,7 +143,7 @@ def test_exact_matches_give_the_pose() -> None:
     assert (score.num_inliers, score.num_correct) == (60, 60)
 
 
-@pytest.mark.parametrize("degrees", [3.0, 77.0])
+@pytest.mark.parametrize("degrees", [3.0, 6.0, 77.0])
 def test_wrong_true_rotation_is_the_rotation_error(degrees: float) -> None:
     # The second camera is turned about its own centre: the direction in its frame turns along.
     wrong = turn((0, 0, 1), degrees)
@@ -172,7 +197,8 @@ SHIFT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def test_epipolar_distances_by_hand() -> None:
-    points1, points2 = np.array([[5.0, 7.0]] * 2), np.array([[90.0, 7.0], [90.0, 10.0]])
+    points1 = np.array([[5.0, 7.0], [5.0, 7.0]])
+    points2 = np.array([[90.0, 7.0], [90.0, 10.0]])
     distances = symmetric_epipolar_distances(SHIFT_X, points1, points2)
     np.testing.assert_allclose(distances, [0.0, 3.0 * np.sqrt(2.0)])
     assert np.isinf(symmetric_epipolar_distances(None, points1, points2)).all()
@@ -193,14 +219,39 @@ def test_matches_of_another_geometry_score_worse() -> None:
     right = truth.score(points1[30:], points2[30:], OPTIONS)
     assert right.error < truth.score(points2[30:], points1[30:], OPTIONS).error
     assert right.solved > 0.5  # the lens of image 1 distorts
+    assert math.isfinite(truth.score(points1[30:38], points2[30:38], OPTIONS).error)
     none = truth.score(points1[:7], points2[:7], OPTIONS)
     assert (none.error, none.solved) == (math.inf, 0.0)
 
 
+def test_of_five_fundamental_matrices_the_one_of_median_error_counts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The error of a matrix that shifts lines by some px in image 2 is that in both images."""
+    offsets_px = (9.0, 1.0, 5.0, 3.0, 7.0)
+
+    def estimate(*given: Any) -> tuple[np.ndarray, int]:
+        seed = given[-1].random_seed
+        return SHIFT_X @ shift(0.0, offsets_px[seed]), seed
+
+    monkeypatch.setattr(truths, "estimate_matrix", estimate)
+    points = np.random.default_rng(0).uniform(0, 300, (9, 2))
+    score = Correspondences(np.hstack([points, points])).score(points, points, ScoreOptions())
+    assert score.error == pytest.approx(np.sqrt(2.0) * 5.0)
+    assert score.num_inliers == 2
+
+
+def test_inliers_of_a_fundamental_matrix_are_within_some_px_of_their_lines() -> None:
+    points1, points2 = matches(120)
+    points2[80:, 1] += 8.0
+    truth = Correspondences(np.hstack([points1[:30], points2[:30]]))
+    assert 60 <= truth.score(points1, points2, OPTIONS).num_inliers <= 90
+
+
 def test_tables_are_by_kind_of_truth() -> None:
     nothing = np.zeros((0, 2))
-    truths = TrueHomography(TRUTH, SIZE1, SIZE2), Correspondences(np.ones((2, 4)))
-    scores = [truth.score(nothing, nothing, OPTIONS) for truth in truths]
+    kinds = (TrueHomography(TRUTH, SIZE1, SIZE2), Correspondences(np.ones((2, 4))))
+    scores = [truth.score(nothing, nothing, OPTIONS) for truth in kinds]
     results = [PairResult(**vars(score), name="p") for score in scores]
     results += [PairResult(math.inf, 0, name="bad"), pose_result("indoors", 4.0, 1.0)]
     found = columns(results)

@@ -14,16 +14,14 @@ from synthetic import circles, texture
 from torch import nn
 
 from colmap_affrect.data import GrayImage
-from colmap_affrect.features.affnet_hardnet import (
-    MAX_TILT,
-    PATCH_SIGMAS,
-    AffNetHardNet,
-    AffNetHardNetOptions,
-)
+from colmap_affrect.features.affnet_hardnet import AffNetHardNet, AffNetHardNetOptions
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
+
+PATCH_SIGMAS = 12.0  # half width of a patch (the paper)
+MAX_TILT = 20.0  # of shapes that are kept
 
 CHAIN = 1e-3
 """Three networks in a row, each on patches sampled through what the one before it said; their

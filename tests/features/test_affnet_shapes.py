@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import ceil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -117,7 +118,8 @@ def standardised(patches: Array) -> Array:
 def locally_normalised(image: GrayImage) -> Array:
     """Pixels by mean and deviation of the 33 x 33 px around them, border reflected."""
     windows = sliding_window_view(np.pad(image.astype(float), 16, mode="reflect"), (33, 33))
-    mean, deviation = windows.mean(axis=(2, 3)), windows.std(axis=(2, 3))
+    mean = windows.mean(axis=(2, 3))
+    deviation = windows.std(axis=(2, 3))
     return np.clip((image - mean) / (deviation + 2.55), -6.0, 6.0)
 
 
@@ -145,7 +147,8 @@ def test_grid_is_the_network_on_the_window_in_the_middle_of_which_a_block_lies(
     grid = source(network, scales=(1.0,), min_deviation=0.0).grid(image)
     windows = sliding_window_view(reflected(locally_normalised(image)), (32, 32))[::4, ::4]
     expected = patch_metrics(network, windows)
-    rows, columns = -(-size[1] // 4), -(-size[0] // 4)
+    rows = ceil(size[1] / 4)
+    columns = ceil(size[0] / 4)
     assert expected.shape == (rows, columns, 3)
     assert grid.textured.shape == (rows, columns)
     # Window (0, 0) holds the rows -14...17: its middle is that of the block 0...3.
@@ -168,7 +171,7 @@ def test_paper_grid_has_global_normalisation_and_replicated_borders(
     rows, columns = expected.shape[:2]
     inside = grid.metrics[4 : 4 + rows, 4 : 4 + columns]
     assert_allclose(inside, expected, atol=SINGLE, rtol=SINGLE)
-    assert grid.textured.shape == (-(-size[1] // 4), -(-size[0] // 4))
+    assert grid.textured.shape == (ceil(size[1] / 4), ceil(size[0] / 4))
     assert grid.textured.all()
     assert (grid.origin_px, grid.step_px) == (1.5, 4)
     assert_array_equal(grid.metrics[:4], np.broadcast_to(grid.metrics[4], grid.metrics[:4].shape))
@@ -192,7 +195,8 @@ def test_shapes_of_a_smaller_size_are_interpolated_between_the_centers_of_its_bl
     assert small.shape == (41, 58)
     logs = log_metrics(source(network, scales=(1.0,), min_deviation=0.0).grid(small).metrics)
     for axis, (length, small_length) in enumerate(zip(image.shape, small.shape, strict=True)):
-        cells, small_cells = np.arange(-(-length // 4)), np.arange(-(-small_length // 4))
+        cells = np.arange(ceil(length / 4))
+        small_cells = np.arange(ceil(small_length / 4))
         # Distances from the edge of the image scale: the middle of cell k is at 4 k + 2.
         at = (4 * cells + 2) * small_length / length
         logs = np.apply_along_axis(

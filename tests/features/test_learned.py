@@ -14,7 +14,7 @@ from random_weights import write_random_weights
 
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.features.base import EXTRACTORS, NetworkContext
-from colmap_affrect.features.learned import RADIUS_PX, Aliked
+from colmap_affrect.features.learned import Aliked
 from colmap_affrect.features.weights import WEIGHT_FILES, find
 
 COURTYARD = Path(__file__).resolve().parents[2] / "sample_scenes" / "courtyard"
@@ -93,7 +93,8 @@ def test_points_are_where_they_are_in_a_shrunk_photograph(published) -> None:
         image = np.ascontiguousarray(cv2.imread(str(path))[:480, :640, ::-1])
         small = cv2.resize(image, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
         scale = np.array(small.shape[1::-1]) / image.shape[1::-1]
-        first, second = extractor.detect((image, None)), extractor.detect((small, None))
+        first = extractor.detect((image, None))
+        second = extractor.detect((small, None))
         points = (second.keypoints + 0.5) / scale - 0.5
         distances = np.linalg.norm(first.keypoints[:, None] - points[None], axis=2)
         nearest = distances.argmin(axis=1)
@@ -115,7 +116,7 @@ def test_mask_chooses_among_what_is_found_without_it(weights, photograph) -> Non
     assert_array_equal(few.keypoints, inside.keypoints[:30])
     assert_allclose(few.descriptors, inside.descriptors[:30], atol=1e-5)
     assert (np.diff(few.responses) <= 0).all()
-    assert_allclose(few.lafs[:, :, :2], np.tile(RADIUS_PX * np.eye(2), (30, 1, 1)), atol=1e-9)
+    assert_allclose(few.lafs[:, :, :2], np.tile(12.0 * np.eye(2), (30, 1, 1)), atol=1e-9)
 
 
 def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:

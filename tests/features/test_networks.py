@@ -207,6 +207,7 @@ def test_no_frames_give_no_patches_and_bad_ones_harm_no_others() -> None:
     assert sampler.sample(np.zeros((0, 2, 3))).shape == (0, 1, 32, 32)
     frames = some_frames(4, (90, 70), 20.0)
     expected = sampler.sample(frames)
-    frames[1, 0, 0], frames[2, 1, 2] = np.nan, np.inf
+    frames[1, 0, 0] = np.nan
+    frames[2, 1, 2] = np.inf
     found = sampler.sample(frames)
     assert torch.equal(found[[0, 3]], expected[[0, 3]])

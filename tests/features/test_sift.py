@@ -58,7 +58,8 @@ def test_rootsift_orders_by_response_and_keeps_the_largest_responses_times_scale
 
 
 def test_dog_finds_each_location_of_rootsift_once(image: GrayImage) -> None:
-    found, oriented = dog(image), rootsift(image)
+    found = dog(image)
+    oriented = rootsift(image)
     assert len(found) > 100
     assert len(oriented) > len(found), "some locations have several orientations"
     locations = np.column_stack([found.keypoints, found.scales])
@@ -70,7 +71,8 @@ def test_dog_finds_each_location_of_rootsift_once(image: GrayImage) -> None:
 
 
 def test_dog_of_a_round_blob_gives_one_upright_circle_of_six_sigma() -> None:
-    center, sigma_px = [60.25, 50.5], 6.0
+    center = [60.25, 50.5]
+    sigma_px = 6.0
     found = dog(blobs((121, 101), [center], sigma_px * np.eye(2)))
     assert len(found) == 1
     assert_allclose(found.keypoints[0], center, atol=CENTER_PX)

@@ -208,7 +208,8 @@ def test_download_that_is_not_what_was_published_leaves_nothing(publish: Publish
 def test_fetch_gets_what_it_can_and_leaves_what_is_there(publish: Publish, tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
-    old, new = some_weights(3), some_weights(4)
+    old = some_weights(3)
+    new = some_weights(4)
     for name in (NAME, "AffNet.pth"):
         (folder / name).write_bytes(old)
     publish("hardnet", new)

@@ -16,7 +16,7 @@ from colmap_affrect.geometry.affine import (
     project,
     rectifying_affine,
     rotation,
-    transform_frames,
+    transform_lafs,
 )
 from colmap_affrect.geometry.tilts import metrics_from_tilts, unit_metrics
 
@@ -47,27 +47,28 @@ def test_homography_errors_are_distances_from_the_nearest_true_match() -> None:
     assert (there < np.linalg.norm(offsets / 6, axis=1)).all()
 
 
-def test_transform_frames_carries_warp_frame_to_image_by_inverse_on_the_left() -> None:
+def test_transform_lafs_maps_lafs_of_a_warp_to_the_image_by_the_inverse_on_the_left() -> None:
     rectified_from_image = np.array([[2.0, 1.0, 3.0], [0.0, 1.0, -5.0], [0.0, 0.0, 1.0]])
-    warp_frame = np.array([[[1.0, 4.0, 7.0], [0.0, 2.0, 1.0]]])
+    warp_lafs = np.array([[[1.0, 4.0, 7.0], [0.0, 2.0, 1.0]]])
     # A^-1 = [[1/2, -1/2], [0, 1]]; the other order, L A^-1, would be [[1/2, 7/2], [0, 2]].
     # Centre: y = 1 + 5 = 6, x = (7 - 3 - 6) / 2 = -1.
     expected = [[[0.5, 1.0, -1.0], [0.0, 2.0, 6.0]]]
-    actual = transform_frames(np.linalg.inv(rectified_from_image), warp_frame)
+    actual = transform_lafs(np.linalg.inv(rectified_from_image), warp_lafs)
     assert_allclose(actual, expected, atol=ROUNDING)
 
 
 @given(homographies(), frames())
-def test_transform_frames_by_homography_has_the_jacobian_of_finite_differences(
+def test_transform_lafs_by_homography_has_the_jacobian_of_finite_differences(
     homography: Array, lafs: Array
 ) -> None:
     step = 1e-3
-    mapped = transform_frames(homography, lafs)
+    mapped = transform_lafs(homography, lafs)
     centers = lafs[:, :, 2]
     assert_allclose(mapped[:, :, 2], project(homography, centers), atol=ROUNDING)
     for column in range(2):
         move = step * lafs[:, :, column]
-        ahead, behind = project(homography, centers + move), project(homography, centers - move)
+        ahead = project(homography, centers + move)
+        behind = project(homography, centers - move)
         derivative = (ahead - behind) / (2 * step)
         assert_allclose(mapped[:, :, column], derivative, rtol=1e-4, atol=JACOBIAN_ERROR)
 

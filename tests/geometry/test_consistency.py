@@ -1,4 +1,4 @@
-"""Neighbours, matches that confirm each other, and significance of their numbers."""
+"""Neighbours, matches that support each other, and significance of their numbers."""
 
 from __future__ import annotations
 
@@ -10,68 +10,65 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import Array
 
+from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.geometry.neighbors import neighbors_within, num_consistent_matches
 from colmap_affrect.geometry.significance import (
     log10_bayes_factor,
     log10_choose,
     log10_false_alarms,
-    shuffled,
+    random_matches,
 )
 
 SIZE = np.array([1200.0, 700.0])
 MAP = np.array([[2.6, 0.9, 40.0], [-0.4, 1.2, 310.0]])  # neither its transpose nor its inverse
 
 
-def random_frames(count: int, seed: int) -> np.ndarray:
+def random_lafs(count: int, seed: int) -> np.ndarray:
     random = np.random.default_rng(seed)
-    frames = np.zeros((count, 2, 3))
-    angles, radii = random.uniform(0, 2 * np.pi, count), random.uniform(3, 30, count)
-    frames[:, 0, 0] = frames[:, 1, 1] = radii * np.cos(angles)
-    frames[:, 1, 0], frames[:, 0, 1] = radii * np.sin(angles), -radii * np.sin(angles)
-    frames[:, :, 2] = random.uniform(0, SIZE, (count, 2))
-    return frames
+    angles = random.uniform(0, 2 * np.pi, count)
+    radii = random.uniform(3, 30, count)
+    return lafs_from_keypoints(random.uniform(0, SIZE, (count, 2)), radii, angles)
 
 
-def carried(frames: np.ndarray) -> np.ndarray:
-    moved = MAP[:, :2] @ frames
+def mapped(lafs: np.ndarray) -> np.ndarray:
+    moved = MAP[:, :2] @ lafs
     moved[:, :, 2] += MAP[:, 2]
     return moved
 
 
 @pytest.mark.parametrize("num_wrong", [0, 150])
 def test_right_matches_are_counted_among_wrong_ones(num_wrong: int) -> None:
-    first = random_frames(40 + num_wrong, 1)
+    first = random_lafs(40 + num_wrong, 1)
     first[:40, :, 2] /= [6.0, 4.0]  # a part of the image that is seen in both
-    second = np.concatenate([carried(first[:40]), random_frames(num_wrong, 2)])
+    second = np.concatenate([mapped(first[:40]), random_lafs(num_wrong, 2)])
     count = num_consistent_matches(first, second)
     assert 34 <= count <= 42
     assert num_consistent_matches(second, first) == count
 
 
-def test_wrong_matches_do_not_confirm_each_other() -> None:
-    counts = [
-        num_consistent_matches(random_frames(300, seed), random_frames(300, seed + 100))
-        for seed in range(5)
-    ]
-    assert max(counts) <= 1
+def test_wrong_matches_do_not_support_each_other() -> None:
+    for seed in range(5):
+        first = random_lafs(300, seed)
+        second = random_lafs(300, seed + 100)
+        assert num_consistent_matches(first, second) <= 1
 
 
-def test_frames_that_contradict_the_positions_confirm_nothing() -> None:
-    first = random_frames(40, 3)
-    second = carried(first)
+def test_lafs_that_contradict_the_positions_support_nothing() -> None:
+    first = random_lafs(40, 3)
+    second = mapped(first)
     second[:, :, :2] = second[:, :, :2] @ np.array([[0.0, -1.0], [1.0, 0.0]])
     assert num_consistent_matches(first, second) == 0
 
 
-def test_copies_of_one_place_are_no_neighbours() -> None:
-    first = random_frames(30, 4)
+def test_matches_at_one_position_are_no_neighbours() -> None:
+    first = random_lafs(30, 4)
     first[:, :, 2] = 500.0 + first[:, :, 2] / 1000.0
-    assert num_consistent_matches(first, carried(first)) == 0
+    assert num_consistent_matches(first, mapped(first)) == 0
 
 
 @pytest.mark.parametrize("num", [2, 3, 50, 9001])
-def test_matches_paired_anew_are_no_matches(num: int) -> None:
-    first, second = shuffled(num)
+def test_random_matches_are_no_matches_of_the_pair(num: int) -> None:
+    first, second = random_matches(num)
     assert len(first) == len(second) >= min(num * (num - 1), 4000 - num)
     assert (first != second).all()
     assert set(first) == set(second) == set(range(num))
@@ -91,6 +88,11 @@ def test_factor_is_fair_under_chance() -> None:
     chances = np.array([math.comb(12, n) * 0.3**n * 0.7 ** (12 - n) for n in counts])
     factors = np.array([10 ** log10_bayes_factor(12, n, 0.3) for n in counts])
     assert chances @ factors == pytest.approx(1.0)
+
+
+def test_fewer_agreeing_lafs_than_half_speak_against_a_pair() -> None:
+    assert log10_bayes_factor(40, 10, 0.1) < -1.0
+    assert log10_bayes_factor(40, 24, 0.1) > 1.0
 
 
 # Eighths are exact in binary, so points at exactly the radius are no matter of rounding.

@@ -28,7 +28,8 @@ def rotation(degrees: tuple[float, float, float]) -> NDArray[np.float64]:
 @pytest.fixture(scope="module")
 def plane() -> dict[str, NDArray[np.float64]]:
     """Points of a slanted plane in both images, with the true local affine maps."""
-    R, t = rotation((4.0, -25.0, 11.0)), np.array([1.3, -0.2, 0.4])
+    R = rotation((4.0, -25.0, 11.0))
+    t = np.array([1.3, -0.2, 0.4])
     normal = np.array([0.3, -0.2, -1.0])
     homography = K2 @ (R - np.outer(t, normal) / 6.0) @ np.linalg.inv(K1)
     skew = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
@@ -50,7 +51,9 @@ def plane() -> dict[str, NDArray[np.float64]]:
 def test_matches_lie_on_their_epipolar_lines_and_others_as_far_as_they_were_moved(
     plane: dict[str, NDArray[np.float64]],
 ) -> None:
-    F, points1, points2 = plane["F"], plane["points1"], plane["points2"]
+    F = plane["F"]
+    points1 = plane["points1"]
+    points2 = plane["points2"]
     assert sampson_errors(F, points1, points2).max() < 1e-6
     lines1, lines2 = epipolar_lines(F, points1, points2)
     for lines, points in ((lines1, points1), (lines2, points2)):
@@ -74,7 +77,8 @@ def test_true_frames_carry_the_epipolar_direction_of_image_1_to_that_of_image_2(
     def cosines_of(F: NDArray, points: tuple, shapes: tuple) -> NDArray:
         return EpipolarModel(F, points).cosines(rows, rows, shapes)
 
-    points, shapes = (points1, points2), (shapes1, maps @ shapes1)
+    points = (points1, points2)
+    shapes = (shapes1, maps @ shapes1)
     cosines = cosines_of(F, points, shapes)
     sign = common_sign(cosines)
     np.testing.assert_allclose(cosines * sign, 1.0, atol=1e-6)

@@ -53,8 +53,10 @@ def test_normals_of_a_plane_are_its_normal_to_the_last_pixel(normal: Array, unit
 
 def test_normals_are_right_up_to_a_depth_discontinuity() -> None:
     # A board before a wall, one side of it a column of pixels from the image border.
-    board, wall = unit([0.5, 0.2, -0.8]), unit([-0.3, 0.1, -1.0])
-    depth, normals = plane_depth(wall, 4.0), np.broadcast_to(wall, (70, 90, 3)).copy()
+    board = unit([0.5, 0.2, -0.8])
+    wall = unit([-0.3, 0.1, -1.0])
+    depth = plane_depth(wall, 4.0)
+    normals = np.broadcast_to(wall, (70, 90, 3)).copy()
     depth[20:50, 30:88] = plane_depth(board, 2.0)[20:50, 30:88]
     normals[20:50, 30:88] = board
     errors = angles_deg(normals_from_depth(depth, CAMERA), normals)

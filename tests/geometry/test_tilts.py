@@ -12,6 +12,7 @@ from strategies import Array, affine_shapes, classes, compose_affine, scales, ti
 from colmap_affrect.geometry.tilts import (
     IDENTITY_LABEL,
     UNCOVERED_LABEL,
+    are_individual_shapes,
     ball_threshold,
     cosh_distances,
     cover_shapes,
@@ -127,9 +128,15 @@ def test_cover_shapes_covers_the_share_asked_for_or_reaches_a_limit(
 
 def cover_with_defaults(tilts: list[float], angles: list[float], weights: list[float]) -> Array:
     """Centres that cover all votes with at most 8 balls of 1.7."""
-    given = metrics_from_tilts(tilts, angles), np.array(weights)
-    limits = {"covered_frac": 1.0, "max_num_centers": 8}
-    return cover_shapes(*given, radius=RADIUS, max_tilt=MAX_TILT, **limits).centers
+    cover = cover_shapes(
+        metrics_from_tilts(tilts, angles),
+        np.array(weights),
+        radius=RADIUS,
+        max_tilt=MAX_TILT,
+        covered_frac=1.0,
+        max_num_centers=8,
+    )
+    return cover.centers
 
 
 def test_cover_shapes_takes_the_heaviest_votes_first() -> None:
@@ -181,3 +188,19 @@ def test_log_metrics_of_stripes_and_of_nothing_are_finite() -> None:
     assert np.isfinite(stripes).all()
     tilt, _ = tilts_from_metrics(metrics_from_log(stripes))
     assert 40.0 < tilt < 50.0
+
+
+def test_circles_that_a_warp_made_ellipses_are_no_shapes_of_their_own() -> None:
+    ellipses = np.tile(np.diag([2.0, 0.5]), (100, 1, 1))
+    radii = np.linspace(3.0, 30.0, 100)[:, None, None]
+    rounding = 1.5e-5 * np.random.default_rng(1).uniform(-1.0, 1.0, (100, 2, 2))
+    assert not are_individual_shapes(radii * (ellipses + rounding))
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.3, False), (0.8, True)])
+def test_most_shapes_that_were_measured_one_by_one_differ(share: float, expected: bool) -> None:
+    shapes = np.tile(np.diag([2.0, 0.5]), (1000, 1, 1))
+    num_measured = int(share * 1000)
+    # Steps of 3e-4 of shapes of unit area.
+    shapes[:num_measured, 1, 0] = 3e-4 * np.arange(num_measured)
+    assert are_individual_shapes(shapes) == expected

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.geometry.epipolar import sampson_errors
-from colmap_affrect.geometry.parallax import Size, rotation_share
+from colmap_affrect.geometry.parallax import Size, pure_rotation_ratio
 from colmap_affrect.geometry.two_views import (
     essential_matrix,
     homogeneous,
@@ -33,7 +33,8 @@ def depth_at(points: np.ndarray) -> np.ndarray:
 def test_depths_are_those_of_the_points_in_both_cameras() -> None:
     points = np.random.default_rng(1).uniform((-2, -1, 4), (3, 1, 9), (50, 3))
     moved = points @ ROTATION.T + TRANSLATION
-    rays1, rays2 = points[:, :2] / points[:, 2:], moved[:, :2] / moved[:, 2:]
+    rays1 = points[:, :2] / points[:, 2:]
+    rays2 = moved[:, :2] / moved[:, 2:]
     depths = triangulated_depths(ROTATION, TRANSLATION, rays1, rays2)
     np.testing.assert_allclose(depths.first, points[:, 2], rtol=1e-9)
     np.testing.assert_allclose(depths.second, moved[:, 2], rtol=1e-9)
@@ -50,7 +51,8 @@ def test_depths_are_those_of_the_points_in_both_cameras() -> None:
 @pytest.mark.parametrize("share_wrong", [0.0, 0.4])
 def test_scale_is_found_between_features_that_lie_beside_each_other(share_wrong: float) -> None:
     random = np.random.default_rng(2)
-    known, places = (random.uniform(0, 1000, (count, 2)) for count in (600, 200))
+    known = random.uniform(0, 1000, (600, 2))
+    places = random.uniform(0, 1000, (200, 2))
     depths = depth_at(places) / SCALE
     wrong = random.random(len(places)) < share_wrong
     depths[wrong] *= np.exp(random.uniform(-2, 2, wrong.sum()))
@@ -76,11 +78,22 @@ def test_plane_carries_depths_to_where_nothing_is_known_and_only_a_plane_does() 
     assert scale_by_planes((known, rough), given, 160.0) is None
 
 
+def test_errors_of_poses_are_shared_by_all_depths_beyond_ten() -> None:
+    random = np.random.default_rng(2)
+    known = random.uniform(0, 1000, (600, 2))
+    places = random.uniform(0, 1000, (400, 2))
+    depths = depth_at(places) / SCALE * np.exp(random.normal(0, 0.03, 400))
+    found = scale_between((known, depth_at(known)), (places, depths), 30.0)
+    assert found is not None
+    assert 0.03 / np.sqrt(20) < found.error_frac < 0.03 / np.sqrt(5)
+
+
 @pytest.mark.parametrize("estimate", [scale_between, scale_by_planes])
 def test_without_known_depths_or_places_there_is_no_scale(estimate: Callable[..., object]) -> None:
-    nothing, something = (np.zeros((0, 2)), np.zeros(0)), (np.zeros((20, 2)), np.ones(20))
-    for known, places in ((nothing, something), (something, nothing)):
-        assert estimate(known, places, 10.0) is None
+    nothing = (np.zeros((0, 2)), np.zeros(0))
+    something = (np.zeros((20, 2)), np.ones(20))
+    assert estimate(nothing, something, 10.0) is None
+    assert estimate(something, nothing, 10.0) is None
 
 
 SIZES: tuple[Size, Size] = ((640, 480), (640, 480))
@@ -110,7 +123,7 @@ def test_turned_views_of_which_things_that_repeat_match_too(share_wrong: float) 
     num_wrong = int(share_wrong * 400)
     points1[:num_wrong] += (380.0, -25.0)
     points2[:num_wrong] = np.random.default_rng(1).uniform((40, 20), (600, 460), (num_wrong, 2))
-    share = rotation_share(points1, points2, SIZES, 2.0)
+    share = pure_rotation_ratio(points1, points2, SIZES, 2.0)
     assert share == pytest.approx(1.0 - share_wrong, abs=0.05)
 
 
@@ -121,4 +134,4 @@ def test_moved_camera_is_no_turned_one() -> None:
     for matrix, center in ((np.eye(3), (0.0, 0, 0)), (rotation(9.0, 2.0), (0.7, -0.2, 0.1))):
         seen = (scene - center) @ (MATRIX @ matrix).T
         views.append(seen[:, :2] / seen[:, 2:])
-    assert rotation_share(views[0], views[1], SIZES, 2.0) < 0.3
+    assert pure_rotation_ratio(views[0], views[1], SIZES, 2.0) < 0.3

@@ -16,7 +16,10 @@ from colmap_affrect.images import conversion
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.reading import decode
 
-FOCAL_LENGTH, EQUIVALENT, EXIF_IFD, ORIENTATION = 0x920A, 0xA405, 0x8769, 0x0112
+FOCAL_LENGTH = 0x920A
+EQUIVALENT = 0xA405
+EXIF_IFD = 0x8769
+ORIENTATION = 0x0112
 
 
 def picture(seed: int) -> Image.Image:

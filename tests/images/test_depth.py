@@ -178,6 +178,6 @@ def test_require_some_needs_a_map_of_one_image(tmp_path):
     with pytest.raises(OptionError, match="no such folder"):
         source(tmp_path / "nowhere").require_some(["a.jpg"])
     write_map(tmp_path / "side" / "č d.npy", asymmetric_map())
-    with pytest.raises(DepthError, match=r"any of the 2 images; looked for a\.jpg\.\* and a\.\*"):
+    with pytest.raises(OptionError, match=r"any of the 2 images; looked for a\.jpg\.\* and a\.\*"):
         source(tmp_path).require_some(["a.jpg", "side/b.jpg"])
     source(tmp_path).require_some(["a.jpg", "side/č d.png"])

@@ -24,7 +24,8 @@ NAMES = ("a.jpg", "b.png", "side/c.tif", "d.bmp")
 def write_turned(path: Path, seed: int, number: int = 6, *, has_exif: bool = True) -> None:
     """Write a photograph that says it lies on its side; what cannot say so is upright."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    exif, given = Image.Exif(), dict[str, object]()
+    exif = Image.Exif()
+    given = dict[str, object]()
     exif[0x112], exif[0x10F] = number, "Canon"
     if has_exif and path.suffix != ".bmp":
         given["exif"] = exif
@@ -42,7 +43,8 @@ def test_exported_pictures_stand_upright(tmp_path: Path, form: str) -> None:
     model.write(tmp_path / "model")
     export(tmp_path / "model", tmp_path / "out", [form], image_path=tmp_path / "photos")
     for name in NAMES:
-        before, path = tmp_path / "photos" / name, tmp_path / "out" / "dense" / "images" / name
+        before = tmp_path / "photos" / name
+        path = tmp_path / "out" / "dense" / "images" / name
         assert orientation(before) == (1 if name == "d.bmp" else 6)
         assert orientation(path) == 1
         with Image.open(path) as picture:
@@ -57,8 +59,10 @@ def test_exported_pictures_stand_upright(tmp_path: Path, form: str) -> None:
 def test_only_what_says_how_it_lies_is_changed(tmp_path: Path, name: str, number: int) -> None:
     path = tmp_path / name
     write_turned(path, 1, number)
-    before, size = cv2.imread(str(path), AS_STORED), path.stat().st_size
-    (linked := tmp_path / "linked").hardlink_to(path)
+    before = cv2.imread(str(path), AS_STORED)
+    size = path.stat().st_size
+    linked = tmp_path / "linked"
+    linked.hardlink_to(path)
     forget_orientation(path)
     assert orientation(path) == 1
     with Image.open(path) as picture:

@@ -88,7 +88,8 @@ def test_masks_are_found_as_colmap_finds_them(tmp_path: Path, mask_name: str) ->
 
 
 def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
-    one, other = diagonal_mask((60, 50)), diagonal_mask((60, 50))[:, ::-1]
+    one = diagonal_mask((60, 50))
+    other = diagonal_mask((60, 50))[:, ::-1]
     write_mask(tmp_path / "masks" / "x.png", one)
     write_mask(tmp_path / "camera.png", other)
     masks = MaskOptions(path=str(tmp_path / "masks"), camera_path=str(tmp_path / "camera.png"))
@@ -195,7 +196,7 @@ def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: s
     touch(folder, "a.png")
     listed = tmp_path / "list.txt"
     listed.write_text(line.format(folder=folder))
-    with pytest.raises(ImageError, match=r"list\.txt: (lists .* not in|is empty)"):
+    with pytest.raises(OptionError, match=r"list\.txt: (lists .* not in|is empty)"):
         list_images(folder, listed)
 
 
@@ -207,7 +208,8 @@ def test_videos_are_named_with_what_to_do(photo_path: Path) -> None:
 
 
 def test_linked_folders_are_followed_and_each_folder_is_taken_once(tmp_path: Path) -> None:
-    photos, other = tmp_path / "photos", tmp_path / "other"
+    photos = tmp_path / "photos"
+    other = tmp_path / "other"
     touch(photos, "a.png", "side/b.png")
     touch(other, "c.png", "deep/d.png")
     (photos / "0 side again").symlink_to(photos / "side")

@@ -84,7 +84,8 @@ def test_low_contrast_is_stretched_alike_in_gray_and_colour(tmp_path: Path) -> N
     path = write_image(tmp_path / "faded.png", cv2.cvtColor(ramp, cv2.COLOR_GRAY2BGR))
     np.testing.assert_array_equal(read_gray(path), ramp)
     stored = decode(path)
-    gray, color = in_eight_bits(stored, tones(stored)), read_color(path, 200)
+    gray = in_eight_bits(stored, tones(stored))
+    color = read_color(path, 200)
     assert_allclose(gray[5, [22, 100, 177]], [0, 128, 255], atol=4)
     assert (gray[:, :15] == 255).all()
     assert not gray[:, -15:].any()
@@ -103,7 +104,8 @@ def test_tones_stay_where_contrast_is_good_or_nothing_is_seen(value_range: tuple
 def test_header_and_pixels_are_those_that_are_stored(
     tmp_path: Path, suffix: str, orientation: int
 ) -> None:
-    path, exif = tmp_path / f"a{suffix}", PIL.Image.Exif()
+    path = tmp_path / f"a{suffix}"
+    exif = PIL.Image.Exif()
     exif[PIL.ExifTags.Base.Orientation] = orientation
     values = np.zeros((30, 50), np.uint8)
     values[:8, :24] = 255
@@ -127,7 +129,8 @@ def test_size_of_a_photograph_of_four_hundred_megapixels_is_known(tmp_path: Path
 
 
 def test_threads_that_read_headers_leave_filters_of_warnings(tmp_path: Path) -> None:
-    path, before = write_image(tmp_path / "a.png", np.zeros((8, 8), np.uint8)), [*warnings.filters]
+    path = write_image(tmp_path / "a.png", np.zeros((8, 8), np.uint8))
+    before = [*warnings.filters]
     with ThreadPoolExecutor(2) as threads:
         for duration_s in (0.1, 0.3):  # the one that begins later ends later
             threads.submit(read_header, path, lambda _, s=duration_s: time.sleep(s))

@@ -35,7 +35,8 @@ SIZE = (150, 100)
 
 def rectification(tilt: float, angle_rad: float) -> Rectification:
     """Warp of a whole image of ``SIZE``."""
-    linear, corners = rectifying_affine(tilt, angle_rad), image_corners(SIZE)
+    linear = rectifying_affine(tilt, angle_rad)
+    corners = image_corners(SIZE)
     matrix, canvas = fit_canvas(linear, corners, margin_px=4.0)
     return Rectification(matrix, canvas, np.ones(SIZE[::-1], bool), tilt, angle_rad)
 
@@ -184,7 +185,8 @@ def test_warp_mask_marks_the_pixels_whose_source_is_in_the_region(is_affine: boo
     assert mask.shape == plan.canvas_size[::-1]
     assert np.unique(mask).tolist() == [0, 255]
     sources = project(plan.image_from_rectified, canvas_points(plan).reshape(-1, 2))
-    low, high = np.array([29.5, 19.5]), np.array([109.5, 59.5])
+    low = np.array([29.5, 19.5])
+    high = np.array([109.5, 59.5])
     slack = 0.1  # of OpenCV's fixed-point coordinates
     surely = ((sources > low + slack) & (sources < high - slack)).all(axis=1)
     surely_not = ((sources < low - slack) | (sources > high + slack)).any(axis=1)

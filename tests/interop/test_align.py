@@ -63,7 +63,8 @@ def test_control_points_give_scale_rotation_and_place(tmp_path: Path) -> None:
 
 def test_positions_on_earth_become_metres_east_north_and_up(tmp_path: Path) -> None:
     model = write_model(tmp_path / "model")
-    table, rows = tmp_path / "positions.csv", ["name,latitude,longitude,altitude"]
+    table = tmp_path / "positions.csv"
+    rows = ["name,latitude,longitude,altitude"]
     for name, place in true_centers(model).items():
         rows.append(",".join([name, *map(repr, on_earth(place, ORIGIN))]))
     table.write_text("\n".join(rows))
@@ -73,7 +74,8 @@ def test_positions_on_earth_become_metres_east_north_and_up(tmp_path: Path) -> N
     kept = json.loads((tmp_path / "new" / "georeference.json").read_text())
     origin = tuple(kept[key] for key in ("latitude", "longitude", "altitude"))
     for name, true in true_centers(model).items():
-        expected, found = on_earth(true, ORIGIN), on_earth(centers(new)[name], origin)
+        expected = on_earth(true, ORIGIN)
+        found = on_earth(centers(new)[name], origin)
         np.testing.assert_allclose(found, expected, atol=1e-4)
         np.testing.assert_allclose(found[:2], expected[:2], atol=1e-8)
 
@@ -122,7 +124,8 @@ def write_gps(path: Path, places: dict[str, list[float]]) -> None:
 
 def ring(folder: Path) -> dict[str, list[float]]:
     """Write a model of nine photographs round a place; return their positions, 2 m wrong or so."""
-    rng, model = np.random.default_rng(5), write_model(folder)
+    rng = np.random.default_rng(5)
+    model = write_model(folder)
     for number in range(5, 10):
         turned = pycolmap.Rotation3d(np.array([0.0, 0.7 * number, 0.0]))
         center = np.array([3.0 * np.sin(number), 0.3 * number, 3.0 * np.cos(number)])

@@ -49,7 +49,8 @@ def test_transforms_are_of_cameras_that_look_along_minus_z_with_y_up(tmp_path: P
     dense = written["undistorted"]
     flat = pycolmap.Reconstruction(dense / "sparse")
     content = json.loads(written["nerfstudio"].read_text())
-    frames, (low, high) = content["frames"], np.array(content["aabb"])
+    frames = content["frames"]
+    (low, high) = np.array(content["aabb"])
     assert len(frames) == 4
     point = np.array([0.4, -0.3, 6.0])
     for frame in frames:

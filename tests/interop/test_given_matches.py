@@ -118,7 +118,8 @@ def described(files: Files, size: int, **more: Any) -> dict[str, list[int]]:
     """Write features of the same things in another order in each image; return the orders."""
     random = np.random.default_rng(0)
     things = unit_rows(random.gamma(0.4, size=(30, size)))
-    orders, groups = {}, {}
+    orders = {}
+    groups = {}
     for number, name in enumerate(("a.png", "sub/b c.png", "sub/č.png", "sub_x/d.png")):
         order = random.permutation(30)
         places = random.permutation(64 * 48)[:30]

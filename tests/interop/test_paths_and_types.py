@@ -20,7 +20,7 @@ from colmap_affrect.interop.hdf5 import export_h5, import_h5
 
 TAKING_PATHS: dict[str, Callable[[Any, Any], object]] = {
     "run": colmap_affrect.run,
-    "map_from_database": colmap_affrect.map_from_database,
+    "map_database": colmap_affrect.map_database,
     "compare": colmap_affrect.compare,
     "evaluate": lambda a, b: colmap_affrect.evaluate("evd", a, b),
     "export_h5": lambda a, b: export_h5(a, b, b + b),
@@ -30,18 +30,19 @@ TAKING_PATHS: dict[str, Callable[[Any, Any], object]] = {
     "diagnose": lambda a, b: diagnose(a, weights_path=b),
     "extract_features": lambda a, b: colmap_affrect.extract_features(b, a),
     "match_exhaustive": lambda a, _: colmap_affrect.match_exhaustive(a),
-    "verify": lambda a, _: colmap_affrect.verify(a),
+    "verify_matches": lambda a, _: colmap_affrect.verify_matches(a),
     "incremental_mapping": lambda a, b: colmap_affrect.incremental_mapping(a, "", b),
 }
 
 
 @pytest.mark.parametrize("name", TAKING_PATHS)
 def test_paths_are_text_too_and_bytes_are_refused_in_words(name: str, tmp_path: Path) -> None:
-    missing, out = str(tmp_path / "missing"), str(tmp_path / "out")
+    missing = str(tmp_path / "missing")
+    out = str(tmp_path / "out")
     with pytest.raises(AffrectError, match="missing"):
         TAKING_PATHS[name](missing, out)
     with pytest.raises(
-        OptionError, match=r"^b'.*': give a path as str or os\.PathLike, not bytes$"
+        OptionError, match=r"^\w+(=|: )b'.*': give a path as str or os\.PathLike, not bytes$"
     ):
         TAKING_PATHS[name](missing.encode(), out.encode())
 
@@ -49,11 +50,11 @@ def test_paths_are_text_too_and_bytes_are_refused_in_words(name: str, tmp_path: 
 def test_options_take_both_kinds_of_paths() -> None:
     options = colmap_affrect.RunOptions(
         image_list_path="list.txt",  # type: ignore[arg-type]
-        extend=colmap_affrect.Extension("model"),  # type: ignore[arg-type]
+        extend=colmap_affrect.Extension(model_path="model"),  # type: ignore[arg-type]
         cameras=colmap_affrect.CameraOptions(cameras_path=Path("model")),  # type: ignore[arg-type]
     )
     assert options.image_list_path == Path("list.txt")
-    assert options.extend == colmap_affrect.Extension(Path("model"))
+    assert options.extend == colmap_affrect.Extension(model_path=Path("model"))
     assert (options.cameras.cameras_path, options.from_database) == ("model", None)
 
 
@@ -64,7 +65,7 @@ def test_errors_of_functions_name_arguments(
     with pytest.raises(OptionError, match=r"^image_path \S+none: no such folder$"):
         export(tmp_path, tmp_path / "out", ["ply"], image_path=tmp_path / "none")
     assert str(AffrectError("--mask-path x: use 'colmap-affrect run --set a=1' or --extend")) == (
-        "mask_path x: use 'colmap-affrect run --set a=1' or extend"
+        "masks.path x: use 'colmap-affrect run --set a=1' or extend"
     )
     with pytest.raises(OptionError, match=r"call extract_features first, or move this folder"):
         colmap_affrect.match_exhaustive(tmp_path / "a.db")
@@ -75,14 +76,19 @@ import colmap_affrect
 from colmap_affrect import pycolmap
 from colmap_affrect.pycolmap.panorama import reconstruct
 
-report = colmap_affrect.run("photos", "out", colmap_affrect.RunOptions())
+report = colmap_affrect.run(
+    "photos", "out", colmap_affrect.RunOptions(effort="low"), cameras={"mode": "single"}
+)
 reveal_type(report)
+reveal_type(report.reconstruction())
 reveal_type(pycolmap.extract_features("a.db", "photos"))
 reveal_type(pycolmap.match_exhaustive("a.db"))
 reveal_type(pycolmap.Reconstruction())
 reveal_type(reconstruct("panoramas", "out"))
 reveal_type(pycolmap.__version__)
 pycolmap.no_such_name
+colmap_affrect.run("photos", "out", efort="low")
+colmap_affrect.CameraOptions(mod="single")
 """
 
 
@@ -95,14 +101,19 @@ def test_type_checkers_see_the_types(tmp_path: Path) -> None:
         env={**os.environ, "MYPYPATH": str(Path(colmap_affrect.__file__).parents[1])},
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
-    *lines, error, _ = done.stdout.splitlines()
+    said = done.stdout.splitlines()
+    lines = [line for line in said if "Revealed type" in line]
+    name, keyword, field = (line for line in said if " error: " in line)
     report = "colmap_affrect.project.report"
     assert [line.partition("Revealed type is ")[2] for line in lines] == [
-        f'"{report}.ReconstructionReport"',
+        '"colmap_affrect.report.run_report.RunReport"',
+        '"pycolmap._core.Reconstruction"',
         f'"{report}.StageReport"',
         f'"tuple[{report}.StageReport, ...]"',
         '"pycolmap._core.Reconstruction"',
         '"dict[int, pycolmap._core.Reconstruction]"',
         '"str"',
     ]
-    assert "no_such_name" in error
+    assert "no_such_name" in name
+    assert 'Unexpected keyword argument "efort"' in keyword
+    assert 'Unexpected keyword argument "mod"' in field

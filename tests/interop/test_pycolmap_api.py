@@ -58,7 +58,8 @@ def test_database_is_that_of_a_run(photos: Path, tmp_path: Path) -> None:
     colmap_affrect.extract_features(str(tmp_path / "a.db"), str(photos))
     colmap_affrect.match_exhaustive(str(tmp_path / "a.db"))
     colmap_affrect.run(photos, tmp_path / "run")
-    one, other = keypoints(tmp_path / "a.db"), keypoints(tmp_path / "run" / "database.db")
+    one = keypoints(tmp_path / "a.db")
+    other = keypoints(tmp_path / "run" / "database.db")
     assert one.keys() == other.keys() == set(NAMES)
     for name in NAMES:
         np.testing.assert_array_equal(one[name], other[name])
@@ -144,7 +145,8 @@ def test_features_are_replaced_in_a_new_database_and_the_old_one_stays(
 def test_a_database_of_another_program_and_other_photographs_are_refused(
     photos: Path, sift: Path, tmp_path: Path
 ) -> None:
-    before, extract = keypoints(sift), colmap_affrect.extract_features
+    before = keypoints(sift)
+    extract = colmap_affrect.extract_features
     with pytest.raises(DatabaseError, match=r"has other features of a\.png.*from_database"):
         extract(sift, photos)
     with pytest.raises(OptionError, match="leave out camera mode"):

@@ -62,7 +62,8 @@ def test_models_are_written_as_by_pycolmap_and_callbacks_called(
     assert list(models) == [0]
     assert len(registered(models[0])) == NUM_IMAGES
     assert registered(pycolmap.Reconstruction(tmp_path / "0")) == registered(models[0])
-    token, other = pycolmap.CancellationToken(), tmp_path / "other"
+    token = pycolmap.CancellationToken()
+    other = tmp_path / "other"
     with pytest.raises(InterruptedError):
         colmap_affrect.incremental_mapping(
             database, "", other, next_image_callback=token.cancel, cancellation_token=token
@@ -123,13 +124,14 @@ def test_verify_and_mapping_take_keypoints_of_any_columns(tmp_path: Path, num_co
     names = synthesize(path, num_columns, verified=False)
     with open_database(path) as database:
         assert database.read_keypoints(1).shape[1] == num_columns
-    colmap_affrect.verify(path)
+    colmap_affrect.verify_matches(path)
     models = colmap_affrect.incremental_mapping(path, "", tmp_path / "out")
     assert registered(models[0]) == names
 
 
 def test_verify_takes_a_list_of_pairs(tmp_path: Path) -> None:
-    path, listed = tmp_path / "database.db", tmp_path / "pairs.txt"
+    path = tmp_path / "database.db"
+    listed = tmp_path / "pairs.txt"
     names = synthesize(path, verified=False)
     listed.write_text(f"{names[2]} {names[0]}\n{names[1]} {names[3]}\n")
     colmap_affrect.verify_matches(path, listed)
@@ -139,7 +141,7 @@ def test_verify_takes_a_list_of_pairs(tmp_path: Path) -> None:
     assert len(pair_ids) == 2
     assert min(counts) > 100
     assert sorted(file.name for file in tmp_path.iterdir()) == ["database.db", "pairs.txt"]
-    colmap_affrect.verify(path)
+    colmap_affrect.verify_matches(path)
     with open_database(path) as database:
         assert len(database.read_two_view_geometry_num_inliers()[0]) == 15
     listed.write_text("a b\n")
@@ -149,7 +151,7 @@ def test_verify_takes_a_list_of_pairs(tmp_path: Path) -> None:
         database.delete_matches(1, 2)
         database.write_matches(1, 2, np.array([[0, 0], [1, 10_000]], np.uint32))
     with pytest.raises(DatabaseError, match="matches of keypoints that do not exist"):
-        colmap_affrect.verify(path)
+        colmap_affrect.verify_matches(path)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -160,21 +162,22 @@ def content(folder: Path) -> dict[str, bytes]:
 def test_database_of_any_program_is_mapped_in_a_copy(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    source, out = tmp_path / "source", tmp_path / "out"
+    source = tmp_path / "source"
+    out = tmp_path / "out"
     source.mkdir()
     names = synthesize(source / "any.db", 4)
     before = content(source)
-    report = colmap_affrect.map_from_database(source / "any.db", out)
+    report = colmap_affrect.map_database(source / "any.db", out)
     assert report.registered_names == tuple(names)
     assert (report.status, report.num_pairs, report.num_verified_pairs) == ("ok", 15, 15)
     assert "verified now" not in caplog.text
     assert content(source) == before
     assert (out / "report.json").exists()
-    again = colmap_affrect.map_from_database(source / "any.db", out)
+    again = colmap_affrect.map_database(source / "any.db", out)
     assert again.stages[-1].num_kept == 1
     with open_database(source / "any.db") as database:
         database.clear_two_view_geometries()
-    again = colmap_affrect.map_from_database(source / "any.db", out)
+    again = colmap_affrect.map_database(source / "any.db", out)
     assert "15 pairs have matches only" in caplog.text
     assert again.stages[0].num_done == 15
 
@@ -187,9 +190,9 @@ def test_databases_that_cannot_be_mapped_are_one_clear_line(tmp_path: Path) -> N
         database.clear_matches()
         database.clear_descriptors()
     with pytest.raises(DatabaseError, match=r"any\.db: has no matches, nor descriptors to match"):
-        colmap_affrect.map_from_database(path, tmp_path / "out")
+        colmap_affrect.map_database(path, tmp_path / "out")
     with pytest.raises(OptionError, match="no such file"):
-        colmap_affrect.map_from_database(tmp_path / "no.db", tmp_path / "none")
+        colmap_affrect.map_database(tmp_path / "no.db", tmp_path / "none")
     assert not (tmp_path / "none").exists()
     with pytest.raises(OptionError, match="nowhere: no such folder"):
-        colmap_affrect.map_from_database(path, tmp_path / "x", image_path=tmp_path / "nowhere")
+        colmap_affrect.map_database(path, tmp_path / "x", image_path=tmp_path / "nowhere")

@@ -205,7 +205,8 @@ def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: 
             token.cancel()
             return super().stage(name, total, unit)
 
-    path, token = tmp_path / "a.db", pycolmap.CancellationToken()
+    path = tmp_path / "a.db"
+    token = pycolmap.CancellationToken()
     with pytest.raises(InterruptedError, match="Operation cancelled"):
         replaced.extract_features(
             path, photos, extraction_options=COARSE, cancellation_token=token,

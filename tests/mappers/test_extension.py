@@ -19,7 +19,8 @@ from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
 
-NUM_IMAGES, NUM_OLD = 10, 5
+NUM_IMAGES = 10
+NUM_OLD = 5
 SCENE = {"num_rigs": 2, "num_frames_per_rig": 5, "num_points3D": 200, "noise_px": 0.5}
 
 
@@ -36,7 +37,8 @@ def old(database: Path) -> pycolmap.Reconstruction:
     native = mapper_of("incremental").native(NOTHING_KNOWN, SEED)
     with open_database(database) as opened:
         names = [image.name for image in opened.read_all_images()]
-    native.image_names, native.extract_colors = names[1::2], False
+    native.image_names = names[1::2]
+    native.extract_colors = False
     output = database.parent / "old"
     output.mkdir()
     model = pycolmap.incremental_mapping(database, database.parent, output, options=native)[0]
@@ -48,7 +50,8 @@ def old(database: Path) -> pycolmap.Reconstruction:
 
 def with_other_ids(model: pycolmap.Reconstruction, pixels: float = 0.0) -> pycolmap.Reconstruction:
     """The same model, every image with a camera and ids of its own, keypoints moved by pixels."""
-    new, ids = pycolmap.Reconstruction(), {}
+    new = pycolmap.Reconstruction()
+    ids = {}
     for number, image_id in enumerate(sorted(model.reg_image_ids(), reverse=True)):
         image = model.image(image_id)
         camera = pycolmap.Camera(model.camera(image.camera_id).todict())
@@ -91,7 +94,7 @@ def extended(
 ) -> tuple[pycolmap.Reconstruction, list[int]]:
     """Write a model into a folder and extend it; return the result and what progress showed."""
     shown: list[int] = []
-    existing = read_existing(Extension(written(old, folder / at), **options), database)
+    existing = read_existing(Extension(model_path=written(old, folder / at), **options), database)
     task = MappingTask(database, None, extend=existing)
     (model,) = map_database(mapper_of("incremental"), task, folder / "sparse", shown.append)
     assert len(model.registered_names) == NUM_IMAGES
@@ -104,7 +107,8 @@ def test_old_poses_and_cameras_stay_to_the_bit(
 ) -> None:
     model, shown = extended(database, with_other_ids(old, pixels), tmp_path)
     assert shown == [NUM_OLD, *[1] * (NUM_IMAGES - NUM_OLD)]
-    now, before = poses(model), poses(old)
+    now = poses(model)
+    before = poses(old)
     for name, pose in before.items():
         assert now[name].tobytes() == pose.tobytes(), name
         assert cameras(model)[name] == cameras(old)[name]
@@ -112,11 +116,11 @@ def test_old_poses_and_cameras_stay_to_the_bit(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["old", "sparse"]
 
 
-def test_the_model_that_is_extended_stays_until_all_is_judged(
+def test_the_model_that_is_extended_stays_until_all_images_are_scored(
     database: Path, old: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "sparse").mkdir()
-    monkeypatch.setattr(mapping, "judge", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(mapping, "score_images", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         extended(database, old, tmp_path, "sparse/0")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]
@@ -143,7 +147,8 @@ def test_new_images_are_where_they_were_taken(
     native.extract_colors = False
     (tmp_path / "all").mkdir()
     whole = pycolmap.incremental_mapping(database, tmp_path, tmp_path / "all", options=native)[0]
-    one, other = poses(model), poses(whole)
+    one = poses(model)
+    other = poses(whole)
     first, *others = sorted(one)
     ratios: list[float] = []
     for name in others:
@@ -173,7 +178,7 @@ def test_rigs_get_the_poses_of_their_cameras(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     truth = synthesize(path, **SCENE | {"num_rigs": 1, "num_cameras_per_rig": 2})
     single = with_other_ids(truth)
-    existing = read_existing(Extension(written(single, tmp_path / "old")), path)
+    existing = read_existing(Extension(model_path=written(single, tmp_path / "old")), path)
     for name, pose in poses(existing.reconstruction).items():
         np.testing.assert_allclose(pose, poses(truth)[name], atol=1e-9)
     assert existing.reconstruction.num_reg_frames() == 5
@@ -190,7 +195,8 @@ def test_cameras_may_have_another_model_than_in_the_database(
     other = with_other_ids(old, 0.3)
     for camera in other.cameras.values():
         f, cx, cy, k = camera.params
-        camera.model, camera.params = pycolmap.CameraModelId.RADIAL, [f, cx, cy, k, 0.0]
+        camera.model = pycolmap.CameraModelId.RADIAL
+        camera.params = [f, cx, cy, k, 0.0]
     before = database_cameras(database)
     model, _ = extended(database, other, tmp_path)
     for name, pose in poses(old).items():
@@ -228,10 +234,10 @@ def test_model_that_does_not_fit_is_one_clear_line(
 ) -> None:
     path = broken(old, kind, tmp_path / "old")
     with pytest.raises(AffrectError, match=message) as error:
-        read_existing(Extension(path), database)
+        read_existing(Extension(model_path=path), database)
     assert "\n" not in str(error.value)
     with pytest.raises(AffrectError, match="not a COLMAP model"):
-        read_existing(Extension(tmp_path), database)
+        read_existing(Extension(model_path=tmp_path), database)
 
 
 def stop_after(number: int, token: pycolmap.CancellationToken) -> Any:
@@ -279,7 +285,8 @@ def test_snapshots_of_other_options_are_dropped(
 ) -> None:
     path = tmp_path / "database.db"
     synthesize(path, **SCENE)
-    task, folder = MappingTask(path, None), tmp_path / "sparse.snapshots"
+    task = MappingTask(path, None)
+    folder = tmp_path / "sparse.snapshots"
 
     def fail(num_images: int, **options: Any) -> None:
         with snapshots.with_snapshots(
@@ -309,9 +316,11 @@ def test_snapshots_of_other_cameras_are_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They are of the same pairs, with as many inliers."""
-    path, folder = tmp_path / "database.db", tmp_path / "sparse.snapshots"
+    path = tmp_path / "database.db"
+    folder = tmp_path / "sparse.snapshots"
     synthesize(path, **SCENE)
-    task, options = MappingTask(path, None), mapper_of("incremental").options
+    task = MappingTask(path, None)
+    options = mapper_of("incremental").options
     monkeypatch.setattr(snapshots, "SNAPSHOT_FRAMES", 2)
 
     def is_gone_on_with(task: MappingTask) -> bool:

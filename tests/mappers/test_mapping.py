@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -18,18 +20,21 @@ from mapping_tasks import (
 from small_scene import NAMES, write_photographs
 from verified import verified
 
+import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
+from colmap_affrect.mappers import mapping
+from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
-from colmap_affrect.pipeline import map_and_report, map_from_database
+from colmap_affrect.pipeline import map_and_report
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
@@ -128,8 +133,11 @@ def test_mapper_that_cannot_extend_says_so_before_anything_is_made(tmp_path: Pat
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=2, num_points3D=60)
     with pytest.raises(OptionError, match=r"the global mapper cannot; use .*mapper sparse"):
-        map_from_database(
-            path, tmp_path / "out", mapping=GlobalOptions(), extend=Extension(tmp_path / "model")
+        colmap_affrect.map_database(
+            path,
+            tmp_path / "out",
+            mapping=GlobalOptions(),
+            extend=Extension(model_path=tmp_path / "model"),
         )
     assert not (tmp_path / "out").exists()
 
@@ -153,6 +161,47 @@ def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
     (model,), _ = reconstruct(path, mapper_of("incremental"))
     assert len(model.registered_names) == 3
+
+
+def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [0.49996, 0.89996, 0.99996]
+
+    def scored(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
+        names = sorted(image.name for image in mapped.reconstruction.images.values())
+        return {n: Confidence(p, "a reason") for n, p in zip(names, given, strict=True)}
+
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=3, num_points3D=150)
+    monkeypatch.setattr(mapping, "score_images", scored)
+    (model,), _ = reconstruct(path, mapper_of("incremental"))
+    first, second, third = model.registered_names
+    assert list(model.probabilities.values()) == [0.499, 0.899, 0.999]
+    assert (model.doubtful, model.unsure) == ({first: "a reason"}, {second: "a reason"})
+    assert model.sure == (third,)
+
+
+def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A call that does not look whether it is cancelled is left, and goes on for a moment."""
+    path = tmp_path / "database.db"
+    removed = shutil.rmtree
+    synthesize(path, num_rigs=2, num_points3D=50)
+
+    def remove_while_a_file_is_made(folder: Path) -> None:
+        monkeypatch.setattr(shutil, "rmtree", removed)
+        raise OSError(errno.ENOTEMPTY, "Directory not empty", folder)
+
+    def stop(*_: object, **__: object) -> None:
+        monkeypatch.setattr(shutil, "rmtree", remove_while_a_file_is_made)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", stop)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(path, mapper_of("incremental"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
 
 
 @pytest.fixture(scope="module")
@@ -184,3 +233,23 @@ def test_two_places_make_two_models_the_largest_first(two_places: Workspace, map
     for folder, names in zip(folders, (large, small), strict=True):
         model = pycolmap.Reconstruction(folder)
         assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(names)
+
+
+@pytest.mark.parametrize(("probability", "num_images"), [(0.2, 3), (0.04, 2)])
+def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, probability: float, num_images: int
+) -> None:
+    synthesize(tmp_path / "database.db", num_rigs=3, num_points3D=60)
+
+    def score(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
+        names = sorted(model_poses(mapped.reconstruction))
+        found = dict.fromkeys(names, Confidence(0.99, ""))
+        if len(names) == 3:
+            found[names[-1]] = Confidence(probability, "no parallax")
+        return found
+
+    monkeypatch.setattr(mapping, "score_images", score)
+    ((model,), _) = reconstruct(tmp_path / "database.db", mapper_of("incremental"))
+    assert len(model.registered_names) == num_images
+    assert len(model.doubtful) == (num_images == 3)
+    assert len(model.taken_out) == (num_images == 2)

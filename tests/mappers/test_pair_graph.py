@@ -1,7 +1,10 @@
 """Graphs of verified pairs, of which mapping takes a part."""
 
-from collections import defaultdict
+import copy
+from collections import Counter, defaultdict
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +14,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers import pair_graph
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
 from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS
 
@@ -92,3 +96,89 @@ def test_most_connected_is_the_largest_part(path: Path) -> None:
     apart = graph.without([p.ids for p in graph.pairs if len(part.intersection(p.ids)) == 1])
     assert apart.most_connected == set(graph.keypoints) - part
     assert not graph.without([pair.ids for pair in graph.pairs]).most_connected
+
+
+def test_agreement_of_a_pair_is_computed_anew_where_a_pose_or_a_camera_is_another(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = PairGraph.read(path)
+    pair = graph.pairs[0]
+    cameras = {key: copy.copy(camera) for key, camera in graph.cameras.items()}
+    poses = {key: (np.eye(3), np.array([0.1 * key, 0.0, 1.0])) for key in cameras}
+    computed = list[str]()
+    compute = pair_graph._agreement
+
+    def counting(*given: Any) -> Any:
+        computed.append("")
+        return compute(*given)
+
+    monkeypatch.setattr(pair_graph, "_agreement", counting)
+    share = graph.agreement(pair, poses, cameras)
+    assert graph.agreement(pair, dict(poses), cameras) == share
+    assert len(computed) == 1
+    first = pair.ids[0]
+    poses[first] = poses[first][0], poses[first][1] + 1e-12
+    graph.agreement(pair, poses, cameras)
+    assert len(computed) == 2
+    cameras[first].params *= 1.5
+    graph.agreement(pair, poses, cameras)
+    assert len(computed) == 3
+    graph.agreement(replace(pair, matches=pair.matches[:50]), poses, cameras)
+    assert len(computed) == 4
+
+
+def shifted(graph: PairGraph, distance_px: float) -> PairGraph:
+    """Move all keypoints by so many px, in all directions."""
+    random = np.random.default_rng(1)
+    keypoints = {}
+    for image_id, points in graph.keypoints.items():
+        angles = random.uniform(0, 2 * np.pi, len(points))
+        shifts = distance_px * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        keypoints[image_id] = (points + shifts).astype(np.float32)
+    return replace(graph, keypoints=keypoints)
+
+
+def enlarged(model: pycolmap.Reconstruction, factor: float) -> pycolmap.Reconstruction:
+    """Return a copy of a model of images so many times as large."""
+    large = pycolmap.Reconstruction(model)
+    for camera in large.cameras.values():
+        camera.rescale(factor)
+    return large
+
+
+def lowest_agreement(graph: PairGraph, model: pycolmap.Reconstruction) -> float:
+    poses = poses_of(model)
+    cameras = cameras_of(model)
+    return min(graph.agreement(pair, poses, cameras) for pair in graph.pairs)
+
+
+def test_matches_agree_that_are_a_few_pixels_off_their_epipolar_lines(tmp_path: Path) -> None:
+    model = synthesize(tmp_path / "database.db", num_rigs=3, num_points3D=300)
+    graph = PairGraph.read(tmp_path / "database.db")
+    assert lowest_agreement(shifted(graph, 3.0), model) > 0.9
+    assert lowest_agreement(shifted(graph, 60.0), model) < 0.3
+
+
+def test_in_large_images_matches_may_be_farther_off(tmp_path: Path) -> None:
+    model = synthesize(tmp_path / "database.db", num_rigs=3, num_points3D=300)
+    graph = PairGraph.read(tmp_path / "database.db")
+    keypoints = {i: 4.0 * points for i, points in graph.keypoints.items()}
+    large, model = replace(graph, keypoints=keypoints), enlarged(model, 4.0)  # 4096 px
+    assert lowest_agreement(shifted(large, 9.0), model) > 0.9
+    assert lowest_agreement(shifted(large, 200.0), model) < 0.3
+
+
+def test_only_the_strongest_pairs_of_an_image_score_models(tmp_path: Path) -> None:
+    synthesize(tmp_path / "database.db", num_rigs=20, num_points3D=40)
+    graph = PairGraph.read(tmp_path / "database.db")
+    counts = Counter(image_id for pair in graph.pairs for image_id in pair.ids)
+    assert min(counts.values()) == 15
+    assert graph.weak
+    assert len(graph.verified) == 190
+
+
+def test_pairs_of_fewer_than_fifteen_inliers_are_left_out(tmp_path: Path) -> None:
+    for num_points in (14, 16):
+        path = tmp_path / f"{num_points}.db"
+        synthesize(path, num_rigs=2, num_points3D=num_points)
+        assert len(PairGraph.read(path).pairs) == (num_points > 15)

@@ -14,8 +14,10 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.parallax import mirrored_share
+from colmap_affrect.mappers.adjustment import Adjuster, FocalPrior
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.reliability import TERMS, judge, judged, measure
+from colmap_affrect.mappers.reliability import TERMS, confidence, score_images
+from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
 from colmap_affrect.project.report import DOUBTFUL, SURE
 
 
@@ -36,7 +38,7 @@ def last(mapped: MappedModel) -> pycolmap.Image:
 
 @pytest.mark.parametrize("num_images", [3, 6])
 def test_right_models_are_sure(tmp_path: Path, num_images: int) -> None:
-    found = judge(*scene(tmp_path, num_images))
+    found = score_images(*scene(tmp_path, num_images))
     assert len(found) == num_images
     assert min(one.probability for one in found.values()) >= SURE
 
@@ -46,38 +48,98 @@ def test_image_that_contradicts_its_pairs_is_doubted_and_the_others_are_not(tmp_
     image = last(mapped)
     turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.05])), np.array([1.0, 2, 3]))
     image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
-    found = judge(mapped, task)
+    found = score_images(mapped, task)
     assert [name for name, one in found.items() if one.probability < DOUBTFUL] == [image.name]
-    measures = measure(mapped, task)[image.name]
-    assert measures.agreement < 0.2
-    assert measures.evidence < 0.0
+    features = features_of(mapped, task)[image.name]
+    assert features.agreement < 0.2
+    assert features.log_likelihood_ratio < 0.0
 
 
 def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
-    good = measure(mapped, task)[last(mapped).name]
+    good = features_of(mapped, task)[last(mapped).name]
     bad = {
-        "evidence": (replace(good, evidence=-20.0), "speak against"),
+        "log-likelihood ratio": (
+            replace(good, log_likelihood_ratio=-20.0),
+            "disagree with this position",
+        ),
         "agreement": (replace(good, agreement=0.1), "only 10% of the matches"),
-        "points of three": (replace(good, num_three=0), "only 0 of its points"),
-        "focal length": (replace(good, focal_growth=0.001), "any focal length fits"),
+        "three-view points": (
+            replace(good, num_three_view_points=0),
+            "none of its points is seen by two other",
+        ),
+        "focal observability": (replace(good, focal_growth=0.001), "any focal length fits"),
         "given focal length": (
-            replace(good, focal_px=720.4, fitting_px=910.2),
+            replace(good, focal_px=720.4, fitting_focal_px=910.2),
             "the given focal length does not fit, 720 px: 910 px does",
         ),
-        "parallax": (replace(good, turned=1.0), "only turned explains 100% of the matches"),
-        "original": (replace(good, original="c.jpg"), "mirrored copy of c.jpg"),
-        "one lens": (replace(good, zoom=1.65), "are up to 1.65 times apart"),
+        "parallax": (
+            replace(good, pure_rotation_ratio=1.0),
+            "only turned explains 100% of the matches",
+        ),
+        "mirrored copy": (replace(good, mirrored_original="c.jpg"), "mirrored copy of c.jpg"),
+        "focal spread": (replace(good, focal_spread=1.65), "are up to 1.65 times apart"),
     }
     assert bad.keys() == TERMS.keys()
-    for name, (measures, text) in bad.items():
-        assert TERMS[name].value(measures) < TERMS[name].value(good)
-        assert text in TERMS[name].reason(measures)
-        assert judged(measures).probability <= judged(good).probability
+    for name, (features, text) in bad.items():
+        assert TERMS[name].value(features) < TERMS[name].value(good)
+        assert text in TERMS[name].reason(features)
+        assert confidence(features).probability <= confidence(good).probability
 
 
-def test_parts_that_one_pair_ties(tmp_path: Path) -> None:
-    """The smaller part hangs on the larger one, and not the other way round."""
+GOOD = ReliabilityFeatures(
+    log_likelihood_ratio=30.0,
+    agreement=0.98,
+    num_three_view_points=100,
+    focal_growth=0.5,
+    focal_px=1000.0,
+    fitting_focal_px=0.0,
+    pure_rotation_ratio=0.2,
+    mirrored_original="",
+    focal_spread=1.0,
+    tie_point_log_odds=0.0,
+    bridge_edge="",
+    num_bridge_inliers=0,
+)
+
+
+@pytest.mark.parametrize(("term", "values", "expected"), [
+    ("log-likelihood ratio", {"log_likelihood_ratio": 6.0}, 1.10),
+    ("log-likelihood ratio", {"log_likelihood_ratio": -6.0}, -1.10),
+    ("three-view points", {"num_three_view_points": 100}, 4.62),
+    ("three-view points", {"num_three_view_points": 5000}, 5.71),
+    ("focal observability", {"focal_growth": 0.1}, -2.30),
+    ("focal observability", {"focal_growth": 0.0}, -5.81),
+    ("focal observability", {"focal_growth": 20.0}, 0.0),
+    ("parallax", {"pure_rotation_ratio": 0.1}, -0.5),
+    ("parallax", {"pure_rotation_ratio": 0.8}, -0.8),
+    ("focal spread", {"focal_spread": 1.3}, -0.26),
+    ("focal spread", {"focal_spread": 9.0}, -0.5),
+])  # fmt: skip
+def test_terms_are_those_that_the_weights_were_fitted_to(
+    term: str, values: dict[str, float], expected: float
+) -> None:
+    features = replace(GOOD, **values)
+    assert TERMS[term].value(features) == pytest.approx(expected, abs=0.01)
+
+
+def test_two_reasons_are_said_and_no_small_ones() -> None:
+    doubted = replace(GOOD, log_likelihood_ratio=-20.0, agreement=0.2, mirrored_original="c.jpg")
+    assert confidence(doubted).reason.count(";") == 1
+    small = replace(GOOD, log_likelihood_ratio=-20.0, num_three_view_points=60)
+    assert "of its points" not in confidence(small).reason
+    assert "of its points" in confidence(replace(small, num_three_view_points=3)).reason
+
+
+def test_a_bridge_edge_counts_by_its_inliers() -> None:
+    probabilities = []
+    for num_inliers in (15, 35, 55, 100):
+        features = replace(GOOD, bridge_edge="a.jpg - b.jpg", num_bridge_inliers=num_inliers)
+        probabilities.append(confidence(features).probability / confidence(GOOD).probability)
+    assert probabilities == pytest.approx([0.12, 0.5, 0.88, 1.0], abs=0.01)
+
+
+def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path, 5)
     ids = sorted(mapped.reconstruction.reg_image_ids())
     with open_database(task.database_path) as database:
@@ -87,11 +149,11 @@ def test_parts_that_one_pair_ties(tmp_path: Path) -> None:
             else:
                 database.delete_two_view_geometry(one, two)
     names = [mapped.reconstruction.images[i].name for i in ids]
-    found = measure(mapped, task)
-    assert [bool(found[name].cut) for name in names] == [False] * 3 + [True] * 2
-    assert found[names[3]].cut == f"{names[1]} - {names[4]}"
-    assert found[names[3]].num_cut == num
-    alone, few = (judged(replace(found[names[3]], num_cut=num)) for num in (200, 29))
+    found = features_of(mapped, task)
+    assert [bool(found[name].bridge_edge) for name in names] == [False] * 3 + [True] * 2
+    assert found[names[3]].bridge_edge == f"{names[1]} - {names[4]}"
+    assert found[names[3]].num_bridge_inliers == num
+    alone, few = (confidence(replace(found[names[3]], num_bridge_inliers=num)) for num in (200, 29))
     assert few.probability < DOUBTFUL < alone.probability - 0.3
     assert f"hangs on the 29 inliers of {names[1]} - {names[4]} alone" in few.reason
     assert few.gain > 0.5
@@ -100,7 +162,8 @@ def test_parts_that_one_pair_ties(tmp_path: Path) -> None:
 def test_camera_that_only_turned(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     first = mapped.reconstruction.images[min(mapped.reconstruction.reg_image_ids())]
-    pose, rng = first.cam_from_world(), np.random.default_rng(3)
+    pose = first.cam_from_world()
+    rng = np.random.default_rng(3)
 
     def turned(image: pycolmap.Image) -> np.ndarray:
         matrix = pycolmap.Rotation3d(rng.uniform(-0.15, 0.15, 3)).matrix()
@@ -112,11 +175,11 @@ def test_camera_that_only_turned(tmp_path: Path) -> None:
                 points[index] = 0.9 * size.max() * ray[:2] / ray[2] + size / 2
         return points
 
-    assert max(one.turned for one in measure(mapped, task).values()) < 0.3
+    assert max(one.pure_rotation_ratio for one in features_of(mapped, task).values()) < 0.3
     with open_database(task.database_path) as database:
         for image_id, image in mapped.reconstruction.images.items():
             database.update_keypoints(image_id, turned(image).astype(np.float32))
-    assert min(one.turned for one in measure(mapped, replace(task)).values()) > 0.9
+    assert min(one.pure_rotation_ratio for one in features_of(mapped, replace(task)).values()) > 0.9
 
 
 def test_only_focal_lengths_that_the_model_tells_are_compared(tmp_path: Path) -> None:
@@ -125,8 +188,8 @@ def test_only_focal_lengths_that_the_model_tells_are_compared(tmp_path: Path) ->
     camera.params[list(camera.focal_length_idxs())] *= 1.5
     for growth, zoom in ((0.2, 1.5), (0.01, 1.0)):
         growths = dict.fromkeys(mapped.reconstruction.cameras, growth)
-        found = measure(mapped, task, growths)
-        assert [one.zoom for one in found.values()] == pytest.approx([zoom] * 5)
+        found = features_of(mapped, task, growths)
+        assert [one.focal_spread for one in found.values()] == pytest.approx([zoom] * 5)
 
 
 def add_mirrored_copy(mapped: MappedModel, task: MappingTask, ids: tuple[int, int]) -> None:
@@ -150,12 +213,16 @@ def test_mirrored_copy_is_told_from_the_photograph(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     add_mirrored_copy(mapped, task, (4, 1))
     images = mapped.reconstruction.images
-    originals = {name: one.original for name, one in measure(mapped, task).items() if one.original}
-    assert originals == {images[1].name: images[4].name}
+    features = features_of(mapped, task)
+    originals = {name: of_image.mirrored_original for name, of_image in features.items()}
+    assert originals.pop(images[1].name) == images[4].name
+    assert set(originals.values()) == {""}
 
 
 def test_dense_keypoints_are_no_mirrored_copies() -> None:
-    rng, size, smaller = np.random.default_rng(2), (320, 240), (256, 192)
+    rng = np.random.default_rng(2)
+    size = (320, 240)
+    smaller = (256, 192)
     few, many, others = (rng.uniform(0, size, (number, 2)) for number in (900, 12000, 12000))
     assert mirrored_share(many, others, (size, size)) < 0.3
     assert mirrored_share(many, many, (size, size)) < 0.3
@@ -170,8 +237,10 @@ def test_dense_keypoints_are_no_mirrored_copies() -> None:
         assert mirrored_share(fewer, few, (smaller, size)) > 0.9
 
 
-NUM_IMAGES, STEP_DEG = 5, 30.0
-DISTANCE, NOISE_PX = 6.0, 0.3
+NUM_IMAGES = 5
+STEP_DEG = 30.0
+DISTANCE = 6.0
+NOISE_PX = 0.3
 
 
 def ring(folder: Path, views_per_point: int) -> tuple[MappedModel, MappingTask]:
@@ -212,9 +281,9 @@ def test_points_of_many_images_tell_focal_lengths_that_nobody_knows(tmp_path: Pa
         folder = tmp_path / str(views_per_point)
         folder.mkdir()
         mapped, task = ring(folder, views_per_point)
-        growths[views_per_point] = measure(mapped, task)["2.jpg"].focal_growth
+        growths[views_per_point] = features_of(mapped, task)["2.jpg"].focal_growth
         known = replace(task, cameras={1: replace(task.cameras[1], source="exif")})
-        assert measure(mapped, known)["2.jpg"].focal_growth == 1.0
+        assert features_of(mapped, known)["2.jpg"].focal_growth == 1.0
     assert growths[2] < 0.07 < growths[4]
 
 
@@ -228,7 +297,21 @@ def test_given_focal_lengths_are_doubted_where_the_points_say_others(
     record = replace(
         task.cameras[1], source="given", focal_px=factor * 1500.0, given=("focal", "distortion")
     )
-    found = measure(mapped, replace(task, cameras={1: record}))
-    fitting = {one.fitting_px for one in found.values()}
+    found = features_of(mapped, replace(task, cameras={1: record}))
+    fitting = {one.fitting_focal_px for one in found.values()}
     assert len(fitting) == 1
     assert fitting == {0.0} if factor == 1.0 else min(fitting) == pytest.approx(1500.0, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_distortion_does_not_hide_that_a_given_focal_length_is_wrong(
+    tmp_path: Path, factor: float
+) -> None:
+    mapped, task = ring(tmp_path, 5)
+    focal_px = factor * 1500.0
+    mapped.reconstruction.cameras[1].params = [focal_px, 320, 240, 0]
+    refining = pycolmap.BundleAdjustmentOptions()
+    Adjuster({1: FocalPrior(focal_px, 0.0)}, 0.7, refining).adjust(mapped.reconstruction, 300)
+    record = replace(task.cameras[1], source="given", focal_px=focal_px, given=("focal",))
+    found = features_of(mapped, replace(task, cameras={1: record}))["2.jpg"].fitting_focal_px
+    assert found == 0.0 if factor == 1.0 else found == pytest.approx(1500.0, rel=0.05)

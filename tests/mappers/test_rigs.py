@@ -14,12 +14,14 @@ import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.mappers.adjustment import Settled
-from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.colmap.model_files import all_see_long_tracks, num_long_tracks
+from colmap_affrect.mappers import reliability_features
+from colmap_affrect.mappers.adjustment import EarlyStop
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.focal_observability import MAX_NUM_OBSERVATIONS, with_fewer_points
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
-from colmap_affrect.mappers.reliability import MAX_NUM_OBSERVATIONS, _with_fewer_points
-from colmap_affrect.mappers.search import _as_first_pairs
+from colmap_affrect.mappers.search import first_pairs
 
 SIZE = (1024, 768)
 
@@ -36,6 +38,36 @@ def unknown_cameras(path: Path) -> dict[int, CameraRecord]:
         cameras = database.read_all_cameras()
     record = CameraRecord(("a",), "guess", 1280.0, size=SIZE)
     return {camera.camera_id: replace(record) for camera in cameras}
+
+
+def test_pairs_of_a_rig_with_itself_tell_no_rotation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    model = synthesize_rig(path)
+    measured = list[Any]()
+
+    def share(*given: Any) -> float:
+        measured.append(given)
+        return 0.25
+
+    monkeypatch.setattr(reliability_features, "pure_rotation_ratio", share)
+    found = reliability_features.features_of(MappedModel(model), MappingTask(path, None))
+    assert len(found) == 12
+    assert {features.pure_rotation_ratio for features in found.values()} == {0.25}
+    num_frames = 4
+    assert num_frames <= len(measured) <= reliability_features.NUM_ROTATION_PAIRS * num_frames
+
+
+def test_models_with_enough_long_tracks_are_told_from_others(tmp_path: Path) -> None:
+    model = synthesize_rig(tmp_path / "database.db")
+    images = sorted(model.reg_image_ids())
+    counts = num_long_tracks(model, {})
+    least = min(counts[image_id] for image_id in images)
+    assert least > 50
+    assert all_see_long_tracks(model, images, least)
+    assert not all_see_long_tracks(model, images, least + 1)
+    assert all_see_long_tracks(model, [], least + 1)
 
 
 @pytest.mark.parametrize(("mapper", "most"), [("incremental", 1.6e5), ("sparse", 4e5)])
@@ -81,7 +113,7 @@ def test_first_pairs_are_of_two_frames_as_long_as_there_are_any(tmp_path: Path) 
     synthesize_rig(tmp_path / "database.db")
     graph = PairGraph.read(tmp_path / "database.db")
     images = graph.cache.images
-    frames = [{images[i].frame_id for i in p.ids} for p in _as_first_pairs(graph.pairs, graph)]
+    frames = [{images[i].frame_id for i in p.ids} for p in first_pairs(graph.pairs, graph)]
     sizes = [len(frame) for frame in frames]
     assert len(sizes) == len(graph.pairs)
     assert sizes == sorted(sizes, reverse=True)
@@ -106,8 +138,8 @@ def test_trials_have_few_observations_of_a_rig_and_all_others_of_single_cameras(
     single = synthesize(tmp_path / "single.db", num_rigs=12, num_points3D=600)
     num_all = rig.compute_num_observations()
     assert num_all == single.compute_num_observations() > 2 * MAX_NUM_OBSERVATIONS
-    assert _with_fewer_points(single).compute_num_observations() == num_all
-    assert 0 < _with_fewer_points(rig).compute_num_observations() <= MAX_NUM_OBSERVATIONS
+    assert with_fewer_points(single).compute_num_observations() == num_all
+    assert 0 < with_fewer_points(rig).compute_num_observations() <= MAX_NUM_OBSERVATIONS
 
 
 def test_what_is_not_to_be_refined_stays_as_the_database_has_it(tmp_path: Path) -> None:
@@ -147,14 +179,16 @@ class Step:
         ([500.0, 100.0, 1.0, 1.0], 3),  # nothing that is left brings it near to the other cost
         ([500.0, 400.0, 30.0, 0.01, 0.01, 0.01], 6),  # it hardly gets nearer any more
         ([500.0, 400.0, 30.0, 0.01, 0.5, 0.01], 6),  # only some steps bring little
+        ([500.0, 400.0, 30.0, 0.1, 0.1, 0.1, 0.1, 0.1], 8),  # they still bring it nearer
     ],
 )
 def test_trial_ends_once_its_cost_tells_enough(changes: list[float], num_steps: int) -> None:
-    settled = Settled(other_cost=100.0, enough=2.0, max_iterations=100)
-    cost, taken = 1100.0 if num_steps == 3 else 1050.0, 0
+    early_stop = EarlyStop(other_cost=100.0, enough=2.0, max_iterations=100)
+    cost = 1100.0 if num_steps == 3 else 1050.0
+    taken = 0
     for number, change in enumerate(changes, 1):
         cost -= change
         taken += 1
-        if settled(Step(number, cost, change)) == pyceres.CallbackReturnType(2):
+        if early_stop(Step(number, cost, change)) == pyceres.CallbackReturnType(2):
             break
     assert taken == num_steps

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import sqlite3
+from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from mapping_tasks import WHOLE, mapper_of, synthesize, task_with_given_cameras
+from wall_scene import views, write_scene
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
@@ -25,14 +27,18 @@ from colmap_affrect.mappers.adjustment import (
     USUAL_SIGMA,
     Adjuster,
     FocalPrior,
+    focal_priors,
 )
-from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence, pair_evidence
+from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer, pair_log_ratio
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
+from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.sparse import OWN_CAMERAS
 
-TRUE_FOCAL, SIZE, NUM_IMAGES = 1280.0, (1024, 768), 4
+TRUE_FOCAL = 1280.0
+SIZE = (1024, 768)
+NUM_IMAGES = 4
 NOISE_PX = 0.5
 UNKNOWN = CameraRecord(("a",), "guess", 1000.0, size=SIZE)
 Scene = tuple[Path, pycolmap.Reconstruction]
@@ -126,27 +132,27 @@ def test_an_adjustment_of_some_images_leaves_the_others_where_they_are(
 
 
 @pytest.mark.parametrize(("agreeing", "num"), [(20, 20), (40, 40)])
-def test_more_agreement_is_more_evidence_and_contradiction_costs_little(
+def test_more_agreement_is_more_score_and_contradiction_costs_little(
     agreeing: int, num: int
 ) -> None:
-    shares = [pair_evidence(agreeing * part / 4, num) for part in range(5)]
+    shares = [pair_log_ratio(agreeing * part / 4, num) for part in range(5)]
     assert shares == sorted(shares)
     assert shares[0] < 0 < shares[-1]
     assert shares[0] >= math.log(0.05)
 
 
-def test_a_wrong_pose_and_an_unlikely_lens_have_less_evidence(
+def test_a_wrong_pose_and_an_unlikely_lens_have_a_lower_score(
     scene: Scene, model: pycolmap.Reconstruction
 ) -> None:
     prior = dict.fromkeys(model.cameras, FocalPrior(TRUE_FOCAL, EXIF_SIGMA))
     graph = PairGraph.read(scene[0])
-    right = Evidence(graph, prior).of(model)
+    right = ModelScorer(graph, prior).score(model)
     unlikely = dict.fromkeys(model.cameras, FocalPrior(2 * TRUE_FOCAL, EXIF_SIGMA))
-    assert Evidence(graph, unlikely).of(model) < right - 3.0
+    assert ModelScorer(graph, unlikely).score(model) < right - 3.0
     image = model.images[max(model.reg_image_ids())]
     turned = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.5, 0.0])), np.zeros(3))
     image.frame.rig_from_world = turned * image.frame.rig_from_world
-    assert Evidence(graph, prior).of(model) < right - 3.0
+    assert ModelScorer(graph, prior).score(model) < right - 3.0
 
 
 @pytest.fixture
@@ -191,7 +197,8 @@ def test_an_adjustment_of_some_images_holds_cameras_that_others_share(tmp_path: 
     model = write_shared(tmp_path / "database.db", TRUE_FOCAL, 150)
     (camera,) = model.cameras.values()
     widen(model, 1.05)
-    before, some = camera.params.tolist(), sorted(model.reg_image_ids())[:3]
+    before = camera.params.tolist()
+    some = sorted(model.reg_image_ids())[:3]
     adjuster(model, FocalPrior(TRUE_FOCAL, USUAL_SIGMA)).adjust(model, FINAL, some)
     assert camera.params.tolist() == before
 
@@ -233,14 +240,42 @@ def test_a_narrow_lens_makes_a_model_unless_that_is_forbidden(
 def test_features_of_three_images_confirm_a_model_until_their_points_are_gone(
     scene: Scene, model: pycolmap.Reconstruction
 ) -> None:
-    evidence = Evidence(PairGraph.read(scene[0]), {})
-    assert evidence.is_confirmed(model)
-    before = sum(evidence.three_view_ratios(model).values())
+    scorer = ModelScorer(PairGraph.read(scene[0]), {})
+    assert scorer.is_confirmed(model)
+    before = sum(scorer.track_log_ratios(model).values())
     last = max(model.reg_image_ids())
     for index in model.images[last].get_observation_point2D_idxs():
         model.delete_observation(last, index)
-    assert not evidence.is_confirmed(model)
-    assert sum(evidence.three_view_ratios(model).values()) < before - 2 * MIN_GAIN
+    assert not scorer.is_confirmed(model)
+    assert sum(scorer.track_log_ratios(model).values()) < before - 2 * MIN_SCORE_GAIN
+
+
+@dataclass(frozen=True)
+class RecordingSearch(Search):
+    """Notes with which focal lengths models are made, in px."""
+
+    tried_px: list[float] = field(default_factory=list)
+
+    def with_bridges(self, graph: PairGraph, models: Sequence[MappedModel]) -> list[MappedModel]:
+        self.tried_px.append(self.adjuster.priors[1].focal_px)
+        return super().with_bridges(graph, models)
+
+
+def test_bridges_are_built_anew_with_a_focal_length_that_a_model_has_found(tmp_path: Path) -> None:
+    """The first one is off by 15 per cent."""
+    path = tmp_path / "database.db"
+    matrix = np.array([[977.5, 0.0, 480.0], [0.0, 977.5, 360.0], [0.0, 0.0, 1.0]])
+    write_scene(path, views(4), [(0, 1), (1, 2), (2, 3)], matrix)
+    record = CameraRecord(("a",), "guess", 1200.0, size=(1000, 700))
+    native = mapper_of("sparse").native(MappingTask(path, None, cameras={1: record}), 0)
+    native.mapper.init_max_forward_motion = 1.0
+    graph = PairGraph.read(path)
+    priors = focal_priors(graph.cameras.values(), {1: record})
+    adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
+    search = RecordingSearch(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
+    (found,) = search.best(graph)
+    assert found.reconstruction.num_reg_images() == 4
+    assert search.tried_px == pytest.approx([USUAL_FOCAL * 1000, 977.5], rel=0.02)
 
 
 def test_a_token_stops_the_search(scene: Scene, tmp_path: Path) -> None:
@@ -269,7 +304,8 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
     with open_database(path) as both:
         with open_database(parts[0]) as one, open_database(parts[1]) as other:
             pycolmap.Database.merge(one, other, both)
-        images, middle = both.read_all_images(), np.array(SIZE) / 2
+        images = both.read_all_images()
+        middle = np.array(SIZE) / 2
         enlarged = min(image.image_id for image in images if image.name.startswith("4/"))
         keypoints = both.read_keypoints(enlarged)
         keypoints[:, :2] = (keypoints[:, :2] - middle) * 1.7 + middle
@@ -289,6 +325,6 @@ def test_photographs_get_own_cameras_and_models_of_other_places_stay(tmp_path: P
     )
     assert found == pytest.approx([TRUE_FOCAL, TRUE_FOCAL, TRUE_FOCAL, 1.7 * TRUE_FOCAL], rel=0.03)
     assert small.reconstruction.num_reg_images() == 2
-    known = replace(task, before=[large, small])
+    known = replace(task, previous_models=[large, small])
     again = mapper_of("sparse").map(known, tmp_path, 0, lambda _: None)
     assert [model.reconstruction.num_reg_images() for model in again] == [4, 2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapping_tasks import task_with_given_cameras, write_images
+from mapping_tasks import task_with_given_cameras
 from numpy.typing import NDArray
+from wall_scene import is_inside, project, turned, views, wall, write_scene
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
@@ -18,73 +20,12 @@ from colmap_affrect.colmap.model_files import Poses, model_poses, pose_errors, r
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
-from colmap_affrect.mappers.reliability import judge
+from colmap_affrect.mappers.reliability import score_images
 from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
 from colmap_affrect.mappers.tie_joining import BY_HAND
-from colmap_affrect.mappers.tie_points import tie_points_of, tied_evidence
+from colmap_affrect.mappers.tie_points import ImageResidual, tie_point_log_odds, tie_points_of
 
-WIDTH, HEIGHT = 1000, 700
-MATRIX = np.array([[900.0, 0.0, 480.0], [0.0, 910.0, 360.0], [0.0, 0.0, 1.0]])
-NOISE_PX = 0.3
 MAX_SCALE_ERROR = 0.03
-
-
-def turned(about_x: float, about_y: float, about_z: float) -> NDArray[np.float64]:
-    angles = np.deg2rad([about_x, about_y, about_z])
-    return np.asarray(pycolmap.Rotation3d(angles).matrix())
-
-
-def views(count: int) -> Poses:
-    """Cameras that walk along a wall with unequal steps, up and down, and turn and roll."""
-    steps = np.cumsum([1.0, 1.3, 0.8, 1.5, 1.1, 0.9][:count])
-    found = {}
-    for i, along in enumerate(steps):
-        rotation = turned(3.0 * (-1) ** i, 9.0 - 4.0 * i, 5.0 * i)
-        center = np.array([along, 0.25 * (-1) ** i, -0.3 * i % 0.7])
-        found[f"{i}.jpg"] = rotation, -rotation @ center
-    return found
-
-
-def wall(random: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Points of two slanted planes that meet in an edge."""
-    x, y = random.uniform(-3, 9, count), random.uniform(-3, 3, count)
-    return np.stack([x, y, 7.0 + 0.35 * np.abs(x - 3.0) + 0.1 * y], axis=1)
-
-
-def write_scene(path: Path, poses: Poses, pairs: Iterable[tuple[int, int]]) -> None:
-    """Write a verified database in which each pair of images has features of its own."""
-    random = np.random.default_rng(5)
-    names = list(poses)
-    keypoints = {i: [np.zeros((0, 2))] for i in range(len(names))}
-    matches = {}
-    for first, second in pairs:
-        points = wall(random, 600)
-        seen = [project(points, poses[names[i]]) for i in (first, second)]
-        inside = np.logical_and(*(is_inside(part) for part in seen))
-        starts = [sum(map(len, keypoints[i])) for i in (first, second)]
-        for i, part in zip((first, second), seen, strict=True):
-            keypoints[i].append(part[inside] + random.normal(0, NOISE_PX, (inside.sum(), 2)))
-        rows = np.arange(inside.sum())
-        matches[first, second] = np.stack([starts[0] + rows, starts[1] + rows], axis=1)
-    with closing(pycolmap.Database.open(path)) as database:
-        camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT)
-        camera.params = MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]]
-        write_images(database, camera, names)
-        for i, parts in keypoints.items():
-            database.write_keypoints(i + 1, np.concatenate(parts).astype(np.float32))
-        for (first, second), indices in matches.items():
-            database.write_matches(first + 1, second + 1, indices.astype(np.uint32))
-    verify(path, VerificationOptions())
-
-
-def project(points: NDArray[np.float64], pose: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
-    seen = (points @ pose[0].T + pose[1]) @ MATRIX.T
-    return np.where(seen[:, 2:] > 0, seen[:, :2] / seen[:, 2:], np.nan)
-
-
-def is_inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    with np.errstate(invalid="ignore"):
-        return np.asarray(((points > 0) & (points < (WIDTH, HEIGHT))).all(axis=1))
 
 
 def mapped(path: Path, output_path: Path, **values: Any) -> list[MappedModel]:
@@ -125,7 +66,7 @@ def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path
         assert bridge.by != name
         assert bridge.num_agreeing > 0.8 * bridge.num_ratios
         assert 0.0 < bridge.scale_error_frac < MAX_SCALE_ERROR
-    (again,) = mapped(path, tmp_path / "again", before=[model])
+    (again,) = mapped(path, tmp_path / "again", previous_models=[model])
     assert again.bridges == model.bridges
 
 
@@ -201,8 +142,9 @@ def tied(
             shift = 100.0 * (moved == (f"p{number}", name))
             lines.append(f"{name},p{number},{y + 0.8 * shift:.2f},{x + 0.6 * shift:.2f}")
     table.write_text("\n".join(lines) + "\n")
-    mapped_path, output_path = path.with_name("mapped.db"), path.with_name("models")
-    tie_points = ByHand(table).copy_database(path, mapped_path)
+    mapped_path = path.with_name("mapped.db")
+    output_path = path.with_name("models")
+    tie_points = ByHand(tie_points_path=table).copy_database(path, mapped_path)
     output_path.mkdir()
     task = task_with_given_cameras(mapped_path, tie_points=tie_points)
     return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None), task
@@ -217,7 +159,7 @@ def test_lost_photograph_comes_back_by_six_points_in_two_others(tmp_path: Path) 
     residuals = tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)
     assert len(residuals) == 18
     assert residuals[0].error_px < 10.0
-    assert judge(model, task)["3.jpg"].probability > 0.8
+    assert score_images(model, task)["3.jpg"].probability > 0.8
 
 
 def test_a_mark_that_is_far_off_is_named_as_the_worst(tmp_path: Path) -> None:
@@ -258,14 +200,31 @@ def test_tie_points_of_too_few_photographs_join_nothing(tmp_path: Path) -> None:
     assert len(tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)) == 6
 
 
-def test_evidence_of_tie_points_grows_with_those_that_agree() -> None:
-    agreeing = [(f"{point}", image_id, 2.0) for point in range(6) for image_id in (1, 2, 3)]
-    assert tied_evidence(agreeing[:9])[1] == 0.0
-    assert tied_evidence(agreeing)[1] > 2.0
-    assert tied_evidence([*agreeing, ("q", 1, 50.0), ("q", 2, 1.0), ("q", 3, 1.0)])[2] > 2.0
-    wrong = [(f"{point}", image_id, 20.0 * image_id) for point in "qrs" for image_id in (0, 1, 2)]
-    assert tied_evidence(wrong)[2] < -5.0 < tied_evidence(wrong)[0]
+def marked(points: str, image_ids: Iterable[int], error_px: float) -> list[ImageResidual]:
+    """Residuals of points, by the letters of their names, that are the same in all images."""
+    found = []
+    for point in points:
+        for image_id in image_ids:
+            found.append(ImageResidual(point, image_id, error_px))
+    return found
+
+
+def test_log_odds_of_tie_points_grow_with_those_that_agree() -> None:
+    agreeing = marked("abcdef", (1, 2, 3), 2.0)
+    assert tie_point_log_odds(agreeing[:9])[1] == 0.0
+    assert tie_point_log_odds(agreeing)[1] > 2.0
+    one_wrong = [ImageResidual("q", 1, 50.0), *marked("q", (2, 3), 1.0)]
+    assert tie_point_log_odds([*agreeing, *one_wrong])[2] > 2.0
+    wrong = marked("qrs", [0], 0.0) + marked("qrs", [1], 20.0) + marked("qrs", [2], 40.0)
+    assert tie_point_log_odds(wrong)[2] < -5.0 < tie_point_log_odds(wrong)[0]
+
+
+def test_many_tie_points_make_a_pose_hardly_surer_than_six_do() -> None:
+    six = tie_point_log_odds(marked("abcdef", (1, 2, 3), 2.0))[1]
+    many = tie_point_log_odds(marked("abcdefghijklmnopqrst", (1, 2, 3), 2.0))[1]
+    assert many == six
+    assert 0.9 < 1.0 / (1.0 + math.exp(-many)) < 0.95  # twelve of thirteen are right
 
 
 def test_two_photographs_alone_prove_nothing() -> None:
-    assert tied_evidence([(f"{point}", i, 0.0) for point in range(8) for i in (1, 2)]) == {}
+    assert tie_point_log_odds(marked("abcdefgh", (1, 2), 0.0)) == {}

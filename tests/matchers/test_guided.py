@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.affine import project, rotation, transform_lafs
 from colmap_affrect.geometry.epipolar import EpipolarModel, HomographyModel, PairModel
-from colmap_affrect.matchers.guided import GuidedOptions, guided_matches, nearest_allowed
+from colmap_affrect.matchers.guided import GuidedOptions, guided_matches, match_near_geometry
 
 HOMOGRAPHY = np.array([[0.7, -0.25, 190.0], [0.2, 0.9, 40.0], [2e-4, -1e-4, 1.0]])
-OPTIONS, NONE = GuidedOptions(), np.zeros((0, 2), int)
+OPTIONS = GuidedOptions()
+NONE = np.zeros((0, 2), int)
 CAMERA = np.array([[500.0, 0, 310], [0, 480, 260], [0, 0, 1]])
 
 
@@ -40,8 +41,8 @@ def random_pair(seed: int, counts: tuple[int, int] = (600, 450)) -> tuple[Arrays
         descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
         descriptors[1] = descriptors[0]
         found.append((descriptors.astype(np.float32), rng.uniform(0, size, (count, 2))))
-    (descriptors1, points1), (descriptors2, points2) = found
-    return (descriptors1, descriptors2), (points1, points2)
+    descriptors, points = zip(*found, strict=True)
+    return descriptors, points
 
 
 def compared_with_everything(
@@ -66,29 +67,30 @@ def compared_with_everything(
 def test_bands_miss_nothing(translation: tuple[float, float, float]) -> None:
     descriptors, points = random_pair(3)
     model = EpipolarModel(fundamental(translation), points)
-    found = nearest_allowed(descriptors, model, OPTIONS)
+    found = match_near_geometry(descriptors, model, OPTIONS)
     assert len(found) > 20
     errors = model.errors(*(index.ravel() for index in np.indices((600, 450))))
     allowed = errors.reshape(600, 450) <= 3.0
     assert_array_equal(found, compared_with_everything(descriptors, points[1], allowed))
 
 
-def test_places_of_a_homography_miss_nothing() -> None:
+def test_positions_of_a_homography_miss_nothing() -> None:
     descriptors, points = random_pair(6, (900, 2000))
     model = HomographyModel(HOMOGRAPHY, points)
-    found = nearest_allowed(descriptors, model, GuidedOptions(band_px=10.0))
+    found = match_near_geometry(descriptors, model, GuidedOptions(band_px=10.0))
     assert len(found) > 20
     errors = np.linalg.norm(project(HOMOGRAPHY, points[0])[:, None] - points[1], axis=2)
     assert_array_equal(found, compared_with_everything(descriptors, points[1], errors <= 20.0))
 
 
-def test_points_without_a_place_match_nothing() -> None:
+def test_points_without_a_position_match_nothing() -> None:
     descriptors, (points1, points2) = random_pair(3)
-    points1[5:300], points2[7:90] = np.nan, np.nan
+    points1[5:300] = np.nan
+    points2[7:90] = np.nan
     points = points1, points2
     epipolar = EpipolarModel(fundamental((1, 0.2, 0.1)), points)
     for model in (epipolar, HomographyModel(HOMOGRAPHY, points)):
-        found = nearest_allowed(descriptors, model, GuidedOptions(band_px=6.0))
+        found = match_near_geometry(descriptors, model, GuidedOptions(band_px=6.0))
         assert len(found)
         assert np.isfinite(points1[found[:, 0]]).all()
         assert np.isfinite(points2[found[:, 1]]).all()
@@ -97,7 +99,8 @@ def test_points_without_a_place_match_nothing() -> None:
 def plane() -> tuple[Arrays, HomographyModel]:
     """200 features of a plane that two photographs see, with descriptors of their own."""
     rng = np.random.default_rng(8)
-    descriptors, points1 = rng.normal(size=(200, 64)), rng.uniform(0, (640, 480), (200, 2))
+    descriptors = rng.normal(size=(200, 64))
+    points1 = rng.uniform(0, (640, 480), (200, 2))
     descriptors = descriptors / np.linalg.norm(descriptors, axis=1)[:, None]
     same = descriptors.astype(np.float32)
     return (same, same), HomographyModel(HOMOGRAPHY, (points1, project(HOMOGRAPHY, points1)))
@@ -120,19 +123,47 @@ def test_inliers_stay_and_matches_are_one_to_one() -> None:
 def test_where_as_much_is_found_beside_a_geometry_nothing_is_proven(kind: type[PairModel]) -> None:
     descriptors, points = random_pair(4, (2000, 2500))
     model = kind(HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1)), points)
-    options, inliers = GuidedOptions(band_px=6.0), np.array([[3, 7], [9, 1]])
-    assert len(nearest_allowed(descriptors, model, options)) > 20
+    options = GuidedOptions(band_px=6.0)
+    inliers = np.array([[3, 7], [9, 1]])
+    assert len(match_near_geometry(descriptors, model, options)) > 20
     assert_array_equal(guided_matches(descriptors, None, model, inliers, options), inliers)
 
 
-def test_frames_that_turn_otherwise_match_nothing() -> None:
+def test_accidental_matches_are_counted_near_the_geometry() -> None:
+    descriptors, (points1, points2) = random_pair(4, (2000, 2500))
+    # A surface of 120 px that repeats itself: farther away there is nothing.
+    surface = (points1 / (640.0, 480.0) * 120.0, points2 / (900.0, 350.0) * 120.0)
+    model = HomographyModel(np.eye(3), surface)
+    assert len(match_near_geometry(descriptors, model, OPTIONS)) > 20
+    assert_array_equal(guided_matches(descriptors, None, model, NONE, OPTIONS), NONE)
+
+
+def shapes_of_plane(model: HomographyModel) -> Arrays:
+    """Shapes of LAFs on the plane, of which the first 60 are rotated in image 2."""
+    shapes1 = np.eye(2) + 0.2 * np.random.default_rng(3).normal(size=(200, 2, 2))
+    lafs = np.concatenate([shapes1, model.points[0][:, :, None]], axis=2)
+    shapes2 = transform_lafs(HOMOGRAPHY, lafs)[:, :, :2]
+    shapes2[:60] = rotation(0.9) @ shapes2[:60]
+    return shapes1, shapes2
+
+
+def test_lafs_that_rotate_otherwise_match_nothing() -> None:
     descriptors, model = plane()
-    shapes = np.eye(2) + 0.3 * np.random.default_rng(3).normal(size=(200, 2, 2))
-    frames = np.concatenate([shapes, model.points[0][:, :, None]], axis=2)
-    carried = transform_frames(HOMOGRAPHY, frames)[:, :, :2]
-    turn = np.array([[np.cos(0.9), -np.sin(0.9)], [np.sin(0.9), np.cos(0.9)]])
-    carried[:60] = turn @ carried[:60]
-    found = guided_matches(descriptors, (shapes, carried), model, NONE, OPTIONS)
+    found = guided_matches(descriptors, shapes_of_plane(model), model, NONE, OPTIONS)
+    assert_array_equal(found, np.stack([np.arange(60, 200)] * 2, axis=1))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_lafs_that_map_epipolar_lines_to_others_match_nothing(sign: float) -> None:
+    descriptors, model = plane()
+    epipole = np.array([[0.0, -1.0, 300.0], [1.0, 0.0, -9000.0], [-300.0, 9000.0, 0.0]])
+    epipolar = EpipolarModel(sign * epipole @ HOMOGRAPHY, model.points)
+    inliers = np.stack([np.arange(100, 130)] * 2, axis=1)
+    shapes = shapes_of_plane(model)
+    # A pair of lines has no direction: right matches have the sign of most inliers.
+    cosines = epipolar.cosines(inliers[:, 0], inliers[:, 1], shapes)
+    assert (cosines < 0.0).all()
+    found = guided_matches(descriptors, shapes, epipolar, inliers, OPTIONS)
     assert_array_equal(found, np.stack([np.arange(60, 200)] * 2, axis=1))
 
 
@@ -140,8 +171,10 @@ def test_frames_that_turn_otherwise_match_nothing() -> None:
 def test_models_of_smaller_images_are_those_of_their_points(kind: type[PairModel]) -> None:
     matrix = HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1))
     _, points = random_pair(3)
-    model, rows = kind(matrix, points), np.arange(100)
+    model = kind(matrix, points)
+    rows = np.arange(100)
     smaller = model.scaled(2.0, 3.0)
     assert_array_equal(smaller.points[1], points[1] / 3.0)
-    near, small = model.errors(rows, rows), smaller.errors(rows, rows)
+    near = model.errors(rows, rows)
+    small = smaller.errors(rows, rows)
     assert np.allclose(small, near / 3.0) or np.all((small > near / 3.1) & (small < near / 1.9))

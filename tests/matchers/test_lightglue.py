@@ -17,15 +17,15 @@ from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures, union
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
+from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
 from colmap_affrect.matchers.lightglue import (
     LightGlue,
     LightGlueOptions,
     load_network,
+    merged_matches,
     network_inputs,
-    points_of_view,
-    united,
+    unwarped_points,
 )
 
 SIZE = (900, 600)
@@ -63,8 +63,8 @@ def test_circles_of_a_warp_tell_where_they_were_in_it() -> None:
     warp[:2, :2] = compose_affine(0.8, 0.3, 2.5, 1.1)
     warp[:2, 2] = (35.0, -20.0)
     found = features(50, 1)
-    carried = transform_frames(np.linalg.inv(warp), found.lafs)
-    points, size = points_of_view(carried)
+    carried = transform_lafs(np.linalg.inv(warp), found.lafs)
+    points, size = unwarped_points(carried)
     factor = 12.0 / np.sqrt(np.linalg.det(carried[0, :, :2]))
     low = found.keypoints.min(axis=0)
     assert_allclose(factor * points, found.keypoints - low, atol=1e-9)
@@ -114,19 +114,20 @@ def test_views_are_matched_one_by_one_and_united(matcher: LightGlue) -> None:
 
 
 def test_of_matches_at_one_place_the_best_is_left() -> None:
-    places = np.array([[9.0, 5.0], [30.0, 7.0], [9.2, 5.1], [30.0, 40.0]])
+    points = np.array([[9.0, 5.0], [17.0, 7.0], [9.2, 5.1], [30.0, 40.0]])
     views = [
         Matches(np.array([[1, 1], [0, 0]]), np.array([0.5, 0.9], np.float32)),
         Matches(np.array([[2, 2], [3, 1]]), np.array([0.8, 0.4], np.float32)),
     ]
-    found = united(views, places, places + 100.0)
+    found = merged_matches(views, points, points + 100.0)
     assert_array_equal(found.indices, [[0, 0], [1, 1]])
     assert_array_equal(found.scores, np.float32([0.9, 0.5]))
 
 
 def test_one_place_seen_in_two_views_is_one_match(matcher: LightGlue) -> None:
     things = np.random.default_rng(0).normal(size=(40, 128))
-    image1, warp1 = features(40, 1, things=things[:40]), features(40, 1, things=things[:40])
+    image1 = features(40, 1, things=things[:40])
+    warp1 = features(40, 1, things=things[:40])
     image2 = features(80, 2, things=np.concatenate([things, things[::-1]]))
     second = replace(image2, lafs=np.concatenate([image2.lafs[:40], image2.lafs[39::-1]]))
     first = union([image1, warp1.with_rectification_id(1)])

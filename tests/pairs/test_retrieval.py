@@ -23,7 +23,8 @@ SIZE = 32
 def images_of_places(counts: list[int], seed: int) -> tuple[list[NDArray[np.float32]], list[int]]:
     """Descriptors of so many images of each place: half of an image is what the place has."""
     random = np.random.default_rng(seed)
-    images, places = [], []
+    images = []
+    places = []
     for place, count in enumerate(counts):
         structure = random.random((200, SIZE))
         for _ in range(count):
@@ -55,7 +56,8 @@ def test_images_of_one_place_find_each_other(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_vector_is_that_of_a_plain_loop() -> None:
     random = np.random.default_rng(1)
-    vocabulary, descriptors = unit_rows(random.random((5, 8))), unit_rows(random.random((40, 8)))
+    vocabulary = unit_rows(random.random((5, 8)))
+    descriptors = unit_rows(random.random((40, 8)))
     words = [
         int(np.argmin([np.linalg.norm(row - word) for word in vocabulary])) for row in descriptors
     ]

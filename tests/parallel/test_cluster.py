@@ -116,7 +116,8 @@ class KillsOneWorker(Progress):
         del count
         if self.lost_tasks:
             return
-        there, doing = self._client.has_what(), self._client.processing()
+        there = self._client.has_what()
+        doing = self._client.processing()
         tasks = {worker: [*there[worker], *doing[worker]] for worker in there}
         victim = max(tasks, key=lambda worker: len(tasks[worker]))
         self.lost_tasks = tasks[victim]
@@ -152,7 +153,8 @@ def test_cluster_that_is_lost_ends_the_run_in_one_line(
     for name, seconds in (("SILENT_S", 3.0), ("WARN_AFTER_S", 0.5), ("GIVE_UP_AFTER_S", 3.0)):
         monkeypatch.setattr(cluster_watch, name, seconds)
     with started(tmp_path, 1) as (address, processes):
-        start, found = time.monotonic(), 0
+        start = time.monotonic()
+        found = 0
 
         def work() -> None:
             nonlocal found
@@ -240,7 +242,11 @@ def extracted(photos: Path, weights: Path, tmp_path_factory: pytest.TempPathFact
     """An output folder before matching."""
     out = tmp_path_factory.mktemp("out")
     with Workspace(out).locked() as workspace:
-        extract(Context(workspace, Resources(weights, "cpu")), Inputs.of(photos), WITH_NETWORK)
+        extract(
+            Context(workspace, Resources(weights_path=weights, device="cpu")),
+            Inputs.of(photos),
+            WITH_NETWORK,
+        )
         choose_pairs(Context(workspace))
     return out
 
@@ -252,7 +258,7 @@ def matched(
     if not out.exists():
         shutil.copytree(extracted, out)
     with Workspace(out).locked() as workspace:
-        match(Context(workspace, Resources(weights, "cpu"), executor))
+        match(Context(workspace, Resources(weights_path=weights, device="cpu"), executor))
     return hdf5_content(Workspace(out).matches)
 
 
@@ -275,7 +281,7 @@ def test_threads_one_pair_alone_and_a_resumed_run_find_the_same(
 ) -> None:
     expected = matched(tmp_path / "one", extracted, weights, Threads(1))
     assert matched(tmp_path / "two", extracted, weights, Threads(2)) == expected
-    context = Context(Workspace(tmp_path / "one"), Resources(weights, "cpu"))
+    context = Context(Workspace(tmp_path / "one"), Resources(weights_path=weights, device="cpu"))
     pairs = context.listed_pairs()
     assert sum(len(found.scores) for found in context.matches.read(pairs)) > 50
     matching = Matching(

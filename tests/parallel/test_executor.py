@@ -51,7 +51,8 @@ def test_map_ordered_raises_an_error_in_its_place() -> None:
 
 
 def test_map_ordered_does_not_wait_when_it_is_interrupted() -> None:
-    may_end, ended = threading.Event(), threading.Event()
+    may_end = threading.Event()
+    ended = threading.Event()
 
     def work(_: int) -> None:
         may_end.wait(2.0)

@@ -85,7 +85,8 @@ class FailingFiles:
     """Lets the first changes of files pass and then raises: an OSError once, others for ever."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, passing: int, error: BaseException) -> None:
-        self.left, self.error = passing, error
+        self.left = passing
+        self.error = error
         for name in ("open", "replace", "unlink"):
             monkeypatch.setattr(Path, name, self._counted(getattr(Path, name)))
 
@@ -109,7 +110,8 @@ class CountedFile:
     """A file whose changes are counted before they are made."""
 
     def __init__(self, file: io.FileIO, count: Callable[[], None]) -> None:
-        self.file, self.count = file, count
+        self.file = file
+        self.count = count
 
     def __enter__(self) -> CountedFile:
         return self
@@ -149,7 +151,8 @@ def test_commit_that_ends_at_any_write_leaves_all_changes_or_none(
 ) -> None:
     path = tmp_path / "file.h5"
     before, after = grown_hdf5(path)
-    old, seen = {f"old {index}" for index in range(40)}, set()
+    old = {f"old {index}" for index in range(40)}
+    seen = set()
     for passing in range(1000):
         for left in tmp_path.glob("file.h5*"):
             left.unlink()
@@ -198,7 +201,8 @@ def test_journal_that_is_torn_or_damaged_is_left_out(
 ) -> None:
     """As after a power loss, where names may reach the disk before what is in the files."""
     path = file_beside_its_journal(tmp_path, monkeypatch)
-    whole, before = journal_of(path).read_bytes(), path.read_bytes()
+    whole = journal_of(path).read_bytes()
+    before = path.read_bytes()
     flipped = bytearray(whole)
     flipped[100] ^= 1
     lengths = (0, 1, 7, 8, 20, 31, 32, 33, 64, 4096, len(whole) - 1)

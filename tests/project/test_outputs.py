@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 import colmap_affrect
 from colmap_affrect.errors import OptionError
+from colmap_affrect.project import outputs
 from colmap_affrect.project.outputs import new_results, refuse_photographs, temporary_folder
 from colmap_affrect.project.workspace import Workspace
 
@@ -90,7 +92,8 @@ def test_nothing_is_made_beside_the_models_of_a_run(tmp_path: Path) -> None:
 
 
 def test_among_photographs_only_work_folders_are_written(tmp_path: Path) -> None:
-    photographs, names = tmp_path / "photographs", ["a.png", "side/b.png", "../c.png"]
+    photographs = tmp_path / "photographs"
+    names = ["a.png", "side/b.png", "../c.png"]
     for name in names[:2]:
         (photographs / name).parent.mkdir(parents=True, exist_ok=True)
         (photographs / name).touch()
@@ -102,6 +105,26 @@ def test_among_photographs_only_work_folders_are_written(tmp_path: Path) -> None
             refuse_photographs(target / "a.ply", names)
     work.begin()
     refuse_photographs(work.path / "export" / "a.ply", names)
+
+
+def test_folder_that_another_process_tidies_up_before_it_is_locked_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    removed = []
+
+    class Late(outputs.FileLock):
+        def __enter__(self) -> Late:
+            lock = super().__enter__()
+            if not removed:
+                removed.append(Path(self.lock_file).parent)
+                shutil.rmtree(removed[0])
+            return lock
+
+    monkeypatch.setattr(outputs, "FileLock", Late)
+    with temporary_folder(tmp_path) as folder:
+        assert folder.is_dir()
+        assert folder != removed[0]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_temporary_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from colmap_affrect.project.report import (
     ModelSummary,
     ReconstructionReport,
     StageReport,
+    as_mapped,
 )
 
 LARGE = ModelSummary(
@@ -64,7 +65,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
     assert read == {
         "status": "partial", "images_total": 5, "images_registered": 2, "num_models": 2,
         "registered_names": ["a.png", "č d.png"], "unregistered": REPORT.unregistered,
-        "doubtful": {}, "probabilities": {}, "moves": [], "guided": {},
+        "doubtful": {}, "unsure": {}, "probabilities": {}, "moves": [], "guided": {},
         "advice": [
             {"why": "it tries more", "command": "colmap-affrect run"},
             {"why": "more photographs", "command": ""},
@@ -137,6 +138,32 @@ def test_summary_says_what_cannot_be_trusted() -> None:
     text = replace(REPORT, models=(shaky,)).summary()
     assert "doubtful    a.png: held by only 9 points\n" in text
     assert "sure        1, right with a probability of 90% or more\n" in text
+
+
+def test_summary_says_why_photographs_are_not_sure() -> None:
+    why = "none of its points is seen by two other photographs"
+    names = LARGE.registered_names[:2]
+    sure = dict.fromkeys(names, 0.7)
+    two = replace(LARGE, bridges={}, probabilities=sure, unsure=dict.fromkeys(names, why))
+    text = replace(REPORT, models=(two,)).summary()
+    line = f"unsure      {names[0]}, {names[1]}: {why}"
+    assert f"sure        0, right with a probability of 90% or more\n{line}\n" in text
+
+
+def test_cameras_that_mapping_makes_one_are_said_to_be() -> None:
+    camera = {"source": "guess", "focal_px": 1000.0, "refined_px": 912.3, "why": ""}
+    cameras = [
+        {**camera, "id": 1, "names": ["a.png"]},
+        {**camera, "id": 2, "names": ["b.png"]},
+        {**camera, "id": 3, "names": ["c.png"], "source": "exif"},
+        {**camera, "id": 4, "names": ["d.png"], "refined_px": 700.0},
+        {**camera, "id": 5, "names": ["e.png"], "refined_px": None},
+    ]
+    text = replace(REPORT, cameras=tuple(cameras)).summary()
+    assert "cameras     focal lengths: 4 not known beforehand, 1 from EXIF\n" in text
+    assert "            of those not known mapping makes 2: photographs of one size share" in text
+    names = [camera["names"] for camera in as_mapped(cameras)]
+    assert names == [["a.png", "b.png"], ["c.png"], ["d.png"], ["e.png"]]
 
 
 def test_long_lists_end_where_the_screen_does() -> None:

@@ -38,8 +38,10 @@ def some_features(count: int, seed: int = 0) -> LocalFeatures:
 
 def test_levels_of_other_features_are_kept_side_by_side(tmp_path: Path) -> None:
     """Shorter and longer descriptors; the photograph looked at again is no warp."""
-    store, first = FeatureStore(tmp_path / "features.h5"), some_features(4)
-    short, long = some_features(3, seed=1), some_features(2, seed=2)
+    store = FeatureStore(tmp_path / "features.h5")
+    first = some_features(4)
+    short = some_features(3, seed=1)
+    long = some_features(2, seed=2)
     short = replace(short, descriptors=short.descriptors[:, :64])
     wide = np.pad(long.descriptors, ((0, 0), (100, 0)))
     long = replace(long, descriptors=wide)

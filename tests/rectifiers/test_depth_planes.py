@@ -55,7 +55,8 @@ def plan_planes(photograph: Photograph, depth: Array, **options: object) -> Rect
 def image_mask(segment: PlanarSegment, size: tuple[int, int]) -> Mask:
     """Mask of a segment over the whole image."""
     mask = np.zeros(size[::-1], bool)
-    (left, top), (height, width) = segment.region.origin, segment.region.mask.shape
+    (left, top) = segment.region.origin
+    (height, width) = segment.region.mask.shape
     mask[top : top + height, left : left + width] = segment.region.mask
     return mask
 
@@ -87,7 +88,8 @@ def test_planar_segments_of_a_room_are_its_walls_and_floor(depth_size: tuple[int
 def test_planar_segments_align_depth_and_image_at_pixel_centres() -> None:
     # A step between two planes on a boundary of the depth map's pixels, whatever the sizes.
     walls = unit([[0.6, 0.0, -0.8], [-0.6, 0.1, -0.8]])
-    size, depth_size = (300, 200), (60, 50)
+    size = (300, 200)
+    depth_size = (60, 50)
     depth = np.where(
         np.arange(60) < 21,
         *(
@@ -222,7 +224,8 @@ def points_in(segment: int, count: int = 40) -> Array:
 def test_each_segment_is_warped_by_its_own_shapes() -> None:
     classes = [(3.0, 0.4), (4.2, 1.9)]
     shapes = np.concatenate([shapes_at(points_in(k), *classes[k]) for k in (0, 1)])
-    plan, segments = plan_room(shapes), room_segments()
+    plan = plan_room(shapes)
+    segments = room_segments()
     assert [item.segment_id for item in plan.items] == [0, 1]
     for item, segment, expected in zip(plan.items, segments, classes, strict=False):
         assert tilt_distance(item.tilt, item.tilt_angle_rad, *expected) < np.log(1.7)

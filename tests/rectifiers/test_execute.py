@@ -83,7 +83,8 @@ def test_extract_rectified_finds_blobs_of_a_tilted_plane_with_their_place_and_el
 
 
 def test_extract_rectified_rejects_ellipses_that_reach_beyond_the_image() -> None:
-    tilt, angle_rad = 3.0, 0.7
+    tilt = 3.0
+    angle_rad = 0.7
     shape = 3.0 * np.linalg.inv(rectifying_affine(tilt, angle_rad))
     reach = MEASUREMENT_SIGMAS * ellipse_extents(shape[None])[0]
     # A fifth more than the reach is well inside, a fifth less well out, on all four sides.

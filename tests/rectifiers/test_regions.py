@@ -9,17 +9,14 @@ from numpy.testing import assert_allclose
 from strategies import classes
 
 from colmap_affrect.data import Rectification
-from colmap_affrect.geometry.affine import project, rectifying_affine, transform_frames
+from colmap_affrect.geometry.affine import project, rectifying_affine, transform_lafs
 from colmap_affrect.geometry.planes import fronto_parallel_homography
 from colmap_affrect.geometry.tilts import metrics_from_tilts, unit_metrics
 from colmap_affrect.rectifiers.base import AffineWarpOptions
-from colmap_affrect.rectifiers.regions import (
-    CANVAS_RATIO,
-    MARGIN_PX,
-    Region,
-    homography_rectification,
-)
+from colmap_affrect.rectifiers.regions import Region, homography_rectification
 
+MARGIN_PX = 16.0  # around a region
+CANVAS_RATIO = 2.0  # area of the canvas of a homography over that of the region
 CAMERA = np.array([[300.0, 0.0, 95.0], [0.0, 320.0, 70.0], [0.0, 0.0, 1.0]])
 
 
@@ -88,7 +85,7 @@ def test_homography_rectification_fits_the_region_and_is_twice_as_large(
     assert_allclose(relative[2, :2], 0.0, atol=1e-9)
     assert_allclose(relative[:2, :2], relative[0, 0] * np.eye(2), atol=1e-6 * relative[0, 0])
     unit = np.concatenate([np.eye(2), pixels(region).mean(axis=0)[:, None]], axis=1)
-    jacobian = transform_frames(item.rectified_from_image, unit[None])[0, :, :2]
+    jacobian = transform_lafs(item.rectified_from_image, unit[None])[0, :, :2]
     assert_allclose(
         metrics_from_tilts(item.tilt, item.tilt_angle_rad), unit_metrics(jacobian), atol=1e-6
     )

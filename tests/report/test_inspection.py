@@ -10,10 +10,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import texture, write_image
 
-from colmap_affrect.data import Photograph, Rectification, RectificationPlan
+from colmap_affrect.data import LocalFeatures, Photograph, Rectification, RectificationPlan
 from colmap_affrect.errors import ImageError
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.report.inspection import PALETTE, WIDTH_PX, inspect_image, inspect_level, tinted
+from colmap_affrect.report.inspection import inspect_image, inspect_level, tinted
+from colmap_affrect.report.sheets import PALETTE, WIDTH_PX, Panel, rgb
 from colmap_affrect.session import context
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
@@ -47,13 +48,14 @@ def test_level_has_the_plan_and_the_features_of_extraction(
     extractor: ImageExtractor, photo: Path, tmp_path: Path
 ) -> None:
     photograph, _ = extractor.photograph(photo)
-    level, plan = inspect_level(extractor, photograph, 0), extractor.plan(photograph)[0]
+    level = inspect_level(extractor, photograph, 0)
+    plan, _ = extractor.plan(photograph)
     features = extractor.extract_file(photo).features
     assert len(level.plan.items) == len(plan.items) > 0
     assert_array_equal(level.features.lafs, features.lafs)
     kept = np.bincount(level.features.rectification_ids, minlength=len(plan.items) + 1)
-    assert set(level.seen) == set(range(len(plan.items) + 1))
-    assert all(kept[number] <= len(found) for number, (_, found) in level.seen.items())
+    assert set(level.detected) == set(range(len(plan.items) + 1))
+    assert all(kept[number] <= len(found) for number, (_, found) in level.detected.items())
     said = inspect(extractor, photo, tmp_path / "new" / "out")
     assert f"{len(plan.items)} warp" in said
     assert f"{len(features)} features" in said
@@ -102,12 +104,24 @@ def test_names_of_every_kind_are_written_and_drawn(
     assert (tmp_path / "Ausgabe ä" / "a $x^{$ ü 漢字-inspection.png").exists()
 
 
+def test_features_are_ellipses_of_two_sigmas() -> None:
+    """The LAF of a feature is that of six sigmas."""
+    lafs = np.array([[[30.0, 0.0, 49.5], [0.0, 15.0, 49.5]]])
+    features = LocalFeatures(lafs, np.ones(1, np.float32), np.zeros((1, 0), np.float32))
+    panel = Panel.fit(np.zeros((100, 100), np.uint8), 2)
+    scale = len(panel.image) / 100
+    panel.draw_features(features, [(255, 0, 0)], 1)
+    rows, columns = np.nonzero(panel.image[:, :, 0])
+    assert np.ptp(columns) == pytest.approx(2 * 10 * scale, abs=3)
+    assert np.ptp(rows) == pytest.approx(2 * 5 * scale, abs=3)
+
+
 def test_region_is_tinted_where_it_lies() -> None:
     region = np.ones((50, 120), bool)
     item = Rectification(np.eye(3), SIZE, region, 2.0, 0.3, region_origin=(150, 20))
     photograph = Photograph(np.full(SIZE[::-1], 100, np.uint8), "photo.png", None, np.eye(3))
     image = tinted(photograph, RectificationPlan(SIZE, (item,)))
-    color = np.array([int(PALETTE[0][k : k + 2], 16) for k in (1, 3, 5)])
+    color = np.array(rgb(PALETTE[0]))
     is_tinted = np.zeros(SIZE[::-1], bool)
     is_tinted[20:70, 150:270] = True
     assert_allclose(image[is_tinted], np.tile(0.55 * 100 + 0.45 * color, (6000, 1)), atol=1)

@@ -21,7 +21,7 @@ from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.report.run_page import RunContent, write_run_page
 
 pytestmark = [needs_chromium, pytest.mark.long]
 
@@ -152,11 +152,12 @@ def test_models_are_chosen_from_a_list_and_seen_beside_each_other(
     running: Browser, tmp_path: Path
 ) -> None:
     make_run_page(tmp_path)
-    workspace, report = Workspace(tmp_path / "out"), small_report(tmp_path)
+    workspace = Workspace(tmp_path / "out")
+    report = small_report(tmp_path)
     (first,) = report.models
     shutil.copytree(workspace.sparse / "0", workspace.sparse / "1")
     both = replace(report, models=(first, replace(first, doubtful={})))
-    running.open(write_run_page(workspace, both, NAMES, {}, None))
+    running.open(write_run_page(workspace, both, RunContent(NAMES, {})))
     shown = "return [...document.querySelectorAll('#model figure')].map((one) => !one.hidden)"
     assert running.run(shown) == [True, False]
     running.click('[data-shows="1"]')

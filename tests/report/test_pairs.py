@@ -21,26 +21,16 @@ from small_run import small_report
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.by_hand import NOTHING, ByHand
 from colmap_affrect.colmap.database import keypoint_counts, open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
 from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.stores import GuidedPair
 from colmap_affrect.report import pairs
-from colmap_affrect.report.inspection import WIDTH_PX
-from colmap_affrect.report.pairs import (
-    BY_HAND,
-    COLORS,
-    GUIDED,
-    LEARNED,
-    OTHERS,
-    OWN,
-    REJECTED,
-    WARPED,
-    KnownPair,
-    PairReader,
-    draw_matches,
-)
+from colmap_affrect.report.pair_choice import pairs_to_check
+from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
+from colmap_affrect.report.pairs import COLORS, draw_matches
+from colmap_affrect.report.sheets import WIDTH_PX, rgb
 from colmap_affrect.stages.map import agreements
 
 NAMES = ("a.png", "b.png", "c.png", "d.png", "e.png", "f.png")
@@ -49,36 +39,41 @@ PHOTOGRAPHS = [np.zeros((height, width, 3), np.uint8) for width, height in SIZES
 SIDE = WIDTH_PX // 2 - 4  # longest side of what is drawn of a photograph
 
 
-def known(first: Any, second: Any, kinds: Any) -> KnownPair:
-    places = [np.asarray(points, np.float64) for points in (first, second)]
-    return KnownPair(SIZES, places, np.asarray(kinds), "")
+def matched(first: Any, second: Any, kinds: Any) -> MatchedPair:
+    points = [np.asarray(side, np.float64) for side in (first, second)]
+    return MatchedPair(SIZES, points, np.asarray(kinds, np.int64), "")
 
 
 def test_lines_join_the_matches_in_the_colours_of_their_kinds() -> None:
     """One photograph is wide and one high: their scales differ."""
-    pair = known([(100.0, 30.0), (390.0, 290.0)], [(30.0, 150.0), (140.0, 10.0)], [OWN, GUIDED])
+    pair = matched(
+        [(100.0, 30.0), (390.0, 290.0)],
+        [(30.0, 150.0), (140.0, 10.0)],
+        [MatchKind.OWN, MatchKind.GUIDED],
+    )
     drawn = draw_matches(pair, PHOTOGRAPHS)
     assert drawn.shape == (SIDE, WIDTH_PX, 3)
-    scales, far = (SIDE / 400, SIDE / 300), np.full(drawn.shape[:2], np.inf)
-    rows, columns = np.indices(far.shape)
-    for index, kind in enumerate((OWN, GUIDED)):
-        first, second = (pair.places[side][index] * scales[side] - 0.5 for side in (0, 1))
+    scales = (SIDE / 400, SIDE / 300)
+    distances = np.full(drawn.shape[:2], np.inf)  # of pixels from the nearest line
+    rows, columns = np.indices(distances.shape)
+    for index, kind in enumerate((MatchKind.OWN, MatchKind.GUIDED)):
+        first, second = (pair.points[side][index] * scales[side] - 0.5 for side in (0, 1))
         second[0] += WIDTH_PX // 2
         for share in (0.0, 0.3, 1.0):
             x, y = np.rint(first + share * (second - first)).astype(int)
             around = drawn[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3).astype(int)
-            assert np.abs(around - COLORS[kind]).sum(axis=1).min() < 30
+            assert np.abs(around - rgb(COLORS[kind])).sum(axis=1).min() < 30
         normal = np.array([first[1] - second[1], second[0] - first[0]])
         normal /= np.linalg.norm(normal)
         offsets = (columns - first[0]) * normal[0] + (rows - first[1]) * normal[1]
-        far = np.minimum(far, np.abs(offsets))
+        distances = np.minimum(distances, np.abs(offsets))
     drawn[int(scales[0] * 300) :, : WIDTH_PX // 2] = 0  # white below the wide photograph
     drawn[:, SIDE : WIDTH_PX // 2] = drawn[:, WIDTH_PX // 2 + int(scales[1] * 150) :] = 0
-    assert far[drawn.any(axis=2)].max() < 6
+    assert distances[drawn.any(axis=2)].max() < 6
 
 
 def test_photographs_that_were_shrunk_get_the_same_lines() -> None:
-    pair = known([(100.0, 30.0)], [(30.0, 150.0)], [WARPED])
+    pair = matched([(100.0, 30.0)], [(30.0, 150.0)], [MatchKind.WARPED])
     small = [np.ascontiguousarray(image[::2, ::2]) for image in PHOTOGRAPHS]
     np.testing.assert_array_equal(draw_matches(pair, small), draw_matches(pair, PHOTOGRAPHS))
 
@@ -89,11 +84,11 @@ def test_numbers_of_lines_are_bounded_for_inliers_and_the_others(
 ) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(pairs.cv2, "line", lambda *given: drawn.append(given[3]))
-    kinds = [OWN] * count + [REJECTED] * 3 * count
+    kinds = [MatchKind.OWN] * count + [MatchKind.REJECTED] * 3 * count
     points = np.full((len(kinds), 2), 40.0)
-    draw_matches(known(points, points, kinds), PHOTOGRAPHS)
-    for kind, num in ((OWN, count), (REJECTED, 3 * count)):
-        assert drawn.count(COLORS[kind]) == min(num, 200)
+    draw_matches(matched(points, points, kinds), PHOTOGRAPHS)
+    for kind, num in ((MatchKind.OWN, count), (MatchKind.REJECTED, 3 * count)):
+        assert drawn.count(rgb(COLORS[kind])) == min(num, 200)
 
 
 class Stores(SimpleNamespace):
@@ -164,14 +159,14 @@ def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned
         inliers = np.asarray(database.read_two_view_geometry(*ids).inlier_matches, np.int64)
         points = [np.asarray(database.read_keypoints(i)[:, :2]) for i in ids]
         raw = {tuple(row) for row in database.read_matches(*ids).tolist()}
-    expected = np.where((inliers % 2).any(axis=1), WARPED, OWN)
-    expected[(inliers >= 60).any(axis=1)] = LEARNED
-    expected[[tuple(row) not in raw for row in inliers.tolist()]] = GUIDED
-    assert np.count_nonzero(expected == GUIDED) == 1
-    np.testing.assert_array_equal(pair.kinds, [*expected, REJECTED, BY_HAND])
-    np.testing.assert_allclose(pair.places[1][: len(inliers)], points[1][inliers[:, 1]])
+    expected = np.where((inliers % 2).any(axis=1), MatchKind.WARPED, MatchKind.OWN)
+    expected[(inliers >= 60).any(axis=1)] = MatchKind.LEARNED
+    expected[[tuple(row) not in raw for row in inliers.tolist()]] = MatchKind.GUIDED
+    assert np.count_nonzero(expected == MatchKind.GUIDED) == 1
+    np.testing.assert_array_equal(pair.kinds, [*expected, MatchKind.REJECTED, MatchKind.BY_HAND])
+    np.testing.assert_allclose(pair.points[1][: len(inliers)], points[1][inliers[:, 1]])
     marks = [(10.0 + image_id, 20.0) for image_id in ids]
-    np.testing.assert_allclose([places[-1] for places in pair.places], marks)
+    np.testing.assert_allclose([places[-1] for places in pair.points], marks)
     count = len(inliers)
     assert pair.text == (
         f"{count} raw matches of level 1 (second), {count} inliers, 100% of them agree with the "
@@ -184,12 +179,12 @@ def test_of_the_database_of_another_program_inliers_are_of_one_kind(scene: Path)
     stores.workspace.sparse = scene / "none"
     reader = PairReader(scene / "database.db", stores)
     pair = reader.read(NAMES[2:4])
-    assert set(pair.kinds.tolist()) == {OTHERS, REJECTED}
+    assert set(pair.kinds.tolist()) == {MatchKind.FOREIGN, MatchKind.REJECTED}
     assert "model" not in pair.text
     stores = Stores(scene, ["match"])
     stores.counts[NAMES[3]] += 1  # the database has others than the run
     pair = PairReader(scene / "database.db", stores).read(NAMES[2:4])
-    assert set(pair.kinds.tolist()) == {OTHERS, REJECTED, BY_HAND}
+    assert set(pair.kinds.tolist()) == {MatchKind.FOREIGN, MatchKind.REJECTED, MatchKind.BY_HAND}
     with pytest.raises(OptionError, match=r"c\.jpg: no such photograph \(did you mean 'c\.png'"):
         reader.read(("c.jpg", NAMES[3]))
     with pytest.raises(OptionError, match="never matched"):
@@ -221,14 +216,6 @@ def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
         assert share < 0.5 if NAMES[0] in pair else share > 0.95
 
 
-def chosen(
-    report: Any, verified: Any, by_hand: ByHand = NOTHING, shares: Any = None, guided: Any = ()
-) -> dict[tuple[str, str], str]:
-    context: Any = SimpleNamespace(by_hand=by_hand, guided=SimpleNamespace(read=lambda: guided))
-    reader: Any = SimpleNamespace(context=context, shares=shares or {})
-    return pairs._chosen(reader, report, verified)
-
-
 def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
     model = ModelSummary(tuple("abcdef"), 9, 2.0, 0.5, doubtful={"f": "why"})
     report = replace(small_report(tmp_path), models=(model,), unregistered={"g": "not registered"})
@@ -236,10 +223,10 @@ def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
         ("a", "b"): 900, ("b", "c"): 800, ("c", "d"): 50, ("d", "e"): 40, ("a", "f"): 30,
         ("e", "f"): 20, ("f", "g"): 60, ("a", "c"): 700,
     }  # fmt: skip
-    guided = [SimpleNamespace(names=("b", "c"), exact=range(500), num_inliers=800)]
-    guided += [SimpleNamespace(names=("a", "b"), exact=range(500), num_inliers=0)]
-    shares = {("a", "c"): 0.1, ("a", "e"): 0.0, **dict.fromkeys(pairwise("abcde"), 0.9)}
-    found = chosen(report, verified, ByHand(rejected=(("e", "a"),)), shares, guided)
+    exact = np.zeros((500, 2), np.int64)
+    guided = [GuidedPair(("b", "c"), exact, 800), GuidedPair(("a", "b"), exact, 0)]
+    agreement = {("a", "c"): 0.1, ("a", "e"): 0.0, **dict.fromkeys(pairwise("abcde"), 0.9)}
+    found = pairs_to_check(report, verified, agreement, [("e", "a")], guided)
     assert found == {
         ("a", "c"): "most inliers disagree with the model",
         ("a", "e"): "rejected by hand; most inliers disagree with the model",
@@ -259,9 +246,9 @@ def test_of_many_pairs_twelve_are_shown_and_without_a_model_the_missing_ones(
     report = small_report(tmp_path)
     doubtful = dict.fromkeys(names, "why")
     whole = replace(report, models=(ModelSummary(tuple(names), 9, 2.0, 0.5, doubtful=doubtful),))
-    assert len(chosen(whole, verified)) == 12
+    assert len(pairs_to_check(whole, verified, {})) == 12
     without = replace(report, models=(), unregistered={"007.jpg": "not registered"})
-    assert chosen(without, verified) == {("006.jpg", "007.jpg"): "007.jpg is missing"}
+    assert pairs_to_check(without, verified, {}) == {("006.jpg", "007.jpg"): "007.jpg is missing"}
 
 
 def test_a_pair_of_long_names_and_of_a_read_only_folder_is_drawn(

@@ -16,7 +16,8 @@ from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.report import pictures
+from colmap_affrect.report.run_page import RunContent, inlier_matrix, write_run_page
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,9 @@ def test_everything_of_the_report_is_told(html: str) -> None:
         "colmap-affrect show-pair OUT", "model: an &lt;old&gt; one",
     ):  # fmt: skip
         assert text in html
-    assert html.index("What to doubt") < html.index("What to try next") < html.index("<main>")
+    parts = ["Low-confidence images", "What to try next", "<main>"]
+    positions = [html.index(part) for part in parts]
+    assert positions == sorted(positions)
 
 
 def test_page_loads_nothing_and_names_are_never_markup(html: str) -> None:
@@ -93,6 +96,32 @@ def test_cameras_are_where_the_model_has_them_seen_from_the_front(html: str, fol
     np.testing.assert_allclose(ratios, ratios[0], rtol=2e-3)
 
 
+def test_matrix_of_inliers_is_symmetric_and_not_there_for_many_photographs() -> None:
+    names = [f"{number}.png" for number in range(1000)]
+    data = base64.b64decode(inlier_matrix(names, {("0.png", "2.png"): 70_000}))
+    counts = np.frombuffer(data, "<u2").reshape(1000, 1000)
+    assert counts[0, 2] == counts[2, 0] == 65_535
+    assert np.count_nonzero(counts) == 2
+    assert inlier_matrix([*names, "one more.png"], {}) == ""
+
+
+@pytest.mark.parametrize(("num_photographs", "side_px"), [(1, 640), (39, 640), (1000, 126)])
+def test_thumbnails_are_smaller_the_more_photographs_a_page_has(
+    num_photographs: int, side_px: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All together have at most 12 megapixels, if they are as long as 4 to 3."""
+    asked = []
+
+    def read(_: Path, size_px: int) -> np.ndarray:
+        asked.append(size_px)
+        return np.zeros((2, 2, 3), np.uint8)
+
+    monkeypatch.setattr(pictures, "read_color", read)
+    names = [f"{number}.png" for number in range(num_photographs)]
+    assert list(pictures.thumbnails(tmp_path, names)) == names
+    assert set(asked) == {side_px}
+
+
 def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
     report = small_report(tmp_path)
     values = {
@@ -102,7 +131,7 @@ def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
         "cameras": (),
     }
     nothing = type(report)(**{**vars(report), **values})
-    path = write_run_page(Workspace(tmp_path), nothing, NAMES, {}, None)
+    path = write_run_page(Workspace(tmp_path), nothing, RunContent(NAMES, {}))
     html = path.read_text(encoding="utf-8")
     for text in (
         "Why there is no model",

@@ -20,11 +20,12 @@ from small_scene import NAMES as SCENE_NAMES
 
 from colmap_affrect.project.report import ModelSummary, Residual
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.run_page import write_run_page
+from colmap_affrect.report.run_page import RunContent, write_run_page
 
 pytestmark = [needs_chromium, pytest.mark.long]
 
-ORIENTATION, TURNED = 0x0112, 6
+ORIENTATION = 0x0112  # tag of EXIF
+TURNED = 6  # by a quarter
 LOST = "side/č.png"
 REJECTED = [f"{LOST},{name}" for name in SCENE_NAMES if name != LOST]
 CORNERS = np.array([
@@ -78,7 +79,8 @@ def browser(running: Browser, tmp_path: Path) -> Iterator[Browser]:
 
 def write_block(path: Path, size: tuple[int, int], left: int, top: int) -> None:
     """Write a dark photograph with a bright square of 8 px, which EXIF turns."""
-    image, exif = np.full(size[::-1], 40, np.uint8), Image.Exif()
+    exif = Image.Exif()
+    image = np.full(size[::-1], 40, np.uint8)
     image[top : top + 8, left : left + 8] = 255
     exif[ORIENTATION] = TURNED
     path.parent.mkdir(exist_ok=True)
@@ -98,8 +100,8 @@ def page(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     model = ModelSummary(tuple(names[:4]), 90, 3.5, 0.25, tie_points=residuals)
     report = small_report(tmp_path)
     values = {**vars(report), "models": (model,), "unregistered": dict.fromkeys(names[4:], "lost")}
-    changed, photographs = type(report)(**values), tmp_path / "photographs"
-    return write_run_page(workspace, changed, names, {}, photographs, marks=marks)
+    content = RunContent(names, {}, tmp_path / "photographs", marks)
+    return write_run_page(workspace, type(report)(**values), content)
 
 
 def until(true: Callable[[], object]) -> None:
@@ -231,8 +233,17 @@ def test_a_saved_table_can_be_opened_and_wrong_ones_say_why(browser: Browser, pa
     assert browser.run("return document.querySelector('[data-part=saved]').offsetHeight") > 0
 
 
-def places_of_corners(name: str) -> np.ndarray:
-    """(8, 2) places of ``CORNERS`` in a photograph of the small scene, px from its corner."""
+def click(browser: Browser, pane: int, point: np.ndarray) -> np.ndarray:
+    """Click next to a point of a photograph of the small scene, and return where: (2,) px."""
+    left, top, width, height = browser.run(BOX, pane)
+    scale = min(width / SCENE_SIZE[0], height / SCENE_SIZE[1])
+    in_window = np.rint([left, top] + scale * point)
+    browser.press(*in_window.tolist())
+    return (in_window - [left, top]) / scale
+
+
+def corners_in_photograph(name: str) -> np.ndarray:
+    """(8, 2) positions of ``CORNERS`` in a photograph of the small scene, px from its corner."""
     index = SCENE_NAMES.index(name)
     position = (0.55 * (index - 1.5), -0.1 * index, 0.1 * index)
     seen = (CORNERS - position) @ world_to_camera(-5.0 * (index - 1.5)).T
@@ -252,13 +263,9 @@ def test_a_lost_photograph_comes_back_by_what_was_clicked(browser: Browser, tmp_
     clicked = {}
     for photograph, pane in ((LOST, 0), (others[0], 1), (others[1], 1)):
         browser.run(CHOOSE, pane + 1, photograph)
-        for number, place in enumerate(places_of_corners(photograph), 1):
+        for number, corner in enumerate(corners_in_photograph(photograph), 1):
             browser.run(CHOOSE, 0, str(number))
-            left, top, width, height = browser.run(BOX, pane)
-            scale = min(width / SCENE_SIZE[0], height / SCENE_SIZE[1])
-            at = np.rint([left, top] + scale * place)
-            browser.press(*at.tolist())
-            clicked[str(number), photograph] = (at - [left, top]) / scale
+            clicked[str(number), photograph] = click(browser, pane, corner)
     browser.click("[data-part=save]")
     table = tmp_path / "tie-points.csv"
     until(table.exists)

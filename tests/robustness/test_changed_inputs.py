@@ -42,7 +42,8 @@ def repaint(path: Path) -> None:
 def same_size_and_time(scene: Path) -> None:
     """As programs do that keep the time of what they change."""
     path = scene / "photos" / FIRST
-    before, there = path.read_bytes(), path.stat()
+    before = path.read_bytes()
+    there = path.stat()
     write_image(path, photograph((0.3, 0.1, 0.0), 4.0))
     path.write_bytes(path.read_bytes()[: len(before)].ljust(len(before), b"\0"))
     os.utime(path, ns=(there.st_atime_ns, there.st_mtime_ns))
@@ -214,7 +215,8 @@ def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
 
     with monkeypatch.context() as patch:
         patch.setattr(f"colmap_affrect.project.stores.{step}", Mock(side_effect=KeyboardInterrupt))
-        assert stage("extract")[-1].startswith("interrupted")
+        with pytest.raises(KeyboardInterrupt):  # of which the process makes one line
+            stage("extract")
     assert stage("extract")[0] == "extract: 1 done, 1 already there, 1 with a warning"
     folders = tmp_path / "out", tmp_path / "fresh"
     for out in folders:

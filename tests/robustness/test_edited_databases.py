@@ -87,15 +87,18 @@ def again(finished: Path, out: Path, call: Call) -> Callable[[str], list[str]]:
 Again = Callable[[str], list[str]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CHANGES)
 def test_what_the_stores_hold_is_made_again(
     finished: Path, out: Path, again: Again, case: str
 ) -> None:
     CHANGES[case](out / "database.db")
     (warning,) = again("run")
-    why, kept = "was changed since the last run", out / "database.changed.db"
+    why = "was changed since the last run"
+    kept = out / "database.changed.db"
     if case == "missing":
-        why, kept = "is missing", out / "database.db"
+        why = "is missing"
+        kept = out / "database.db"
     if case in ("noise", "cut"):
         assert "database.db: cannot be used (" in warning
         why = warning.partition("database.db: ")[2].partition("; it is")[0]
@@ -139,7 +142,8 @@ def test_damaged_index_is_found_and_made_again(
 
 def test_damage_that_came_meanwhile_is_mended_by_the_next_command(out: Path, call: Call) -> None:
     """A file with the stamp of its seal is not looked through: COLMAP stumbles over the damage."""
-    path, seal = out / "database.db", out / "database.db.seal"
+    path = out / "database.db"
+    seal = out / "database.db.seal"
     harm(path, "sqlite_autoindex_images_1")
     harm(path, "two_view_geometries")
     seal.write_text(f"{seal.read_text().splitlines()[0]}\n{stamp_of(database_files(path)[:2])}\n")
@@ -181,7 +185,8 @@ def test_map_maps_a_changed_database_as_it_is(out: Path, again: Again, call: Cal
         (warning,) = again("map")
         assert f"{path}: was changed since the last run, and is mapped as it is" in warning
     assert database_content(path) == changed
-    kept, other = out / "database.changed.db", ["--output-path", out.with_name("other")]
+    kept = out / "database.changed.db"
+    other = ["--output-path", out.with_name("other")]
     assert f"'colmap-affrect map --from-database {kept} --output-path OTHER'" in again("verify")[0]
     assert len(database_content(path)["inliers"]) == 3
     assert call("map", "-q", "--from-database", kept, *other).code == 0
@@ -190,6 +195,7 @@ def test_map_maps_a_changed_database_as_it_is(out: Path, again: Again, call: Cal
     assert (ended.code, len(ended.stderr)) == (1, 1)
 
 
+@pytest.mark.long
 def test_copies_are_made_again_from_the_original(
     finished: Path, tmp_path: Path, call: Call
 ) -> None:

@@ -66,7 +66,9 @@ RECIPES = [(recipe_folder() / f"{name}.toml").read_bytes() for name in recipe_na
 def test_damaged_files_are_taken_or_refused(
     tmp_path: Path, name: str, read: Callable[[Path], None], valid: list[bytes], count: int
 ) -> None:
-    chance, path, refused = random.Random(1), tmp_path / name, 0
+    chance = random.Random(1)
+    path = tmp_path / name
+    refused = 0
     path.write_bytes(valid[0])
     read(path)
     for _ in range(count):

@@ -81,10 +81,12 @@ def test_hostile_rows_are_one_line(
 def test_panoramas_are_refused_before_anything_is_recorded(
     healthy: Path, path: Path, call: Call
 ) -> None:
-    model, params = pycolmap.CameraModelId.EQUIRECTANGULAR.value, np.array([320.0, 240.0])
+    model = pycolmap.CameraModelId.EQUIRECTANGULAR.value
+    params = np.array([320.0, 240.0])
     query = f"UPDATE cameras SET model = {model}, params = ? WHERE camera_id = 2"
     execute(path, (query, [params.tobytes()]))
-    out, photos = path.parent / "out", healthy.parent / "photos"
+    out = path.parent / "out"
+    photos = healthy.parent / "photos"
     given = ["--output-path", out, "--image-path", photos]
     for command in (["extract", *given], ["run", *given], ["map", *given[:2]]):
         ended = call(*command, "-q", "--from-database", path)
@@ -134,12 +136,14 @@ CAMERA_SIZE = (1600, 1200)
 def test_random_matches_are_rejected(
     tmp_path: Path, count: int, num_pairs: int, prior: bool
 ) -> None:
-    rng, path = np.random.default_rng([count, prior]), tmp_path / "database.db"
+    rng = np.random.default_rng([count, prior])
+    path = tmp_path / "database.db"
     camera = pycolmap.Camera.create_from_model_name(
         1, "SIMPLE_RADIAL", 1.2 * CAMERA_SIZE[0], *CAMERA_SIZE
     )
     camera.has_prior_focal_length = prior
-    lafs, same = np.zeros((count, 2, 3)), np.stack([np.arange(count)] * 2, axis=1)
+    lafs = np.zeros((count, 2, 3))
+    same = np.stack([np.arange(count)] * 2, axis=1)
     with open_database(path) as database:
         image_ids = range(1, 2 * num_pairs + 1)
         write_images(database, camera, map(str, image_ids))
@@ -156,7 +160,8 @@ def test_random_matches_are_rejected(
 def test_database_without_images_is_one_line(healthy: Path, path: Path, call: Call) -> None:
     execute(path, *(f"DELETE FROM {table}" for table in ("images", "keypoints", "frame_data")))
     execute(path, "DELETE FROM matches", "DELETE FROM two_view_geometries")
-    photos, out = healthy.parent / "photos", path.with_name("out")
+    photos = healthy.parent / "photos"
+    out = path.with_name("out")
     for command in ("run", "extract"):
         given = ["--image-path", photos, "--output-path", out, "--from-database", path]
         ended = call(command, "-q", *given)

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -76,9 +76,11 @@ class Case:
     @cached_property
     def calls(self) -> dict[str, list[int]]:
         """For each kind of call that changes files of the run, which ones of its thread do so."""
-        out, trace = self.folder / "traced", self.folder / "trace.txt"
+        out = self.folder / "traced"
+        trace = self.folder / "trace.txt"
         run_traced(["-y", "-s", "0", "-o", trace], self.arguments(out))
-        counts, found = Counter[tuple[str, str]](), defaultdict[str, list[int]](list)
+        counts = Counter[tuple[str, str]]()
+        found = defaultdict[str, list[int]](list)
         for line in trace.read_text(encoding="utf-8", errors="replace").splitlines():
             if called := re.match(r"(\d+) +(\w+)[(]", line):
                 counts[called[1], called[2]] += 1
@@ -124,6 +126,38 @@ def end_after(delay_s: float, number: signal.Signals, arguments: Sequence[str], 
     return process.returncode != 0
 
 
+def wait_until_signals_are_put_off(pid: int) -> None:
+    """Wait until the first function of the command runs; before that Python starts."""
+    blocked = 0
+    while not blocked & 1 << signal.SIGINT - 1:
+        status = Path(f"/proc/{pid}/status").read_text()
+        blocked = int(re.search(r"^SigBlk:\t(\w+)", status, re.MULTILINE)[1], 16)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell what is put off")
+@pytest.mark.parametrize("send", [os.kill, os.killpg])
+@pytest.mark.parametrize("times", [1, 2])
+def test_interrupt_while_a_command_starts_ends_it_at_once_with_one_line(
+    photos: Path, tmp_path: Path, send: Callable[[int, int], None], times: int
+) -> None:
+    """After delays up to 0.6 s, most of them while packages are loaded."""
+    for number in range(30 * TIMES):
+        out = tmp_path / str(number)
+        arguments = ["run", "--image-path", photos, "--output-path", out, *FAST]
+        with start(*arguments, start_new_session=True) as process:
+            wait_until_signals_are_put_off(process.pid)
+            time.sleep(0.6 * number / (30 * TIMES - 1))
+            sent = time.monotonic()
+            for _ in range(times):
+                send(process.pid, signal.SIGINT)
+                time.sleep(0.03)
+            _, stderr = process.communicate(timeout=60)
+        assert time.monotonic() - sent < 3.0
+        assert process.returncode == 130, stderr
+        lines = [line for line in stderr.splitlines() if not line.startswith("extract: ")]
+        assert lines == ["interrupted; run the same command again to go on"], number
+
+
 def run_traced(options: Sequence[object], arguments: Sequence[str]) -> int:
     """Run under ``strace`` and return the exit code."""
     command = ["strace", "-f", "-qq", *map(str, options), "-e", f"trace={CALLS}"]
@@ -155,7 +189,9 @@ def cases(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Case]:
 def test_runs_ended_again_and_again_have_the_results_of_an_undisturbed_one(
     cases: list[Case], tmp_path: Path, number: int
 ) -> None:
-    case, chance, out = cases[number % 2], random.Random(number), tmp_path / "out"
+    case = cases[number % 2]
+    chance = random.Random(number)
+    out = tmp_path / "out"
     for index, sent in enumerate(SIGNALS):
         # What is done stays done: later runs are nearer to their end.
         delay_s = chance.uniform(0.0, case.worked_s / (index + 1))
@@ -171,7 +207,10 @@ def test_runs_ended_again_and_again_have_the_results_of_an_undisturbed_one(
 def test_runs_killed_when_they_enter_a_system_call_lose_nothing(
     cases: list[Case], tmp_path: Path, number: int
 ) -> None:
-    case, chance, out, code = cases[number % 2], random.Random(number), tmp_path / "out", 0
+    case = cases[number % 2]
+    chance = random.Random(number)
+    out = tmp_path / "out"
+    code = 0
     while not code:
         shutil.rmtree(out, ignore_errors=True)
         kind = chance.choice(sorted(case.calls))
@@ -192,7 +231,8 @@ def mounted(*command: object) -> bool:
 def test_runs_on_full_disks_go_on_when_these_have_grown(
     cases: list[Case], tmp_path: Path, number: int
 ) -> None:
-    case, disk = cases[number % 2], tmp_path / "disk"
+    case = cases[number % 2]
+    disk = tmp_path / "disk"
     assert case.worked_s
     needed = sum(p.stat().st_size for p in (case.folder / "out").rglob("*") if p.is_file())
     num_kib = random.Random(number).randrange(8, needed // 1024)
@@ -233,7 +273,9 @@ def assert_says_what_to_do(ended: Ended, path: Path) -> None:
 def test_hdf5_write_that_fails_loses_nothing_else(
     cases: list[Case], tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, passing: int
 ) -> None:
-    workspace, calls, commit = Workspace(tmp_path / "out"), [], FileTransaction.commit
+    workspace = Workspace(tmp_path / "out")
+    calls = []
+    commit = FileTransaction.commit
 
     def full(changes: FileTransaction) -> None:
         calls.append(changes)

@@ -51,7 +51,8 @@ def test_nothing_is_written_outside_the_output_folder(tmp_path: Path, call: Call
 
 def test_features_of_somebody_else_lead_nowhere(tmp_path: Path, call: Call) -> None:
     # A group that is a link to another file, in a file of features that was tampered with.
-    photos, out = tmp_path / "photos", tmp_path / "out"
+    photos = tmp_path / "photos"
+    out = tmp_path / "out"
     write_photographs(photos, 2)
     run = ["run", "--image-path", photos, "--output-path", out, *FAST]
     assert call(*run).code == 0
@@ -69,7 +70,8 @@ def test_features_of_somebody_else_lead_nowhere(tmp_path: Path, call: Call) -> N
 def test_any_name_of_a_file_comes_through_or_is_left_out_with_a_line(
     tmp_path: Path, call: Call
 ) -> None:
-    photos, out = tmp_path / "photos", tmp_path / "out"
+    photos = tmp_path / "photos"
+    out = tmp_path / "out"
     write_photographs(photos, 2)
     image = (photos / "a.png").read_bytes()
     taken = ["\u202etxt.png", "=1+1.png", "\U0001f600 \u200d.png", "-rf.png"]

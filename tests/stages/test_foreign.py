@@ -50,11 +50,11 @@ def test_database_with_descriptors_alone_is_matched_and_mapped(
 ) -> None:
     names = names_of(unmatched)
     before = unmatched.read_bytes()
-    report = colmap_affrect.map_from_database(unmatched, tmp_path / "out", page=False)
+    report = colmap_affrect.map_database(unmatched, tmp_path / "out", page=False)
     assert report.registered_names == tuple(names)
     assert report.num_verified_pairs == NUM_IMAGES * (NUM_IMAGES - 1) // 2
     assert unmatched.read_bytes() == before
-    again = colmap_affrect.map_from_database(unmatched, tmp_path / "out", page=False)
+    again = colmap_affrect.map_database(unmatched, tmp_path / "out", page=False)
     assert [stage.num_done for stage in again.stages] == [0, 0]
 
 
@@ -62,7 +62,7 @@ def test_listed_pairs_alone_are_matched_by_descriptors(unmatched: Path, tmp_path
     names = names_of(unmatched)
     listed = tmp_path / "pairs.txt"
     listed.write_text(f"{names[0]} {names[1]}\n{names[1]} {names[2]}\n", encoding="utf-8")
-    report = colmap_affrect.map_from_database(
+    report = colmap_affrect.map_database(
         unmatched, tmp_path / "out", match_list_path=listed, page=False
     )
     assert report.num_verified_pairs == 2
@@ -74,7 +74,7 @@ def test_database_without_matches_and_descriptors_is_refused(
     with open_database(unmatched) as database:
         database.clear_descriptors()
     with pytest.raises(DatabaseError, match="has no matches, nor descriptors to match by"):
-        colmap_affrect.map_from_database(unmatched, tmp_path / "out", page=False)
+        colmap_affrect.map_database(unmatched, tmp_path / "out", page=False)
 
 
 @pytest.mark.parametrize("match_type", ["raw", "inliers"])
@@ -92,19 +92,19 @@ def test_list_of_matches_is_mapped_with_the_keypoints_of_a_database(
     given.write_text("\n".join(lines), encoding="utf-8")
     with open_database(unmatched) as database:
         database.clear_descriptors()
-    report = colmap_affrect.map_from_database(
+    report = colmap_affrect.map_database(
         unmatched, tmp_path / "out", matches_path=given, match_type=match_type, page=False
     )
     assert len(report.registered_names) == NUM_IMAGES
     assert report.stages[0].num_done == (6 if match_type == "raw" else 0)
     given.write_text("\n".join(lines[: lines.index("") + 1]), encoding="utf-8")
-    report = colmap_affrect.map_from_database(
+    report = colmap_affrect.map_database(
         unmatched, tmp_path / "out", matches_path=given, match_type=match_type, page=False
     )
     assert report.num_verified_pairs == 1  # the copy is made anew
     given.write_text("a b\n0 0\n", encoding="utf-8")
     with pytest.raises(StoreError, match="line 1: 'a b' is not two names"):
-        colmap_affrect.map_from_database(unmatched, tmp_path / "other", matches_path=given)
+        colmap_affrect.map_database(unmatched, tmp_path / "other", matches_path=given)
 
 
 def test_cameras_are_given_for_the_database_of_another_program(
@@ -117,7 +117,7 @@ def test_cameras_are_given_for_the_database_of_another_program(
         encoding="utf-8",
     )
     cameras = CameraOptions(cameras_path=str(table))
-    colmap_affrect.map_from_database(verified, tmp_path / "out", cameras=cameras, page=False)
+    colmap_affrect.map_database(verified, tmp_path / "out", cameras=cameras, page=False)
     workspace = Workspace(tmp_path / "out")
     records = {
         record.names[0]: record for record in read_camera_records(workspace.cameras).values()
@@ -157,7 +157,7 @@ def test_cameras_that_do_not_fit_are_refused_before_anything_is_made(
     table = tmp_path / "cameras.csv"
     table.write_text("name,focal_px,model\n" + row.replace("NAME", names_of(verified)[0]))
     with pytest.raises(OptionError, match=message):
-        colmap_affrect.map_from_database(
+        colmap_affrect.map_database(
             verified, tmp_path / "out", cameras=CameraOptions(cameras_path=str(table))
         )
     assert not (tmp_path / "out").exists()
@@ -169,15 +169,13 @@ def test_cameras_of_a_model_that_is_extended_are_not_called_unknown(
     with open_database(verified) as database:
         first = database.read_all_images()[0]
     model = tmp_path / "first" / "sparse" / "0"
-    colmap_affrect.map_from_database(verified, tmp_path / "first", page=False)
+    colmap_affrect.map_database(verified, tmp_path / "first", page=False)
     found = pycolmap.Reconstruction(model)
     found.deregister_frame(found.find_image_with_name(first.name).frame_id)
     (tmp_path / "old").mkdir()
     found.write(tmp_path / "old")
-    extension = colmap_affrect.Extension(tmp_path / "old")
-    report = colmap_affrect.map_from_database(
-        verified, tmp_path / "out", extend=extension, page=False
-    )
+    extension = colmap_affrect.Extension(model_path=tmp_path / "old")
+    report = colmap_affrect.map_database(verified, tmp_path / "out", extend=extension, page=False)
     assert report.added == (first.name,)
     line = "focal lengths: 3 of the model that is extended, 1 not known beforehand"
     assert line in report.summary()

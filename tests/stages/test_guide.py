@@ -99,7 +99,8 @@ def test_sets_that_hang_together_are_left_alone(before: Workspace, context: Cont
 
 
 def test_only_images_in_need(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
-    every, in_need = set(context.verified_inliers()), {NAMES[1]}
+    every = set(context.verified_inliers())
+    in_need = {NAMES[1]}
     monkeypatch.setattr(stage, "weakly_connected_images", lambda *_: in_need)
     assert guide(context).num_done == 3
     assert {pair.names for pair in context.guided.read()} == {p for p in every if NAMES[1] in p}
@@ -146,7 +147,8 @@ def test_killed_before_the_geometries_are_written_it_goes_on(
 
 
 def same_inliers(first: Context, second: Context) -> None:
-    one, other = first.verified_inliers(), second.verified_inliers()
+    one = first.verified_inliers()
+    other = second.verified_inliers()
     assert one.keys() == other.keys()
     for pair, indices in one.items():
         assert_array_equal(indices, other[pair])

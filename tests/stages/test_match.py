@@ -112,10 +112,12 @@ def test_all_features_are_matched_once_a_pair_that_tied_an_image_is_not_listed(
     """Then the database has these matches, too."""
     monkeypatch.setattr(stage, "MANY_MATCHES", 140)
     monkeypatch.setattr(stage, "NUM_WELL_TIED", 1)
-    out, (a, b, c, _) = tmp_path / "out", PHOTOGRAPHS
+    out = tmp_path / "out"
+    (a, b, c, _) = PHOTOGRAPHS
     where = ["--output-path", out]
     assert call("extract", "--image-path", photos, *where, "--recipe", "rectified").code == 0
-    listed, pairs = tmp_path / "list.txt", exhaustive_pairs(PHOTOGRAPHS)
+    listed = tmp_path / "list.txt"
+    pairs = exhaustive_pairs(PHOTOGRAPHS)
     listed.write_text("".join(f"{one}\t{two}\n" for one, two in pairs), encoding="utf-8")
     assert call("pairs", *where, "--match-list-path", listed).code == 0
     assert call("match", *where, "--set", "matching.max_num_first=300").code == 0

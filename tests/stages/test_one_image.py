@@ -18,7 +18,7 @@ from synthetic import blobs, write_image
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.errors import AffrectError, DepthError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.base import FeatureOptions
 from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.photographs import CameraOptions
@@ -33,7 +33,8 @@ from colmap_affrect.stages import match, one_image
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.one_image import num_images_at_once, prepare
 
-WIDTH, HEIGHT = 480, 360
+WIDTH = 480
+HEIGHT = 360
 GRID = np.stack(np.meshgrid(np.arange(30, WIDTH - 20, 45), np.arange(30, HEIGHT - 20, 45)), -1)
 BLOBS = GRID.reshape(-1, 2) + np.random.default_rng(5).uniform(-2, 2, (GRID.size // 2, 2))
 BLOB_SIGMA_PX = 5.2
@@ -95,7 +96,8 @@ DEPTH = ["depth.kind=z", "max_image_size_px=360"]
 
 def courtyard(tmp_path: Path, num_maps: int) -> tuple[Path, Path]:
     """Two photographs and the depth maps of some of them."""
-    photos, depth = tmp_path / "photos", tmp_path / "depth"
+    photos = tmp_path / "photos"
+    depth = tmp_path / "depth"
     photos.mkdir()
     depth.mkdir()
     for name in ["court_3", "court_4"]:
@@ -126,7 +128,7 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
     photos, depth = courtyard(tmp_path, 0)
     for settings, error, message in [
         ([], OptionError, "rectifier depth-planes needs depth maps: give --depth-path"),
-        ([f"depth.path='{depth}'"], DepthError, str(depth)),
+        ([f"depth.path='{depth}'"], OptionError, str(depth)),
         ([f"depth.path='{tmp_path / 'nowhere'}'"], OptionError, "nowhere"),
     ]:
         recipe = load_recipe("depth-planes-recommended", [*DEPTH, *settings])

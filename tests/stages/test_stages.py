@@ -149,8 +149,10 @@ def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from
 def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     workspace, report = finished
     command = ("colmap-affrect", "run", "--image-path", "a b", "--output-path", "out", "-q")
-    context, (model, *_) = Context(workspace, command=command), report.models
-    lost, wanted = NAMES[0], str(workspace.path.with_name(f"{workspace.path.name}-2"))
+    context = Context(workspace, command=command)
+    (model, *_) = report.models
+    lost = NAMES[0]
+    wanted = str(workspace.path.with_name(f"{workspace.path.name}-2"))
 
     monkeypatch.setattr(Workspace, "recipe", lambda _: "rectified")
 
@@ -175,7 +177,7 @@ def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.M
     bridged = {lost: Bridge(NAMES[1], 5, 9, 0.2)}
     alone = replace(model, doubtful={lost: f"bridged by {NAMES[1]} alone"}, bridges=bridged)
     assert commands([], alone) == [f"{again} --reject-pair '{lost},{NAMES[1]}'"]
-    said = replace(context, by_hand=ByHand(Path("t.csv")), command=())
+    said = replace(context, by_hand=ByHand(tie_points_path=Path("t.csv")), command=())
     (_, tie_points, _) = advice(said, [lost], [model], 0)
     assert tie_points.why.startswith("no point of t.csv is seen by two photographs of one model")
     assert tie_points.command.startswith("colmap-affrect map --output-path ")
@@ -230,7 +232,8 @@ def test_image_whose_features_are_lost_gets_the_same_again(
 def test_other_options_than_before_are_named(copy: Workspace, photos: Path, call: Call) -> None:
     out = ["--output-path", copy.path]
     images = ["--image-path", photos]
-    cameras, seed = CAMERA_ARGUMENTS, ["--random-seed", 3]
+    cameras = CAMERA_ARGUMENTS
+    seed = ["--random-seed", 3]
     before = {path: path.read_bytes() for path in (copy.features, copy.matches, copy.config)}
     cases = [
         (["run", *images, *seed], "cameras.mode"),
@@ -249,7 +252,7 @@ def test_other_options_than_before_are_named(copy: Workspace, photos: Path, call
     ]  # fmt: skip
     for command, named in cases:
         code, stdout, stderr = call(*command, *out)
-        assert (code, stdout, len(stderr)) == (1, "", 1), stderr
+        assert (code, stdout, len(stderr)) == (2, "", 1), stderr
         assert named in stderr[0]
         assert "--overwrite" in stderr[0]
     assert {path: path.read_bytes() for path in before} == before
@@ -272,7 +275,8 @@ def test_options_survive_stage_by_stage(
     for stage in ("pairs", "match", "verify", "map"):
         ended = call(stage, "--output-path", out)
         assert ended.code == 0, ended.errors
-    workspace, now = Workspace(out), Workspace(out)
+    workspace = Workspace(out)
+    now = Workspace(out)
     assert workspace.require("match")["max_ratio"] == 0.8
     assert workspace.require("map")["init_min_num_inliers"] == 40
     changed = call("match", "--output-path", out, "--set", "matching.max_ratio=0.7", "--overwrite")
@@ -343,9 +347,9 @@ def test_features_of_another_number_than_in_the_database_are_refused(
 
 
 @pytest.mark.parametrize(("values", "message"), [
-    ({"effort": "hihg"}, "effort 'hihg' is not one of low, normal, high"),
-    ({"max_minutes": -1.0}, "max_minutes -1.0: must be at least 0"),
-    ({"max_minutes": float("nan")}, "max_minutes nan: must be at least 0"),
+    ({"effort": "hihg"}, "effort='hihg': should be 'low', 'normal' or 'high'"),
+    ({"max_minutes": -1.0}, "max_minutes=-1.0: should be greater than or equal to 0"),
+    ({"max_minutes": float("nan")}, "max_minutes=nan: should be greater than or equal to 0"),
 ])  # fmt: skip
 def test_run_options_that_mean_nothing_are_refused_at_once(
     values: dict[str, Any], message: str

@@ -25,10 +25,12 @@ def stores(
     folder: Path, points: list[NDArray[np.float64]], sizes: list[tuple[int, int]] | None = None
 ) -> tuple[FeatureStore, MatchStore, list[tuple[str, str]]]:
     """Write images whose features of one number are matched with each other."""
-    features, matches = FeatureStore(folder / "features.h5"), MatchStore(folder / "matches.h5")
+    features = FeatureStore(folder / "features.h5")
+    matches = MatchStore(folder / "matches.h5")
     names = [f"{k}.jpg" for k in range(len(points))]
     for name, places, size in zip(names, points, sizes or [SIZE] * len(points), strict=True):
-        ones, count = np.ones(len(places)), len(places)
+        ones = np.ones(len(places))
+        count = len(places)
         lafs = lafs_from_keypoints(places, 5.0 * ones, 0.0 * ones)
         descriptors = np.ones((count, 8), np.float32) / np.sqrt(8)
         features.write(name, LocalFeatures(lafs, np.float32(ones), descriptors), size)
@@ -97,7 +99,8 @@ def test_call_that_was_killed_is_repeated_to_the_same_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     features, matches, pairs = stores(tmp_path, scans(4))
-    write, written = MatchStore.write, list[str]()
+    write = MatchStore.write
+    written = list[str]()
 
     def killed(store: MatchStore, found: list[PairMatches]) -> None:
         if len(written) == 4:
@@ -122,7 +125,8 @@ def test_two_images_are_too_little_evidence(tmp_path: Path) -> None:
 
 def turned(points: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
     """Photograph points around the origin after they, or the camera, turned about it."""
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    c = np.cos(np.deg2rad(degrees))
+    s = np.sin(np.deg2rad(degrees))
     x, y, z = (points @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])).T
     noise = np.random.default_rng(int(degrees) + 100).normal(0.0, 0.2, (len(points), 2))
     return np.stack([480 + 1100 * x / (z + 4), 320 + 1100 * y / (z + 4)], axis=1) + noise

@@ -1,4 +1,4 @@
-"""Print that stands still, told from what a camera turns about."""
+"""Print is stationary, and what a camera turns about is not."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.stillness import exactness, num_moving_together
+from colmap_affrect.geometry.stationary import num_moving_together, stationary_log_ratios
 
-LIMIT_PX, TOLERANCE_PX = 5.0, 1.0
+LIMIT_PX = 5.0
+TOLERANCE_PX = 1.0
 
 
 def points(count: int) -> Array:
@@ -20,8 +21,9 @@ def noise(count: int) -> Array:
 
 
 def mean_ratio(places: Array, motions: Array) -> float:
-    small = np.linalg.norm(motions, axis=1) <= LIMIT_PX
-    return float(exactness(places[small], motions[small], TOLERANCE_PX, LIMIT_PX).mean())
+    is_small = np.linalg.norm(motions, axis=1) <= LIMIT_PX
+    ratios = stationary_log_ratios(places[is_small], motions[is_small], TOLERANCE_PX, LIMIT_PX)
+    return float(ratios.mean())
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (1.5, -1.5), (-3.0, 1.0)])
@@ -52,14 +54,15 @@ def test_most_that_agree_count_and_not_the_others() -> None:
     places = points(60)
     motions = noise(60)
     motions[::5] += (3.5, 0.0)
-    ratios = exactness(places, motions, TOLERANCE_PX, LIMIT_PX)
+    ratios = stationary_log_ratios(places, motions, TOLERANCE_PX, LIMIT_PX)
     assert ratios[::5].max() < 0.0
     assert np.median(ratios) > 1.0
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_or_no_motions_are_no_error(count: int) -> None:
-    assert exactness(points(count), noise(count), TOLERANCE_PX, LIMIT_PX).shape == (count,)
+    ratios = stationary_log_ratios(points(count), noise(count), TOLERANCE_PX, LIMIT_PX)
+    assert ratios.shape == (count,)
 
 
 def test_matches_of_an_object_move_together_and_wrong_ones_do_not() -> None:

@@ -12,10 +12,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.geometry.affine import project
-from colmap_affrect.mappers.one_view import one_views
 from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 
-WIDTH, HEIGHT = 480, 320
+WIDTH = 480
+HEIGHT = 320
 PRINT = np.array([[0.55, -0.01, 130.0], [0.01, 0.55, 40.0], [0.0, 0.0, 1.0]])
 TURNED = np.array([[0.9, 0.05, 10.0], [-0.02, 0.95, 8.0], [5e-4, 0.0, 1.0]])
 """Px of the photograph to those of its print and of another view, the corner of each at (0, 0)."""
@@ -29,13 +30,15 @@ def texture(seed: int) -> np.ndarray:
 def printed(photograph: np.ndarray, homography: np.ndarray = PRINT) -> np.ndarray:
     """A print on white paper, of half the contrast."""
     centres = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
-    moved, faded = centres @ homography @ np.linalg.inv(centres), 0.5 * photograph + 60
+    moved = centres @ homography @ np.linalg.inv(centres)
+    faded = 0.5 * photograph + 60
     return np.asarray(cv2.warpPerspective(faded, moved, (WIDTH, HEIGHT), borderValue=250.0))
 
 
 def test_prints_of_one_negative_are_one_view(tmp_path: Path) -> None:
     photographs = {"a.png": texture(1), "b.png": printed(texture(1)), "c.png": printed(texture(2))}
     photographs["d.png"] = printed(texture(1), TURNED)
+    photographs["e.png"] = printed(0.5 * texture(1) + 0.6 * texture(3))
     for name, content in photographs.items():
         cv2.imwrite(str(tmp_path / name), np.clip(content, 0, 255).astype(np.uint8))
     points = np.random.default_rng(3).uniform((20, 20), (WIDTH - 20, HEIGHT - 20), (60, 2))
@@ -46,13 +49,16 @@ def test_prints_of_one_negative_are_one_view(tmp_path: Path) -> None:
     geometry.inlier_matches = np.stack([np.arange(60, dtype=np.uint32)] * 2, axis=1)
     with open_database(tmp_path / "database.db") as database:
         write_images(database, camera, photographs)
-        for image_id, places in enumerate((points, moved, moved, project(TURNED, points)), 1):
-            database.write_keypoints(image_id, places.astype(np.float32))
-        for other in (2, 3, 4):  # of 2 and 3 the same matches; 4 is another view of the plane
+        positions = (points, moved, moved, project(TURNED, points), moved)
+        for image_id, keypoints in enumerate(positions, 1):
+            database.write_keypoints(image_id, keypoints.astype(np.float32))
+        # The matches of 2, 3 and 5 are the same; 4 is another view of the plane. Image 5 shows
+        # half of what 1 does, as a photograph of the same thing from nearby may.
+        for other in (2, 3, 4, 5):
             database.write_two_view_geometry(1, other, geometry)
     graph = PairGraph.read(tmp_path / "database.db")
-    assert one_views(graph, tmp_path) == {(1, 2)}
-    assert one_views(graph, None) == frozenset()
+    assert same_viewpoint_pairs(graph, tmp_path) == {(1, 2)}
+    assert same_viewpoint_pairs(graph, None) == frozenset()
 
 
 def test_points_that_one_view_sees_twice_are_of_two_views() -> None:

@@ -1,0 +1,180 @@
+"""How well the points of a model tell its focal lengths.
+
+Models are adjusted again with other focal lengths: where that hardly raises the cost, any focal
+length fits, and where it lowers the cost, a given one is wrong.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.mappers.adjustment import (
+    EXIF_SIGMA,
+    FINAL,
+    NOISE_PX,
+    Adjuster,
+    EarlyStop,
+    FocalPrior,
+    focal_priors,
+)
+from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.mappers.model_score import num_occupied_cells
+from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs, sampling_step
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+
+FACTORS = 1.25, 0.8
+"""Other focal lengths that are tried: with these, poses are off by 5 degrees and more (judged)."""
+MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing (judged)
+MAX_GROWTH = 1.0  # as of known focal lengths: more makes no photograph surer (judged)
+FREE_SIGMA = 1.0  # of the logarithm of a given focal length while others are tried: nearly free
+MIN_MOVE = 0.1  # of the logarithm of a given focal length, from which on another one is named
+NUM_ITERATIONS = 100  # of a trial: three times as many change growths by 4 % at most (measured)
+MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once, to save time
+MAX_NUM_IMAGES = 100  # larger models have points of many images, which tell focal lengths
+MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time
+MAX_NUM_OBSERVATIONS = 3_000
+"""The same of a model of rigs: with the poses of the sensors as unknowns, too, each observation
+takes two or three times as long."""
+MIN_COST = 1e-9  # costs are divided by
+
+
+class _FocalTrials:
+    """Adjusts a model with other focal lengths of some cameras."""
+
+    def __init__(
+        self,
+        model: pycolmap.Reconstruction,
+        priors: Mapping[int, FocalPrior],
+        refining: pycolmap.BundleAdjustmentOptions,
+        fixed: frozenset[int],
+    ) -> None:
+        """Adjust the model as it is.
+
+        Args:
+            model: Changed in place.
+            priors: Priors of the focal lengths, by camera id.
+            refining: Say which parameters of cameras are refined.
+            fixed: Ids of the cameras of which nothing is refined.
+        """
+        self.model = model
+        self.priors = priors
+        self.refining = refining
+        self.fixed = fixed
+        adjuster = Adjuster(priors, NOISE_PX, refining, fixed)
+        self.cost = max(adjuster.adjust(model, NUM_ITERATIONS), MIN_COST)
+
+    def growth(self, camera_ids: Sequence[int]) -> float:
+        """Return the part by which the cost grows, with the factor for which that is least."""
+        fixed = self.fixed.union(camera_ids)
+        adjuster = Adjuster(self.priors, NOISE_PX, self.refining, fixed)
+        least = math.inf
+        for factor in FACTORS:
+            trial = pycolmap.Reconstruction(self.model)
+            for camera_id in camera_ids:
+                camera = trial.camera(camera_id)
+                camera.params[list(camera.focal_length_idxs())] *= factor
+            early_stop = EarlyStop(self.cost, 1.0 + MAX_GROWTH, NUM_ITERATIONS)
+            cost = adjuster.adjust(trial, NUM_ITERATIONS, early_stop=early_stop)
+            least = min(least, cost / self.cost)
+            if least - 1.0 <= MIN_GROWTH:
+                break
+        return least - 1.0
+
+
+def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+    """Return by what part the cost grows with another focal length, by id of the camera.
+
+    A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
+    focal length of each uncalibrated camera, while all else may move.
+    """
+    priors = focal_priors(cameras_of(model).values(), task.cameras)
+    recorded = sorted(priors.keys() & task.cameras.keys())
+    unknown = [key for key in recorded if priors[key].sigma > EXIF_SIGMA]
+    if not unknown or not _is_tried(model):
+        return {}
+    fixed = frozenset(key for key in recorded if task.cameras[key].is_fixed)
+    is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
+    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
+    trials = _FocalTrials(with_fewer_points(model), priors, refining, fixed)
+    groups = []
+    for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
+        groups.append(keys.tolist())
+    growths = {}
+    for keys, growth in zip(
+        groups, map_ordered(trials.growth, groups, available_cores()), strict=True
+    ):
+        growths.update(dict.fromkeys(keys, growth))
+    return growths
+
+
+def fitting_focals(
+    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, FocalPrior]
+) -> dict[int, float]:
+    """Find focal lengths that fit better than those that the user gave.
+
+    Args:
+        model: It stays as it is.
+        task: Says which focal lengths were given.
+        priors: Priors of the focal lengths, by camera id.
+
+    Returns:
+        The focal lengths in px by id of the camera. None where freeing the given ones lowers the
+        cost by less than free parameters are worth (BIC): half the logarithm of the number of
+        observations each, of which those in one cell of an image count once.
+    """
+    recorded = priors.keys() & task.cameras.keys()
+    given = {key for key in recorded if "focal" in task.cameras[key].given}
+    if not given or not _is_tried(model):
+        return {}
+    free_priors = {**priors}
+    for key in given:
+        free_priors[key] = FocalPrior(priors[key].focal_px, FREE_SIGMA)
+    # A wrong focal length is made up for by distortion, where that was free.
+    constant = frozenset(key for key in given if task.cameras[key].is_fixed)
+    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
+    fixed = with_fewer_points(model)
+    fixed_cost = Adjuster(priors, NOISE_PX, refining, constant).adjust(fixed, FINAL)
+    free = with_fewer_points(model)
+    free_cost = Adjuster(free_priors, NOISE_PX, refining).adjust(free, FINAL)
+    num = _num_occupied_cells(fixed)
+    gain = (fixed_cost - free_cost) * (num / max(1, fixed.compute_num_observations()))
+    if gain < 0.5 * len(given) * np.log(max(2, num)):
+        return {}
+    found = {}
+    for key in sorted(given):
+        focal_px = float(free.cameras[key].mean_focal_length())
+        if abs(math.log(focal_px / priors[key].focal_px)) > MIN_MOVE:
+            found[key] = focal_px
+    return found
+
+
+def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return a copy with every n-th point, of ``MAX_NUM_POINTS`` at most.
+
+    A model of rigs has ``MAX_NUM_OBSERVATIONS`` at most.
+    """
+    fewer = pycolmap.Reconstruction(model)
+    ids = sorted(fewer.point3D_ids())
+    step = sampling_step(len(ids), MAX_NUM_POINTS)
+    if has_rigs(model):
+        step = max(step, sampling_step(model.compute_num_observations(), MAX_NUM_OBSERVATIONS))
+    kept = set(ids[::step])
+    for point_id in ids:
+        if point_id not in kept:
+            fewer.delete_point3D(point_id)
+    return fewer
+
+
+def _is_tried(model: pycolmap.Reconstruction) -> bool:
+    return model.num_reg_images() <= MAX_NUM_IMAGES and model.num_points3D() > 0
+
+
+def _num_occupied_cells(model: pycolmap.Reconstruction) -> int:
+    """Return how many cells of all images hold observations."""
+    num = 0
+    for image_id, camera in cameras_of(model).items():
+        seen = [p.xy for p in model.images[image_id].get_observation_points2D()]
+        num += num_occupied_cells(camera, np.array(seen).reshape(-1, 2))
+    return num

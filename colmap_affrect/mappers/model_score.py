@@ -1,0 +1,142 @@
+"""The score of a model: log-likelihood ratio of its inliers, plus the priors of its cameras.
+
+A verified pair whose images are both in the model says how many of its inliers agree with their
+poses. Pairs alone leave scales and focal lengths open, so a feature that is matched in two other
+images says whether one point explains all three. The likelihood of such a count is a beta-binomial
+distribution, one for right models and one for wrong ones. The score adds the logarithms of their
+ratios, which allow for pairs that are wrong themselves, and subtracts the costs of focal lengths.
+More images that agree raise the score; images that agree with nothing do not.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import seen_points
+from colmap_affrect.geometry.arrays import Floats, Indices
+from colmap_affrect.mappers.adjustment import FocalPrior
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of, poses_of
+
+
+@dataclass(frozen=True)
+class Beta:
+    """A beta distribution of the share of matches that agree."""
+
+    alpha: float
+    beta: float
+
+
+# Judged on models of the benchmark scenes whose poses are known, right and wrong.
+GRID = 8  # cells on a side of an image: features in one cell err together and count once
+RIGHT_PAIR = Beta(14.0, 1.0)  # inliers of a pair with right poses, 93 per cent on average
+RIGHT_TRACKS = Beta(6.0, 2.0)  # features of three images of a right model, 75 per cent
+CHANCE = Beta(2.0, 4.0)  # both of wrong models, a third
+WRONG_PAIR = 0.05  # probability that a verified pair is wrong
+MIN_SCORE_GAIN = 3.0  # log-likelihood ratio, twenty to one, by which a score is clearly higher
+
+
+@dataclass(frozen=True)
+class ModelScorer:
+    """Scores models of one database."""
+
+    graph: PairGraph
+    priors: Mapping[int, FocalPrior]  # by camera id
+    _num_cells: dict[Ids, int] = field(default_factory=dict, init=False, repr=False)
+
+    def score(self, model: pycolmap.Reconstruction) -> float:
+        """Return the score of a model, a log-likelihood ratio."""
+        poses = poses_of(model)
+        cameras = cameras_of(model)
+        total = sum(self.track_log_ratios(model).values())
+        for pair in self.graph.pairs_inside(poses):
+            num = self.num_cells(pair)
+            num_agreeing = self.graph.agreement(pair, poses, cameras) * num
+            total += pair_log_ratio(num_agreeing, num)
+        used = {camera.camera_id: camera for camera in cameras.values()}
+        costs = [self.priors[key].cost(camera.mean_focal_length()) for key, camera in used.items()]
+        return total - sum(costs)
+
+    def is_confirmed(self, model: pycolmap.Reconstruction) -> bool:
+        """Tell whether tracks of three images confirm each image of a model."""
+        log_ratios = self.track_log_ratios(model).values()
+        return min(log_ratios, default=MIN_SCORE_GAIN) >= MIN_SCORE_GAIN
+
+    def track_log_ratios(self, model: pycolmap.Reconstruction) -> dict[int, float]:
+        """Return the log-likelihood ratio of each image's features that two others match.
+
+        Cells of the image that hold such features count as often as is the share of these features
+        that observe a point seen by three images or more.
+        """
+        num_partners = self._num_partners(model)
+        points = {image_id: seen_points(model.images[image_id]) for image_id in num_partners}
+        long_tracks = _seen_by_three(points)
+        log_ratios = {}
+        for image_id, number in num_partners.items():
+            features = np.flatnonzero(number > 1)
+            keypoints = self.graph.keypoints[image_id][features]
+            num = num_occupied_cells(self.graph.cameras[image_id], keypoints)
+            is_long = np.isin(points[image_id][features], long_tracks)
+            share = is_long.mean() if num else 0.0
+            log_ratios[image_id] = _log_ratio(float(share * num), num, RIGHT_TRACKS)
+        return log_ratios
+
+    def num_cells(self, pair: VerifiedPair) -> int:
+        """Return how many cells hold inliers, in that image of a pair which has fewer."""
+        if pair.ids not in self._num_cells:
+            both = zip(pair.ids, self.graph.points(pair), strict=True)
+            counts = [num_occupied_cells(self.graph.cameras[i], points) for i, points in both]
+            self._num_cells[pair.ids] = min(counts)
+        return self._num_cells[pair.ids]
+
+    def _num_partners(self, model: pycolmap.Reconstruction) -> dict[int, Indices]:
+        """Return in how many other images of the model each feature is matched, by image id."""
+        inside = self.graph.keypoints.keys() & set(model.reg_image_ids())
+        found = {i: np.zeros(len(self.graph.keypoints[i]), np.int64) for i in sorted(inside)}
+        for pair in self.graph.pairs_inside(found):
+            for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
+                found[image_id][np.unique(features)] += 1
+        return found
+
+
+def num_occupied_cells(camera: pycolmap.Camera, points: Floats) -> int:
+    """Return how many cells of a grid over an image hold points, (N, 2) px."""
+    cells = (points / [camera.width, camera.height] * GRID).astype(int)
+    return len(np.unique(np.clip(cells, 0, GRID - 1) @ [1, GRID]))
+
+
+def pair_log_ratio(num_agreeing: float, num: float) -> float:
+    """Return the log-likelihood ratio of right poses against wrong ones, by one pair.
+
+    >>> pair_log_ratio(30, 30) > pair_log_ratio(10, 10) > 0 > pair_log_ratio(5, 30) > -3.1
+    True
+    """
+    ratio = _log_ratio(num_agreeing, num, RIGHT_PAIR)
+    return float(np.logaddexp(math.log(1.0 - WRONG_PAIR) + ratio, math.log(WRONG_PAIR)))
+
+
+def _seen_by_three(points: Mapping[int, Indices]) -> Indices:
+    """Return the ids of the points that three images or more see, of those by keypoint."""
+    ids, num_observations = np.unique(np.concatenate([*points.values(), [-1]]), return_counts=True)
+    return np.asarray(ids[(num_observations > 2) & (ids >= 0)])
+
+
+def _log_ratio(num_agreeing: float, num: float, right: Beta) -> float:
+    """Return the log-likelihood ratio of right models against wrong ones."""
+    by_right = _log_beta_binomial(num_agreeing, num, right)
+    by_chance = _log_beta_binomial(num_agreeing, num, CHANCE)
+    return by_right - by_chance
+
+
+def _log_beta_binomial(num_agreeing: float, num: float, prior: Beta) -> float:
+    """Return the log probability of a count, but for the binomial coefficient."""
+    posterior = Beta(num_agreeing + prior.alpha, num - num_agreeing + prior.beta)
+    return _log_beta(posterior) - _log_beta(prior)
+
+
+def _log_beta(shape: Beta) -> float:
+    """Return the logarithm of the beta function."""
+    both = math.lgamma(shape.alpha) + math.lgamma(shape.beta)
+    return both - math.lgamma(shape.alpha + shape.beta)

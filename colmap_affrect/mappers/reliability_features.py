@@ -1,0 +1,288 @@
+"""What the confidence in a photograph is computed from, one function for each feature.
+
+See :mod:`colmap_affrect.mappers.reliability`.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.colmap.verification import connected_parts, lone_ties
+from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
+from colmap_affrect.mappers.adjustment import focal_priors
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.focal_observability import fitting_focals, focal_growths
+from colmap_affrect.mappers.model_score import ModelScorer, pair_log_ratio
+from colmap_affrect.mappers.pair_graph import (
+    MIN_NUM_MATCHES,
+    MIN_SHARE,
+    Ids,
+    VerifiedPair,
+    cameras_of,
+    graph_of,
+    poses_of,
+    sampling_step,
+)
+from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
+from colmap_affrect.mappers.tie_points import tie_point_log_odds, tie_points_of
+
+# The terms of the regression are fitted to features that are measured with these numbers, which
+# are judged on the benchmark scenes; after a change fit again.
+MIN_TOLD = 0.03
+"""Growth of the cost with another focal length, from which on a model tells the focal length: of
+parts of photographs it is 0.15."""
+NUM_ROTATION_PAIRS = 4  # strongest pairs of a frame that are compared with a pure rotation
+MAX_ROTATION_PAIRS = 300  # the same of a model, to save time
+MAX_ROTATION_ERROR = 0.003  # longer sides, of a match that a rotation explains, as in verification
+MIN_MIRRORED_SHARE = 0.5
+"""Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
+images a tenth by chance."""
+MAX_MIRRORED_PAIRS = 1000  # looked at, all of 45 photographs; of more some copies are missed
+MIN_FOCAL_PX = 1e-9  # focal lengths are divided by
+
+
+@dataclass(frozen=True)
+class ReliabilityFeatures:
+    """What speaks for and against the pose of a photograph."""
+
+    log_likelihood_ratio: float
+    """Of right against wrong poses, by its pairs, its features that two other images match, and the
+    prior of its focal length."""
+    agreement: float  # share of the inliers of its pairs that agrees with the model
+    num_three_view_points: int  # points that it and two others see
+    focal_growth: float
+    """Part by which the cost of adjustment grows with another focal length; 1 of a known one."""
+    focal_px: float  # of its camera
+    fitting_focal_px: float  # what fits, where the focal length that the user gave does not; else 0
+    pure_rotation_ratio: float
+    """Share of the matches without parallax, of the strongest pairs of its frame with others."""
+    mirrored_original: str  # name of the photograph that it may be a mirrored copy of, or empty
+    focal_spread: float
+    """Longest by shortest focal length of the photographs of its size, of those that only the model
+    tells: parts of photographs have longer ones, and their middle is elsewhere."""
+    tie_point_log_odds: float  # of a right pose, by its tie points
+    bridge_edge: str
+    """The pair without which it and others, at most half of all, would be apart, or empty."""
+    num_bridge_inliers: int  # of that pair
+
+
+class _ModelContext:
+    """What the features of all photographs of a model have in common."""
+
+    def __init__(self, mapped: MappedModel, task: MappingTask) -> None:
+        self.task = task
+        self.model = mapped.reconstruction
+        self.graph = graph_of(task, MIN_NUM_MATCHES)
+        self.poses = poses_of(self.model)
+        self.cameras = cameras_of(self.model)
+        used = {camera.camera_id: camera for camera in self.cameras.values()}
+        self.used_cameras = used
+        self.priors = focal_priors(used.values(), task.cameras)
+        self.scorer = ModelScorer(self.graph, self.priors)
+        self.pairs = self.graph.pairs_inside(self.poses)
+        self.agreements: dict[Ids, float] = {}
+        self.pairs_of: dict[int, list[VerifiedPair]] = {i: [] for i in sorted(self.poses)}
+        for pair in self.pairs:
+            self.agreements[pair.ids] = self.graph.agreement(pair, self.poses, self.cameras)
+            for image_id in pair.ids:
+                self.pairs_of[image_id].append(pair)
+        self.pairs_of_frames = self._pairs_of_frames()
+        self.same_viewpoint = same_viewpoint_pairs(self.graph, task.image_path)
+
+    def frame_of(self, image_id: int) -> int:
+        """Return the frame of an image: all that a rig took at once is one."""
+        return self.model.images[image_id].frame_id
+
+    def _pairs_of_frames(self) -> dict[int, list[VerifiedPair]]:
+        """Return the pairs of each frame with others: poses inside a rig hold each other."""
+        found: dict[int, list[VerifiedPair]] = {self.frame_of(i): [] for i in self.pairs_of}
+        for image_id, pairs in self.pairs_of.items():
+            for pair in pairs:
+                first, second = pair.ids
+                if self.frame_of(first) != self.frame_of(second):
+                    found[self.frame_of(image_id)].append(pair)
+        return found
+
+
+def features_of(
+    mapped: MappedModel, task: MappingTask, growths: Mapping[int, float] | None = None
+) -> dict[str, ReliabilityFeatures]:
+    """Compute the features of each photograph of a model.
+
+    Args:
+        mapped: The model.
+        task: What it was made from.
+        growths: The :func:`focal_growths` of the model, or of one with a few photographs more;
+            they are computed if they are not given.
+
+    Returns:
+        The features by image name.
+    """
+    context = _ModelContext(mapped, task)
+    if growths is None:
+        growths = focal_growths(context.model, task)
+    track_log_ratios = context.scorer.track_log_ratios(context.model)
+    num_three_view_points = _num_three_view_points(context)
+    rotation_ratios = _rotation_ratios(context)
+    originals = _mirrored_originals(context)
+    fitting_focals_px = fitting_focals(context.model, task, context.priors)
+    focal_spreads = _focal_spreads(context, growths)
+    residuals = tie_points_of(task, context.graph).residuals(context.model)
+    log_odds = tie_point_log_odds(residuals)
+    bridges = _bridge_edges(context)
+    names = context.graph.names
+    found = {}
+    for image_id in context.pairs_of:
+        camera = context.cameras[image_id]
+        key = camera.camera_id
+        focal_px = float(camera.mean_focal_length())
+        log_ratio = _pair_log_ratio(context, image_id) + track_log_ratios.get(image_id, 0.0)
+        bridge = bridges.get(image_id)
+        found[names[image_id]] = ReliabilityFeatures(
+            log_likelihood_ratio=log_ratio - context.priors[key].cost(focal_px),
+            agreement=_agreement(context, image_id),
+            num_three_view_points=num_three_view_points[image_id],
+            focal_growth=growths.get(key, 1.0),
+            focal_px=focal_px,
+            fitting_focal_px=fitting_focals_px.get(key, 0.0),
+            pure_rotation_ratio=_pure_rotation_ratio(context, image_id, rotation_ratios),
+            mirrored_original=names[originals[image_id]] if image_id in originals else "",
+            focal_spread=focal_spreads.get((camera.width, camera.height), 1.0),
+            tie_point_log_odds=log_odds.get(image_id, 0.0),
+            bridge_edge=" - ".join(names[i] for i in bridge.ids) if bridge else "",
+            num_bridge_inliers=len(bridge.matches) if bridge else 0,
+        )
+    return found
+
+
+def _pair_log_ratio(context: _ModelContext, image_id: int) -> float:
+    """Return the log-likelihood ratio of an image by its pairs from other viewpoints."""
+    total = 0.0
+    for pair in context.pairs_of[image_id]:
+        if pair.ids not in context.same_viewpoint:
+            num = context.scorer.num_cells(pair)
+            total += pair_log_ratio(context.agreements[pair.ids] * num, num)
+    return total
+
+
+def _agreement(context: _ModelContext, image_id: int) -> float:
+    """Return the share of the inliers of an image's pairs that agree with the model."""
+    pairs = context.pairs_of[image_id]
+    if not pairs:
+        return 1.0
+    shares = [context.agreements[pair.ids] for pair in pairs]
+    weights = [len(pair.matches) for pair in pairs]
+    return float(np.average(shares, weights=weights))
+
+
+def _num_three_view_points(context: _ModelContext) -> Mapping[int, int]:
+    """Return the number of points of three viewpoints, by image id."""
+    viewpoint_of = dict[int, int]()
+    for first, second in sorted(context.same_viewpoint):
+        viewpoint_of[second] = viewpoint_of.get(first, first)
+    return num_long_tracks(context.model, viewpoint_of)
+
+
+def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
+    """Return the share of matches that a rotation explains, of the strongest pairs of frames."""
+    strongest = dict[Ids, VerifiedPair]()
+    for pairs in context.pairs_of_frames.values():
+        ranked = sorted(pairs, key=lambda pair: -len(pair.matches))
+        for pair in ranked[:NUM_ROTATION_PAIRS]:
+            strongest[pair.ids] = pair
+    found = {}
+    step = sampling_step(len(strongest), MAX_ROTATION_PAIRS)
+    for pair in list(strongest.values())[::step]:
+        sizes = context.graph.sizes(pair.ids)
+        max_error_px = MAX_ROTATION_ERROR * max(map(max, sizes))
+        points1, points2 = context.graph.points(pair)
+        found[pair.ids] = pure_rotation_ratio(points1, points2, sizes, max_error_px)
+    return found
+
+
+def _pure_rotation_ratio(
+    context: _ModelContext, image_id: int, ratios: Mapping[Ids, float]
+) -> float:
+    """Return the mean ratio of the pairs of an image's frame, of all pairs where it has none."""
+    with_frame = context.pairs_of_frames[context.frame_of(image_id)]
+    own = [ratios[pair.ids] for pair in with_frame if pair.ids in ratios]
+    known = own or list(ratios.values())
+    return float(np.mean(known)) if known else 0.0
+
+
+def _mirrored_originals(context: _ModelContext) -> dict[int, int]:
+    """Return the original of each mirrored copy: more matches of the others agree with it.
+
+    Those of others that have a mirrored copy themselves do not count.
+    """
+    mirrored = _mirrored_pairs(context)
+    unclear = {image_id for ids in mirrored for image_id in ids}
+    support: defaultdict[int, float] = defaultdict(float)
+    for pair in context.pairs:
+        first, second = pair.ids
+        num_agreeing = context.agreements[pair.ids] * len(pair.matches)
+        if second not in unclear:
+            support[first] += num_agreeing
+        if first not in unclear:
+            support[second] += num_agreeing
+    originals = {}
+    for ids in mirrored:
+        copy, original = sorted(ids, key=lambda image_id: support[image_id])
+        originals[copy] = original
+    return originals
+
+
+def _mirrored_pairs(context: _ModelContext) -> list[Ids]:
+    graph = context.graph
+    found = list[Ids]()
+    step = sampling_step(len(graph.pairs), MAX_MIRRORED_PAIRS)
+    for pair in graph.pairs[::step]:
+        first, second = pair.ids
+        share = mirrored_share(
+            graph.keypoints[first], graph.keypoints[second], graph.sizes(pair.ids)
+        )
+        if share >= MIN_MIRRORED_SHARE:
+            found.append(pair.ids)
+    return found
+
+
+def _focal_spreads(context: _ModelContext, growths: Mapping[int, float]) -> dict[Size, float]:
+    """Return the longest by the shortest focal length that the model tells, by image size."""
+    focals_px: defaultdict[Size, list[float]] = defaultdict(list)
+    for key, camera in context.used_cameras.items():
+        if growths.get(key, 0.0) >= MIN_TOLD:
+            focal_px = max(camera.mean_focal_length(), MIN_FOCAL_PX)
+            focals_px[camera.width, camera.height].append(focal_px)
+    return {size: max(of_size) / min(of_size) for size, of_size in focals_px.items()}
+
+
+def _bridge_edges(context: _ModelContext) -> dict[int, VerifiedPair]:
+    """Return the pair without which an image, with others, would be apart from half of all.
+
+    Of several such pairs that with fewest inliers counts.
+    """
+    agreeing = dict[Ids, VerifiedPair]()
+    for pair in context.pairs:
+        if context.agreements[pair.ids] >= MIN_SHARE:
+            agreeing[pair.ids] = pair
+    found = dict[int, VerifiedPair]()
+    ranked = sorted(lone_ties(agreeing), key=lambda ids: (-len(agreeing[ids].matches), ids))
+    for ids in ranked:
+        for image_id in _smaller_sides(agreeing.keys() - {ids}, ids):
+            found[image_id] = agreeing[ids]
+    return found
+
+
+def _smaller_sides(others: Collection[Ids], ids: Ids) -> set[int]:
+    """Return the images of the smaller component beside a pair, of both if they are equal."""
+    components = connected_parts(others)
+    sides = [component for component in components if not component.isdisjoint(ids)]
+    smallest = min(map(len, sides))
+    found = set[int]()
+    for side in sides:
+        if len(side) == smallest:
+            found |= side
+    return found

@@ -1,0 +1,218 @@
+"""The command line as a process, and what it does at Ctrl-C and SIGTERM.
+
+On Linux the command runs in a child process. The parent passes Ctrl-C and SIGTERM on. It kills the
+child at once while that still loads packages, which would answer a signal with errors of their own,
+or lose it; later where the child does not end within four seconds, as in native code that never
+returns. When native code has crashed it says so in one line. Nothing heavy is imported here.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from typing import NoReturn
+
+from colmap_affrect.errors import (
+    EXIT_INTERRUPTED,
+    INTERRUPTED,
+    MEMORY_HINT,
+    escape_what_lacks,
+    heedless_stream,
+    lacks_memory,
+    say,
+)
+from colmap_affrect.parallel.subprocesses import end_with
+
+PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
+WITHOUT_MEMORY = " (perhaps for want of memory)"
+KEPT = (
+    "run.log may say why, and what was done before is kept: run the same command again, or "
+    "'colmap-affrect doctor'"
+)
+SIGNALS = {signal.SIGINT, signal.SIGTERM}
+BEGUN = b"b"
+ENDED = b"e"
+"""What the worker tells: all is loaded and the command works; Python, not native code, ends it."""
+
+
+def run_command() -> NoReturn:
+    """Run the command line in a process of its own, where the system can do that, and end."""
+    _open_standard_streams()
+    os.umask(os.umask(0) & 0o077)  # of one that takes rights from the owner, results are lost
+    if sys.platform != "linux":  # elsewhere libraries of the system do not survive a fork
+        _work()
+    signals: list[int] = []
+
+    def stop(number: int, _: object) -> None:
+        if BEGUN not in news.heard():
+            _kill(worker, signal.SIGKILL)
+        elif signals:
+            _kill(worker, signal.SIGINT)
+        else:
+            signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+            _kill(worker, signal.SIGTERM)
+        signals.append(number)
+
+    parent = os.getpid()
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # else nobody could wait for the worker
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    news = _News()
+    try:
+        worker = os.fork()
+    except OSError:  # too many processes
+        _work()
+    if not worker:
+        end_with(parent)
+        _work_and_tell(news)
+    signal.signal(signal.SIGALRM, lambda *_: _kill(worker, signal.SIGKILL))
+    _handle(stop)
+    _, status = os.waitpid(worker, 0)
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    code = os.waitstatus_to_exitcode(status)
+    if code > 0 and code != EXIT_INTERRUPTED and not signals and ENDED not in news.heard():
+        say(f"error: native code ended the command with exit code {code}{WITHOUT_MEMORY}; {KEPT}")
+    sys.exit(_exit_code(code, signals))
+
+
+class _News:
+    """What the worker tells its parent, a byte each."""
+
+    def __init__(self) -> None:
+        self._out, self._in = os.pipe()
+        os.set_blocking(self._out, False)
+        self._heard = b""
+
+    def tell(self, what: bytes) -> None:
+        os.write(self._in, what)
+
+    def heard(self) -> bytes:
+        """Return all that has been told until now."""
+        with suppress(BlockingIOError):  # nothing new
+            self._heard += os.read(self._out, 2)
+        return self._heard
+
+
+def _open_standard_streams() -> None:
+    """Give the process those of the first three files that it was started without.
+
+    Else the next files that are opened, results perhaps, would be taken for them.
+    """
+    for number, flags in enumerate((os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, flags)  # the lowest number that is free: this one
+    if sys.stderr:  # it may have been closed
+        sys.stderr = heedless_stream(2, sys.stderr.encoding, closes=False)
+
+
+def _handle(handler: Callable[[int, object], None]) -> None:
+    """Call a function for Ctrl-C and SIGTERM, where they are not ignored as in the background."""
+    for number in SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+
+def _kill(worker: int, number: int) -> None:
+    with suppress(ProcessLookupError):  # it has just ended
+        os.kill(worker, number)
+
+
+def _exit_code(code: int, signals: list[int]) -> int:
+    """Return the exit code of the command, and say why it ended where it could not do that."""
+    if code >= 0:
+        return 128 + signals[0] if signals and code else code
+    if signals:
+        say(INTERRUPTED)
+        return 128 + signals[0]
+    cause = WITHOUT_MEMORY if code == -signal.SIGKILL else ""
+    say(f"error: ended by {signal.Signals(-code).name}{cause}; {KEPT}")
+    return 1
+
+
+def _work_and_tell(news: _News) -> NoReturn:
+    """Run the command line, and tell when it ends, as native code that ends it does not."""
+    try:
+        _work(lambda: news.tell(BEGUN))
+    finally:
+        news.tell(ENDED)
+
+
+def _leave(*_: object) -> NoReturn:
+    """End at once: what was done before is kept, as after a kill."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    say(INTERRUPTED)
+    os._exit(EXIT_INTERRUPTED)
+
+
+class _Interrupts:
+    """Raises the first signal as an exception; another Ctrl-C ends the process."""
+
+    def __init__(self) -> None:
+        self.signals: list[int] = []
+
+    def take(self, number: int, _: object) -> None:
+        """Handle a signal."""
+        if number == signal.SIGTERM and self.signals:
+            return  # of the first process, for a Ctrl-C that came here, too
+        if self.signals:
+            _leave()
+        self.signals.append(number)
+        raise KeyboardInterrupt
+
+
+def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
+    """Run the command in this process.
+
+    The first Ctrl-C or SIGTERM is raised as an exception, so that the command can tidy up; another
+    Ctrl-C ends it at once. Both are put off while packages are loaded, where a parent is told when
+    that has come to an end; else they end the process at once.
+    """
+    interrupts = _Interrupts()
+    code: int | str | None
+
+    def begin() -> None:
+        if tell_begin:
+            tell_begin()
+        _handle(interrupts.take)
+
+    for stream in (sys.stdout, sys.stderr):
+        escape_what_lacks(stream)
+    try:
+        if not tell_begin:
+            _handle(_leave)
+        from colmap_affrect.cli import main
+
+        code = main(begin=begin)
+    except SystemExit as end:  # argparse has shown help
+        code = end.code
+    except (KeyboardInterrupt, Exception) as error:
+        # Libraries turn a KeyboardInterrupt in their callbacks into errors of their own.
+        if interrupts.signals or isinstance(error, KeyboardInterrupt):
+            _leave()  # at once: threads may be in the middle of something long
+        elif lacks_memory(error):  # already for loading what is needed
+            say(f"error: {MEMORY_HINT}")
+            code = 1
+        else:
+            raise
+    _end(code)
+
+
+def _end(code: int | str | None) -> NoReturn:
+    """End this process, and do not mind that nobody reads what is printed any more."""
+    for number in SIGNALS:  # too late to change anything
+        signal.signal(number, signal.SIG_IGN)
+    try:
+        if sys.stdout:  # it may have been closed
+            sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it again
+        if not code and not isinstance(error, BrokenPipeError):
+            say(f"error: what the command prints cannot be written ({error.strerror})")
+            code = 1
+    sys.exit(code)

@@ -1,0 +1,151 @@
+"""The matches of a pair of photographs, and what a run knows of each of them."""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.by_hand import require_known
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.errors import OptionError, StoreError
+from colmap_affrect.geometry.arrays import Array, Indices, rows_in
+from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.session.context import Context
+from colmap_affrect.stages.map import agreements
+
+
+class MatchKind(IntEnum):
+    """Where a match is from; of its two features the one with the higher kind decides."""
+
+    OWN = 0  # an inlier of features that were detected in the photographs themselves
+    WARPED = 1  # an inlier with a feature of a warp
+    LEARNED = 2  # an inlier with a feature that has no affine shape
+    GUIDED = 3  # an inlier that is no raw match: guided matching found it
+    BY_HAND = 4  # a tie point
+    FOREIGN = 5  # an inlier of features that are not those of the run
+    REJECTED = 6  # a raw match that is no inlier
+
+
+@dataclass(frozen=True)
+class MatchedPair:
+    """The matches of two photographs."""
+
+    sizes: list[tuple[int, int]]  # (width, height) of the photographs in px
+    points: list[Array]  # (N, 2) px from the upper left corner of each photograph
+    kinds: Indices  # (N,) values of MatchKind
+    text: str  # how many there are, of which level, and how many agree with the model
+
+
+class PairReader:
+    """Reads pairs of a database, with what the stores and the model of a run know."""
+
+    def __init__(self, path: Path, context: Context) -> None:
+        """Read the model of a run, and how its pairs agree with it.
+
+        Args:
+            path: the database.
+            context: of the run; its folder need not have anything.
+        """
+        workspace = context.workspace
+        model_path = workspace.sparse / "0"
+        has_stores = "match" in workspace.begun and not workspace.is_changed
+        self.path = path
+        self.run = context if has_stores else None
+        self.model = (
+            read_given_model(model_path) if model_path.exists() else pycolmap.Reconstruction()
+        )
+        self.agreement = agreements(path, self.model)  # share of inliers, by verified pair
+
+    def read(self, names: Pair) -> MatchedPair:
+        """Read a pair; OptionError for photographs that are not there or were never matched."""
+        sizes = []
+        keypoints = []
+        with open_database(self.path) as database:
+            images = {image.name: image for image in database.read_all_images()}
+            for name in names:
+                require_known(name, images)
+                camera = database.read_camera(images[name].camera_id)
+                sizes.append((camera.width, camera.height))
+                rows = database.read_keypoints(images[name].image_id)
+                keypoints.append(np.asarray(rows[:, :2], np.float64))
+            ids = (images[names[0]].image_id, images[names[1]].image_id)
+            raw = np.asarray(database.read_matches(*ids), np.int64).reshape(-1, 2)
+            geometry = database.read_two_view_geometry(*ids)
+            is_matched = database.exists_matches(*ids)
+        inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+        tie_points = self._tie_points(names, keypoints)
+        num_tie_points = len(tie_points[0])
+        if not is_matched and not len(inliers) and not num_tie_points:
+            raise OptionError(f"{names[0]}, {names[1]}: never matched; give another pair")
+        kinds = self._feature_kinds(names, keypoints, inliers)
+        kinds[(kinds != MatchKind.FOREIGN) & ~rows_in(inliers, raw)] = MatchKind.GUIDED
+        rejected = raw[~rows_in(raw, inliers)]
+        matches = np.concatenate([inliers, rejected])
+        return MatchedPair(
+            sizes,
+            [np.concatenate([keypoints[k][matches[:, k]], tie_points[k]]) for k in (0, 1)],
+            np.concatenate(
+                [
+                    kinds,
+                    np.full(len(rejected), MatchKind.REJECTED),
+                    np.full(num_tie_points, MatchKind.BY_HAND),
+                ]
+            ),
+            self._text(names, len(raw), len(inliers)),
+        )
+
+    def _feature_kinds(self, names: Pair, keypoints: list[Array], matches: Indices) -> Indices:
+        """Return the kinds of matches by their features: foreign if these are not of the run.
+
+        Args:
+            names: of the photographs.
+            keypoints: (N, 2) of the database, by photograph.
+            matches: (M, 2) features.
+        """
+        kinds = np.full(len(matches), MatchKind.OWN)
+        for side, name in enumerate(names):
+            ids = self.run.features.read(name).rectification_ids if self.run else ()
+            if not self.run or len(ids) != len(keypoints[side]):  # another program changed it
+                return np.full(len(matches), MatchKind.FOREIGN)
+            feature_kinds = np.where(ids, MatchKind.WARPED, MatchKind.OWN)
+            for level, rows in self.run.features.level_ranges(name).items():
+                if not self.run.extraction.levels[level].features.has_shapes:
+                    feature_kinds[rows.start : rows.stop] = MatchKind.LEARNED
+            kinds = np.maximum(kinds, feature_kinds[matches[:, side]])
+        return kinds
+
+    def _tie_points(self, names: Pair, keypoints: list[Array]) -> list[Array]:
+        """Return the tie points of a pair, (T, 2) px from the upper left corner by photograph.
+
+        The model has them as keypoints behind those of the database (``colmap/by_hand``).
+        """
+        marks: list[dict[int, Array]] = [{}, {}]  # by the id of their 3D point
+        for side, name in enumerate(names):
+            image = self.model.find_image_with_name(name)
+            for point in image.points2D[len(keypoints[side]) :] if image else ():
+                if point.has_point3D():
+                    marks[side][point.point3D_id] = point.xy
+        points: list[list[Array]] = [[], []]
+        for point_id in marks[0]:
+            if point_id in marks[1]:
+                points[0].append(marks[0][point_id])
+                points[1].append(marks[1][point_id])
+        return [np.array(points[0]).reshape(-1, 2), np.array(points[1]).reshape(-1, 2)]
+
+    def _text(self, names: Pair, num_raw: int, num_inliers: int) -> str:
+        """Return how many matches a pair has, of which level, and what the model says."""
+        text = f"{num_raw} raw matches"
+        if self.run:
+            pair = (min(names), max(names))
+            with suppress(StoreError):  # another program has matched the pair, and not the run
+                level = self.run.matches.levels([pair])[pair]
+                text += f" of level {level} ({self.run.extraction.levels[level].name})"
+        text += f", {num_inliers} inliers"
+        share = self.agreement.get(names, self.agreement.get(names[::-1]))
+        if share is not None:
+            text += f", {share:.0%} of them agree with the model"
+        return text

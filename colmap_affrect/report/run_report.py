@@ -1,0 +1,161 @@
+"""What a run returns: its report, its models, and how a notebook shows it."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
+from colmap_affrect.errors import NoModelError, OptionError, shown
+from colmap_affrect.options import documented
+from colmap_affrect.project.report import ModelSummary, ReconstructionReport
+from colmap_affrect.project.workspace import Workspace
+
+MAX_ROWS = 200  # photographs in the table of a notebook; report.json has all
+
+
+@documented
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RunReport(ReconstructionReport):
+    """The report of a run, with the output folder that it is about."""
+
+    output_path: Path
+    """Folder of all results."""
+
+    @property
+    def page_path(self) -> Path | None:
+        """The page to look at, ``report.html``; None where none was written."""
+        page = Workspace(self.output_path).page
+        return page if page.is_file() else None
+
+    def reconstruction(self, number: int = 0) -> pycolmap.Reconstruction:
+        """Return a model as pycolmap has it.
+
+        Args:
+            number: of the model, 0 is the largest; its folder is ``sparse/NUMBER``.
+
+        Returns:
+            The model, read from its files anew each time.
+
+        Raises:
+            NoModelError: where the run has found none.
+            OptionError: for a number that no model has.
+        """
+        if not self.models:
+            raise NoModelError(self.why_no_model)
+        if number not in range(len(self.models)):
+            raise OptionError(f"number={number!r}: the models are 0 to {len(self.models) - 1}")
+        return pycolmap.Reconstruction(Workspace(self.output_path).sparse / str(number))
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the content of ``report.json``."""
+        content = super().to_mapping()
+        del content["output_path"]  # a folder may be moved
+        return content
+
+    def __repr__(self) -> str:
+        registered = f"{len(self.registered_names)} of {self.images_total} images"
+        where = str(self.output_path)
+        return (
+            f"RunReport(registered={registered!r}, status={self.status!r}, output_path={where!r})"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: counts, photographs, what to try next."""
+        counts = {
+            "photographs in the model": f"{len(self.registered_names)} of {self.images_total}",
+            "verified pairs": f"{self.num_verified_pairs:,} of {self.num_pairs:,}",
+        }
+        if self.models:
+            model = self.models[0]
+            unsure = len(model.registered_names) - len(model.sure) - len(model.doubtful)
+            counts |= {
+                "sure": f"{len(model.sure)}",
+                "unsure": f"{unsure}",
+                "doubtful": f"{len(model.doubtful)}",
+                "points": f"{model.num_points3D:,}",
+                "reprojection error": f"{model.mean_reprojection_error_px:.2f} px",
+            }
+        parts = [
+            f"<p><strong>{_text(self._headline())}</strong></p>",
+            _table([], [[_text(key), _text(value)] for key, value in counts.items()]),
+            self._photographs(),
+            *(_advice(one.why, one.command) for one in self.advice),
+            f"<p>{self._link()}</p>",
+        ]
+        return f"<div>{''.join(parts)}</div>"
+
+    def _headline(self) -> str:
+        registered = f"{len(self.registered_names)} of {self.images_total} photographs registered"
+        return self.why_no_model or registered
+
+    def _photographs(self) -> str:
+        """Return a folded table of the photographs and what became of each."""
+        rows = []
+        model = self.models[0] if self.models else None
+        for name in self.registered_names:
+            chance = model.probabilities.get(name) if model else None
+            percent = "" if chance is None else f"{chance:.0%}"
+            why = model.doubtful.get(name, "") if model else ""
+            rows.append([_text(name), percent, _text(f"doubtful: {why}" if why else "registered")])
+        rows += [[_text(name), "", _text(why)] for name, why in self.unregistered.items()]
+        more = f"<p>and {len(rows) - MAX_ROWS:,} more</p>" if len(rows) > MAX_ROWS else ""
+        table = _table(["photograph", "probability", "what became of it"], rows[:MAX_ROWS])
+        return f"<details><summary>Photographs</summary>{table}{more}</details>"
+
+    def _link(self) -> str:
+        """Return where the page is, as a link where a notebook can follow it."""
+        page = self.page_path
+        if page is None:
+            return f"Results: <code>{_text(str(self.output_path))}</code>"
+        relative = os.path.relpath(page)
+        if relative.startswith(os.pardir):  # notebooks show files below their folder only
+            return f"To look at: <code>{_text(str(page))}</code>"
+        address = escape(Path(relative).as_posix(), quote=True)
+        return f'To look at: <a href="{address}" target="_blank">{_text(relative)}</a>'
+
+
+def _text(text: str) -> str:
+    return escape(shown(text))
+
+
+def _advice(why: str, command: str) -> str:
+    """Return a paragraph on what may help, with the command that does it."""
+    code = f"<pre>{_text(command)}</pre>" if command else ""
+    return f"<p>Try: {_text(why)}</p>{code}"
+
+
+def _table(titles: list[str], rows: list[list[str]]) -> str:
+    """Return a table of cells that are HTML already."""
+    head = "".join(f"<th>{title}</th>" for title in titles)
+    lines = [f"<tr>{head}</tr>"] if titles else []
+    for row in rows:
+        cells = "".join(f'<td style="text-align: left">{cell}</td>' for cell in row)
+        lines.append(f"<tr>{cells}</tr>")
+    return f"<table>{''.join(lines)}</table>"
+
+
+def cameras_of_report(
+    workspace: Workspace, models: Sequence[ModelSummary], before: Sequence[str]
+) -> tuple[dict[str, Any], ...]:
+    """Return what a report has of the cameras, as the largest model has them.
+
+    Args:
+        workspace: with the record of the cameras.
+        models: the largest first.
+        before: names of the images of the model that was extended.
+    """
+    largest = models[0] if models else None
+    found = list[dict[str, Any]]()
+    for camera_id, record in read_camera_records(workspace.cameras).items():
+        found.append(_extended(record, before).to_report(camera_id, largest))
+    return tuple(found)
+
+
+def _extended(record: CameraRecord, before: Sequence[str]) -> CameraRecord:
+    """Say of a camera that nobody knew but the model that is extended that it is from there."""
+    is_known = record.source == "guess" and not set(before).isdisjoint(record.names)
+    return replace(record, source="model", lens_mm=0.0) if is_known else record

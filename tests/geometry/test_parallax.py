@@ -1,0 +1,105 @@
+"""Lines of print, and copies of one photograph."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from colmap_affrect.geometry.affine import project, rotation
+from colmap_affrect.geometry.arrays import Array, Bytes
+from colmap_affrect.geometry.parallax import (
+    Size,
+    correlation,
+    same_view_homography,
+    text_line_matches,
+)
+
+SIZES: tuple[Size, Size] = ((1000, 800), (1000, 800))
+SHIFT_PX = np.array([20.0, 100.0])  # of a caption between two prints
+
+
+def caption(height_px: float, angle_deg: float) -> Array:
+    """Points of a line of print, 400 px long."""
+    rng = np.random.default_rng(1)
+    along = rng.uniform(0.0, 400.0, 60)
+    across = rng.uniform(-height_px / 2, height_px / 2, 60)
+    turn = rotation(np.deg2rad(angle_deg))
+    return np.stack([along, across], axis=1) @ turn.T + (300.0, 400.0)
+
+
+def noise(sigma_px: float, count: int) -> Array:
+    return np.random.default_rng(2).normal(0.0, sigma_px, (count, 2))
+
+
+def test_matches_of_a_caption_are_on_a_text_line_and_those_of_the_scene_are_not() -> None:
+    points1 = caption(height_px=6.0, angle_deg=2.0)
+    scene = np.random.default_rng(3).uniform((0, 0), (1000, 800), (30, 2))
+    others = np.random.default_rng(4).uniform((0, 0), (1000, 800), (30, 2))
+    points1 = np.concatenate([points1, scene])
+    points2 = np.concatenate([0.8 * points1[:60] + (30.0, 240.0) + noise(0.1, 60), others])
+    found = text_line_matches(points1, points2, SIZES)
+    assert np.count_nonzero(found[:60]) > 54
+    assert np.count_nonzero(found[60:]) < 3
+
+
+@pytest.mark.parametrize(
+    ("height_px", "angle_deg"), [(60.0, 0.0), (6.0, 20.0)], ids=["too high", "oblique"]
+)
+def test_thick_or_oblique_bands_are_no_text_line(height_px: float, angle_deg: float) -> None:
+    points = caption(height_px, angle_deg)
+    assert not text_line_matches(points, points + SHIFT_PX, SIZES).any()
+
+
+def test_line_of_inexact_matches_is_no_print() -> None:
+    points = caption(height_px=6.0, angle_deg=0.0)
+    found = text_line_matches(points, points + SHIFT_PX + noise(4.0, 60), SIZES)
+    assert np.count_nonzero(found) < 30
+
+
+def copies(num_wrong: int, sigma_px: float) -> tuple[Array, Array]:
+    """Matches of a photograph and a smaller print of it."""
+    points1 = np.random.default_rng(5).uniform((0, 0), (1000, 800), (200, 2))
+    points2 = 0.6 * points1 + (20.0, 30.0) + noise(sigma_px, 200)
+    points2[:num_wrong] = np.random.default_rng(6).uniform((0, 0), (700, 500), (num_wrong, 2))
+    return points1, points2
+
+
+@pytest.mark.parametrize(("sigma_px", "error_px"), [(0.05, 0.1), (2.0, 4.0)])
+def test_matches_of_a_print_have_the_homography_of_pixel_centres(
+    sigma_px: float, error_px: float
+) -> None:
+    points1, points2 = copies(10, sigma_px)
+    homography = same_view_homography(points1, points2, SIZES)
+    assert homography is not None
+    # Corners of images are at (0, 0), centres of their first pixels at (0.5, 0.5).
+    points = np.array([[99.5, 99.5], [799.5, 599.5]])
+    expected = 0.6 * (points + 0.5) + (20.0, 30.0) - 0.5
+    assert_allclose(project(homography, points), expected, atol=error_px)
+
+
+@pytest.mark.parametrize(
+    ("num_wrong", "sigma_px"), [(60, 2.0), (0, 40.0)], ids=["other matches", "parallax"]
+)
+def test_other_photographs_are_no_copies(num_wrong: int, sigma_px: float) -> None:
+    assert same_view_homography(*copies(num_wrong, sigma_px), SIZES) is None
+
+
+def gray_texture(seed: int, deviation: float) -> Bytes:
+    random = np.random.default_rng(seed).normal(size=(300, 400)).astype(np.float32)
+    smooth = cv2.GaussianBlur(random, (0, 0), 2.0)
+    return np.rint(128.0 + deviation * smooth / smooth.std()).astype(np.uint8)
+
+
+def test_copies_correlate_whatever_their_contrast_and_other_photographs_do_not() -> None:
+    photograph = gray_texture(7, 15.0)
+    shading = 60.0 * np.sin(np.arange(400) / 30.0)
+    copy = np.rint(0.8 * photograph + 30.0 + shading).clip(0, 255).astype(np.uint8)
+    assert correlation(photograph, copy, np.eye(3)) > 0.85
+    assert correlation(photograph, gray_texture(8, 15.0), np.eye(3)) < 0.3
+
+
+def test_images_without_texture_do_not_correlate() -> None:
+    faint = gray_texture(7, 3.5)
+    assert correlation(faint, faint, np.eye(3)) == 0.0

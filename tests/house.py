@@ -1,0 +1,167 @@
+"""How the code reads, in figures, and the limits that keep it readable.
+
+    python tests/house.py
+
+prints a table for the package and for the tests, and ends with exit code 1 where a limit is passed.
+`.ci/run` calls it. A code line is one with a token that is neither a comment nor a docstring. The
+limits are what the code keeps today: they may only go down.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tokenize
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+NOT_CODE = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENDMARKER,
+}
+COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
+MANY_ARGUMENTS = 3  # of a public function, from which on its docstring has a section for them
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How a folder reads."""
+
+    characters: float  # of a code line, without indentation
+    statements: float  # in 100 code lines
+    comprehensions: float  # in 1,000 code lines
+    packed_assignments: float  # a, b = x, y in 1,000 code lines
+    walruses: float  # in 1,000 code lines
+    undocumented: float  # public functions of many arguments without a section for them, per cent
+
+
+LIMITS = {
+    "colmap_affrect": Figures(
+        characters=42.8,
+        statements=83.0,
+        comprehensions=41.5,
+        packed_assignments=0.6,
+        walruses=2.1,
+        undocumented=43.5,
+    ),
+    "tests": Figures(
+        characters=46.0,
+        statements=80.0,
+        comprehensions=37.0,
+        packed_assignments=0.4,
+        walruses=0.6,
+        undocumented=100.0,
+    ),
+}
+
+
+@dataclass
+class Counts:
+    """What is counted in files."""
+
+    code_lines: int = 0
+    characters: int = 0
+    statements: int = 0
+    comprehensions: int = 0
+    packed_assignments: int = 0
+    walruses: int = 0
+    public_functions: int = 0  # of many arguments
+    undocumented: int = 0
+
+    def add_file(self, path: Path) -> None:
+        """Count what a file has."""
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        lines = path.read_text(encoding="utf-8").splitlines()
+        for number in code_lines(path, tree):
+            self.code_lines += 1
+            self.characters += len(lines[number - 1].strip())
+        for node in ast.walk(tree):
+            self.add_node(node)
+
+    def add_node(self, node: ast.AST) -> None:
+        """Count one node of a syntax tree."""
+        if isinstance(node, ast.stmt) and not is_docstring(node):
+            self.statements += 1
+        if isinstance(node, COMPREHENSIONS):
+            self.comprehensions += 1
+        elif isinstance(node, ast.NamedExpr):
+            self.walruses += 1
+        elif isinstance(node, ast.Assign) and is_packed(node):
+            self.packed_assignments += 1
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and has_many_arguments(node):
+            self.public_functions += 1
+            if "Args:" not in (ast.get_docstring(node) or ""):
+                self.undocumented += 1
+
+    def figures(self) -> Figures:
+        """Return the shares."""
+        thousand = 1000.0 / self.code_lines
+        return Figures(
+            characters=self.characters / self.code_lines,
+            statements=100.0 * self.statements / self.code_lines,
+            comprehensions=self.comprehensions * thousand,
+            packed_assignments=self.packed_assignments * thousand,
+            walruses=self.walruses * thousand,
+            undocumented=100.0 * self.undocumented / max(1, self.public_functions),
+        )
+
+
+def code_lines(path: Path, tree: ast.Module) -> Iterator[int]:
+    """Yield the numbers of the lines that have code."""
+    docstrings = set[int]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and is_docstring(node):
+            docstrings.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    used = set[int]()
+    with tokenize.open(path) as file:
+        for token in tokenize.generate_tokens(file.readline):
+            if token.type not in NOT_CODE:
+                used.update(range(token.start[0], token.end[0] + 1))
+    yield from sorted(used - docstrings)
+
+
+def is_docstring(node: ast.stmt) -> bool:
+    """Tell whether a statement is a text on its own."""
+    is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    return is_text and isinstance(node.value.value, str)
+
+
+def is_packed(node: ast.Assign) -> bool:
+    """Tell whether an assignment gives several values to several names."""
+    return isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
+
+
+def has_many_arguments(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    """Tell whether a function is public and has so many arguments that they need a section."""
+    arguments = [*node.args.args, *node.args.kwonlyargs]
+    return not node.name.startswith("_") and len(arguments) >= MANY_ARGUMENTS
+
+
+def main() -> int:
+    """Print the tables and what is above its limit."""
+    num_failures = 0
+    for folder, limits in LIMITS.items():
+        counts = Counts()
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            counts.add_file(path)
+        found = counts.figures()
+        print(f"{folder}: {counts.code_lines:,} code lines")
+        for field in fields(Figures):
+            value = getattr(found, field.name)
+            limit = getattr(limits, field.name)
+            mark = ""
+            if value > limit:
+                mark = " <- too many"
+                num_failures += 1
+            print(f"{value:7.1f}  {field.name} (at most {limit:.1f}){mark}")
+    return min(1, num_failures)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

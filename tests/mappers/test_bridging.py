@@ -1,0 +1,137 @@
+"""Bridges: images registered by one verified pair, whichever of its images the model has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mapping_tasks import SEED, mapper_of, task_with_given_cameras
+from wall_scene import views, write_scene
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import Pose, pose_errors, relative_pose
+from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster, focal_priors
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.bridging import BridgeFinder, BridgeHypothesis
+from colmap_affrect.mappers.growing import Grower, register_bridges
+from colmap_affrect.mappers.model_score import ModelScorer
+from colmap_affrect.mappers.pair_graph import PairGraph, poses_of
+from colmap_affrect.project.report import Bridge
+
+CHAIN = [(0, 1), (1, 2), (2, 3)]
+TRUTH = dict(enumerate(views(4).values(), 1))
+MIDDLE = (2, 3)  # ids of the images that the model begins with
+
+
+@pytest.fixture(scope="module")
+def grower(tmp_path_factory: pytest.TempPathFactory) -> Grower:
+    """What grows models of a chain of four images without tracks of three."""
+    path = tmp_path_factory.mktemp("chain") / "database.db"
+    write_scene(path, views(4), CHAIN)
+    task = task_with_given_cameras(path)
+    graph = PairGraph.read(path)
+    native = mapper_of("sparse").native(task, SEED)
+    priors = focal_priors(graph.cameras.values(), task.cameras)
+    fixed = frozenset(priors)
+    adjuster = Adjuster(priors, NOISE_PX, native.get_global_bundle_adjustment(), fixed)
+    return Grower(graph, adjuster, native, lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def middle(grower: Grower) -> pycolmap.Reconstruction:
+    """The model of the two images in the middle of the chain."""
+    model = grower.grow(MIDDLE)
+    assert model is not None
+    assert sorted(model.reg_image_ids()) == list(MIDDLE)
+    return model
+
+
+def scale_of(poses: dict[int, Pose], first: int, second: int) -> float:
+    """How long the step between two images is, in units of its true length."""
+    steps = [relative_pose(found[first], found[second])[1] for found in (poses, TRUTH)]
+    return float(np.linalg.norm(steps[0]) / np.linalg.norm(steps[1]))
+
+
+@pytest.mark.parametrize(("image_id", "neighbor"), [(1, 2), (4, 3)])
+def test_bridge_begins_at_the_first_or_at_the_second_image_of_a_pair(
+    grower: Grower, middle: pycolmap.Reconstruction, image_id: int, neighbor: int
+) -> None:
+    found = BridgeFinder(grower.graph, SEED).find(middle)
+    best = next(hypothesis for hypothesis in found if hypothesis.image_id == image_id)
+    assert best.bridge.by == grower.graph.names[neighbor]
+    poses = {**poses_of(middle), image_id: best.pose}
+    for other in MIDDLE:
+        estimated = relative_pose(poses[other], poses[image_id])
+        errors_deg = pose_errors(estimated, relative_pose(TRUTH[other], TRUTH[image_id]))
+        assert max(errors_deg) < 1.0
+    scale = scale_of(poses, neighbor, image_id) / scale_of(poses, *MIDDLE)
+    assert scale == pytest.approx(1.0, abs=0.03)
+
+
+def keep_points(
+    model: pycolmap.Reconstruction, image_id: int, right_px: float
+) -> pycolmap.Reconstruction:
+    """Return a copy with the points that an image sees left of a column."""
+    part = pycolmap.Reconstruction(model)
+    for keypoint in list(part.images[image_id].get_observation_points2D()):
+        if keypoint.xy[0] >= right_px:
+            part.delete_point3D(keypoint.point3D_id)
+    return part
+
+
+def bridged(grower: Grower, model: pycolmap.Reconstruction) -> set[int]:
+    found = BridgeFinder(grower.graph, SEED).find(model)
+    return {hypothesis.image_id for hypothesis in found}
+
+
+def test_depths_far_from_the_features_of_a_pair_tell_no_scale(
+    grower: Grower, middle: pycolmap.Reconstruction
+) -> None:
+    (pair,) = [pair for pair in grower.graph.pairs if pair.ids == (3, 4)]
+    left_px = grower.graph.keypoints[3][pair.matches[:, 0], 0].min()
+    near = keep_points(middle, 3, left_px + 150)
+    far = keep_points(middle, 3, left_px - 125)  # depths 120 px away may be on the same plane
+    assert far.num_points3D() > 20
+    assert 4 in bridged(grower, near)
+    assert 4 not in bridged(grower, far)
+
+
+def test_few_depths_tell_no_scale(grower: Grower, middle: pycolmap.Reconstruction) -> None:
+    ids = sorted(middle.point3D_ids())
+    few = pycolmap.Reconstruction(middle)
+    for point_id in ids[3:]:
+        few.delete_point3D(point_id)
+    assert bridged(grower, middle) == {1, 4}
+    assert bridged(grower, few) == set()
+
+
+class Trials:
+    """A finder of bridges that lead nowhere, and what tries them."""
+
+    def __init__(self, model: pycolmap.Reconstruction, number: int) -> None:
+        pose = np.eye(3), np.zeros(3)
+        camera = next(iter(model.cameras.values()))
+        bridge = Bridge("2.jpg", 10, 10, 0.01)
+        self.hypotheses = [
+            BridgeHypothesis(bridge, image_id, pose, camera, 1.0) for image_id in range(number)
+        ]
+        self.num_tried = 0
+
+    def find(self, _: pycolmap.Reconstruction) -> list[BridgeHypothesis]:
+        return self.hypotheses
+
+    def register_at(self, _: Any, __: Any, model: pycolmap.Reconstruction) -> Any:
+        self.num_tried += 1
+        return model
+
+
+def test_a_model_is_complete_after_five_bridges_in_vain(
+    grower: Grower, middle: pycolmap.Reconstruction
+) -> None:
+    trials: Any = Trials(middle, 20)
+    scorer = ModelScorer(grower.graph, grower.adjuster.priors)
+    found = register_bridges(MappedModel(middle), trials, trials, scorer)
+    assert found.reconstruction is middle
+    assert found.bridges == {}
+    assert trials.num_tried == 5

@@ -1,0 +1,47 @@
+"""The score of a model: what agreeing and contradicting pairs and tracks add to it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapping_tasks import synthesize
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.mappers.model_score import ModelScorer, num_occupied_cells, pair_log_ratio
+from colmap_affrect.mappers.pair_graph import PairGraph
+
+
+def test_an_image_has_sixty_four_cells() -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
+    points = np.random.default_rng(0).uniform(0, (640, 480), (5000, 2))
+    assert num_occupied_cells(camera, points) == 64
+    assert num_occupied_cells(camera, points[(points < (80, 60)).all(axis=1)]) == 1
+    assert num_occupied_cells(camera, np.zeros((0, 2))) == 0
+
+
+def test_one_pair_in_twenty_may_be_wrong_itself() -> None:
+    assert pair_log_ratio(0, 60) == pytest.approx(math.log(0.05), abs=0.01)
+    assert pair_log_ratio(0, 10) > math.log(0.05)
+
+
+@pytest.mark.parametrize("num", [10, 40])
+def test_a_pair_speaks_for_poses_when_four_fifths_of_it_agree_and_not_when_two_thirds_do(
+    num: int,
+) -> None:
+    assert pair_log_ratio(0.8 * num, num) > 0.0 > pair_log_ratio(0.65 * num, num)
+    assert pair_log_ratio(num, num) > 3.0
+
+
+@pytest.mark.parametrize(("num_points", "is_confirmed"), [(4, False), (60, True)])
+def test_tracks_confirm_an_image_when_chance_is_twenty_times_less_likely(
+    tmp_path: Path, num_points: int, *, is_confirmed: bool
+) -> None:
+    path = tmp_path / "database.db"
+    model = synthesize(path, num_rigs=3, num_points3D=num_points)
+    scorer = ModelScorer(PairGraph.read(path, 1), {})
+    log_ratios = scorer.track_log_ratios(model).values()
+    assert (math.exp(min(log_ratios)) > 20.0) == is_confirmed
+    assert scorer.is_confirmed(model) == is_confirmed
