@@ -16,17 +16,11 @@ from pycolmap.cost_functions import ReprojErrorCost
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX
-from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
 from colmap_affrect.colmap.model_files import all_see_long_tracks
+from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.mappers.camera_priors import DISTORTION_SIGMA, MIN_FOCAL_PX, CameraPrior
 from colmap_affrect.mappers.tie_points import NONE, TiePoints
 
-# Priors of intrinsics. The usual focal length and its deviation are judged on lenses of 25 to
-# 70 mm on 35 mm film; the deviation by EXIF covers rounding and the distance of focus.
-USUAL_FOCAL = 1.15  # longer sides of the image, the median
-USUAL_SIGMA = 0.4  # of the logarithm of an uncalibrated focal length
-EXIF_SIGMA = 0.08  # of the logarithm of a focal length by EXIF
-DISTORTION_SIGMA = 0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
-UNKNOWN_SIGMA = 1e6  # px, of parameters without a prior (the principal point)
 NOISE_PX = 0.7  # standard deviation of keypoints, judged on the benchmark scenes
 
 FAST = 15  # iterations while a model grows
@@ -44,30 +38,6 @@ TIE_POINT_LOSS_SCALE = 4.0  # in deviations of keypoints: tie points pull from f
 FIRST_STEPS = 3  # of an adjustment, which say nothing of those that follow
 SMALL_STEP = 0.001  # part of the excess over the other cost, below which a step is small
 NUM_SMALL = 3  # small steps in a row that end an adjustment
-
-
-@dataclass(frozen=True)
-class FocalPrior:
-    """What is known of a focal length."""
-
-    focal_px: float  # its median
-    sigma: float  # standard deviation of its logarithm; 0 where it is given and held
-
-    @classmethod
-    def of(cls, camera: pycolmap.Camera, record: CameraRecord | None) -> "FocalPrior":
-        """Return what is known of a camera of a database, by the record of it if there is one."""
-        focal_px = float(camera.mean_focal_length())
-        if record and "focal" in record.given:
-            return cls(focal_px, 0.0)
-        if record.source in TRUSTED if record else camera.has_prior_focal_length:
-            return cls(focal_px, EXIF_SIGMA)
-        return cls(USUAL_FOCAL * max(camera.width, camera.height), USUAL_SIGMA)
-
-    def cost(self, focal_px: float) -> float:
-        """Return how much a focal length costs, in nats."""
-        if not self.sigma:
-            return 0.0
-        return 0.5 * (math.log(max(focal_px, 1e-9) / self.focal_px) / self.sigma) ** 2
 
 
 class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
@@ -113,18 +83,45 @@ class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
         return lowest_cost >= self.enough * self.other_cost or self._num_small >= NUM_SMALL
 
 
-def focal_priors(
-    cameras: Iterable[pycolmap.Camera], records: Mapping[int, CameraRecord]
-) -> dict[int, FocalPrior]:
-    """Return the priors of the focal lengths of cameras, by camera id."""
-    return {c.camera_id: FocalPrior.of(c, records.get(c.camera_id)) for c in cameras}
+class _IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
+    """The prior of intrinsics: focal lengths log-normal, all else that is free normal.
+
+    Residuals are deviations in units of ``noise_px``, as reprojection errors are in px.
+    """
+
+    def __init__(self, camera: pycolmap.Camera, prior: CameraPrior, noise_px: float) -> None:
+        super().__init__()
+        number = len(camera.params)
+        self.focal = list(camera.focal_length_idxs())
+        self.focal_px = prior.focal_px
+        self.mean: Array = np.zeros(number)
+        self.weights: Array = np.zeros(number)
+        self.weights[self.focal] = noise_px / prior.sigma
+        self.weights[list(camera.extra_params_idxs())] = noise_px / DISTORTION_SIGMA
+        self.set_num_residuals(number)
+        self.set_parameter_block_sizes([number])
+
+    def Evaluate(
+        self, parameters: list[Array], residuals: Array, jacobians: list[Array] | None
+    ) -> bool:
+        """See Ceres' CostFunction."""
+        params = parameters[0]
+        focals_px = np.maximum(params[self.focal], MIN_FOCAL_PX)
+        deviations = params - self.mean
+        deviations[self.focal] = np.log(focals_px / self.focal_px)
+        residuals[:] = self.weights * deviations
+        if jacobians is not None and jacobians[0] is not None:
+            slopes = self.weights.copy()
+            slopes[self.focal] /= focals_px
+            jacobians[0][:] = np.diag(slopes).ravel()
+        return True
 
 
 @dataclass(frozen=True)
 class Adjuster:
     """Adjusts models with priors on intrinsics."""
 
-    priors: Mapping[int, FocalPrior]  # by camera id
+    priors: Mapping[int, CameraPrior]  # by camera id
     noise_px: float  # standard deviation of the keypoints, the scale of the robust loss
     refining: pycolmap.BundleAdjustmentOptions  # say which parameters of cameras are refined
     constant: frozenset[int] = frozenset()  # ids of the cameras of which nothing is refined
@@ -244,7 +241,6 @@ class Adjuster:
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
         prior = self.priors[camera.camera_id]
         focal = list(camera.focal_length_idxs())
-        extra = list(camera.extra_params_idxs())
         if not prior.sigma:  # distortion alone is refined
             fixed = [*focal, *camera.principal_point_idxs()]
             if len(fixed) == len(camera.params):
@@ -252,13 +248,8 @@ class Adjuster:
             manifold = pyceres.SubsetManifold(len(camera.params), fixed)
             problem.set_manifold(camera.params, manifold)
             return
-        mean = camera.params.copy()
-        sigma = np.full(len(camera.params), UNKNOWN_SIGMA)
-        mean[focal], sigma[focal] = prior.focal_px, prior.sigma * prior.focal_px
-        mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
-        # Reprojection errors are in px, priors in units of their deviation times the noise.
-        normal = pyceres.factors.NormalPrior(mean, np.diag((sigma / self.noise_px) ** 2))
-        problem.add_residual_block(normal, None, [camera.params])
+        cost = _IntrinsicsCost(camera, prior, self.noise_px)
+        problem.add_residual_block(cost, None, [camera.params])
 
 
 def _solver_options(max_iterations: int, num_images: int) -> Any:

@@ -10,16 +10,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers.adjustment import (
-    EXIF_SIGMA,
-    FINAL,
-    NOISE_PX,
-    Adjuster,
-    EarlyStop,
-    FocalPrior,
-    focal_priors,
-)
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, EarlyStop
 from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
 from colmap_affrect.mappers.model_score import num_occupied_cells
 from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs, sampling_step
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -46,7 +39,7 @@ class _FocalTrials:
     def __init__(
         self,
         model: pycolmap.Reconstruction,
-        priors: Mapping[int, FocalPrior],
+        priors: Mapping[int, CameraPrior],
         refining: pycolmap.BundleAdjustmentOptions,
         fixed: frozenset[int],
     ) -> None:
@@ -89,7 +82,7 @@ def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each uncalibrated camera, while all else may move.
     """
-    priors = focal_priors(cameras_of(model).values(), task.cameras)
+    priors = camera_priors(cameras_of(model).values(), task.cameras)
     recorded = sorted(priors.keys() & task.cameras.keys())
     unknown = [key for key in recorded if priors[key].sigma > EXIF_SIGMA]
     if not unknown or not _is_tried(model):
@@ -110,7 +103,7 @@ def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int
 
 
 def fitting_focals(
-    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, FocalPrior]
+    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, CameraPrior]
 ) -> dict[int, float]:
     """Find focal lengths that fit better than those that the user gave.
 
@@ -130,7 +123,7 @@ def fitting_focals(
         return {}
     free_priors = {**priors}
     for key in given:
-        free_priors[key] = FocalPrior(priors[key].focal_px, FREE_SIGMA)
+        free_priors[key] = CameraPrior(priors[key].focal_px, FREE_SIGMA)
     # A wrong focal length is made up for by distortion, where that was free.
     constant = frozenset(key for key in given if task.cameras[key].is_fixed)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)

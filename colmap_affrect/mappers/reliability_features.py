@@ -12,8 +12,8 @@ import numpy as np
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import connected_parts, lone_ties
 from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
-from colmap_affrect.mappers.adjustment import focal_priors
 from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.camera_priors import camera_priors
 from colmap_affrect.mappers.focal_observability import fitting_focals, focal_growths
 from colmap_affrect.mappers.model_score import ModelScorer, pair_log_ratio
 from colmap_affrect.mappers.pair_graph import (
@@ -80,7 +80,7 @@ class _ModelContext:
         self.cameras = cameras_of(self.model)
         used = {camera.camera_id: camera for camera in self.cameras.values()}
         self.used_cameras = used
-        self.priors = focal_priors(used.values(), task.cameras)
+        self.priors = camera_priors(used.values(), task.cameras)
         self.scorer = ModelScorer(self.graph, self.priors)
         self.pairs = self.graph.pairs_inside(self.poses)
         self.agreements: dict[Ids, float] = {}

@@ -14,9 +14,10 @@ from functools import cached_property
 from typing import Self
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA, MEDIUM, Adjuster, FocalPrior
+from colmap_affrect.mappers.adjustment import MEDIUM, Adjuster
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import BridgeFinder
+from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior
 from colmap_affrect.mappers.growing import Grower, register_bridges
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of
@@ -153,7 +154,7 @@ class Search:
         return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(model)
 
     @cached_property
-    def unknown(self) -> dict[int, FocalPrior]:
+    def unknown(self) -> dict[int, CameraPrior]:
         """Priors of the unknown focal lengths, by camera id."""
         priors = self.adjuster.priors
         return {key: prior for key, prior in priors.items() if prior.sigma > EXIF_SIGMA}
@@ -179,15 +180,15 @@ class Search:
         priors = {}
         for key, prior in self.unknown.items():
             sigma = min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma
-            priors[key] = FocalPrior(zoom * prior.focal_px, sigma)
+            priors[key] = CameraPrior(zoom * prior.focal_px, sigma)
         return self._with_priors(priors)
 
     def _with_focals_of(self, model: pycolmap.Reconstruction) -> Self:
         """Return a search that keeps unknown focal lengths near those of a model."""
         focals = self._unknown_focals(model).items()
-        return self._with_priors({key: FocalPrior(px, SHARED_SIGMA) for key, px in focals})
+        return self._with_priors({key: CameraPrior(px, SHARED_SIGMA) for key, px in focals})
 
-    def _with_priors(self, priors: Mapping[int, FocalPrior]) -> Self:
+    def _with_priors(self, priors: Mapping[int, CameraPrior]) -> Self:
         together = {**self.adjuster.priors, **priors}
         return replace(self, adjuster=replace(self.adjuster, priors=together))
 

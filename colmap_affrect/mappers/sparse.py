@@ -8,14 +8,9 @@ from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
-from colmap_affrect.mappers.adjustment import (
-    EXIF_SIGMA,
-    NOISE_PX,
-    Adjuster,
-    FocalPrior,
-    focal_priors,
-)
+from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
 from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
@@ -168,12 +163,12 @@ class SparseMapper(IncrementalMapper):
 
     def _priors(
         self, task: MappingTask, graph: PairGraph, native: pycolmap.IncrementalPipelineOptions
-    ) -> dict[int, FocalPrior]:
+    ) -> dict[int, CameraPrior]:
         """Return the priors of the focal lengths, by camera id."""
         if not native.ba_refine_focal_length:  # then they are those of the database
             used = {camera.camera_id: camera for camera in graph.cameras.values()}
-            return {k: FocalPrior(float(c.mean_focal_length()), 0.0) for k, c in used.items()}
-        priors = focal_priors(graph.cameras.values(), task.cameras)
+            return {k: CameraPrior(float(c.mean_focal_length()), 0.0) for k, c in used.items()}
+        priors = camera_priors(graph.cameras.values(), task.cameras)
         if not self.options.keep_given_intrinsics:
             for key, prior in priors.items():
                 priors[key] = replace(prior, sigma=prior.sigma or EXIF_SIGMA)

@@ -11,9 +11,9 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX
 from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import BridgeFinder
+from colmap_affrect.mappers.camera_priors import EXIF_SIGMA
 from colmap_affrect.mappers.growing import Grower, register_bridges
 from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import CameraById, PoseById, cameras_of, poses_of

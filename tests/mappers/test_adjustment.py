@@ -10,7 +10,8 @@ from mapping_tasks import synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
-from colmap_affrect.mappers.adjustment import FINAL, Adjuster, FocalPrior
+from colmap_affrect.mappers.adjustment import FINAL, Adjuster
+from colmap_affrect.mappers.camera_priors import CameraPrior, camera_prior
 
 TRUE_FOCAL = 1280.0
 SIZE = (1024, 768)
@@ -26,7 +27,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Reconstruction:
 def mean_distortion(model: pycolmap.Reconstruction, noise_px: float) -> float:
     """Adjust a copy of a model, with known focal lengths, to keypoints of some noise."""
     trial = pycolmap.Reconstruction(model)
-    priors = dict.fromkeys(model.cameras, FocalPrior(TRUE_FOCAL, 1e-4))
+    priors = dict.fromkeys(model.cameras, CameraPrior(TRUE_FOCAL, 1e-4))
     Adjuster(priors, noise_px, pycolmap.BundleAdjustmentOptions()).adjust(trial, FINAL)
     return float(np.mean([camera.params[3] for camera in trial.cameras.values()]))
 
@@ -41,7 +42,7 @@ def test_distortion_is_found_by_exact_keypoints_and_stays_near_zero_by_noisy_one
 def cost_of(factor: float, **known: str) -> float:
     """What a focal length costs that is so many times the expected one."""
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE)
-    prior = FocalPrior.of(camera, CameraRecord(("a",), size=SIZE, focal_px=TRUE_FOCAL, **known))
+    prior = camera_prior(camera, CameraRecord(("a",), size=SIZE, focal_px=TRUE_FOCAL, **known))
     return prior.cost(factor * prior.focal_px)
 
 
