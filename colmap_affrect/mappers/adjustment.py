@@ -6,7 +6,7 @@ few points are seen by many images, its focal lengths run away.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX
 from colmap_affrect.colmap.model_files import all_see_long_tracks
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.mappers.camera_priors import DISTORTION_SIGMA, MIN_FOCAL_PX, CameraPrior
+from colmap_affrect.mappers.camera_priors import (
+    DISTORTION_SIGMA,
+    MIN_FOCAL_PX,
+    CameraPrior,
+    usual_principal_point,
+)
 from colmap_affrect.mappers.tie_points import NONE, TiePoints
 
 NOISE_PX = 0.7  # standard deviation of keypoints, judged on the benchmark scenes
@@ -83,13 +88,23 @@ class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
         return lowest_cost >= self.enough * self.other_cost or self._num_small >= NUM_SMALL
 
 
-class _IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
+class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
     """The prior of intrinsics: focal lengths log-normal, all else that is free normal.
 
     Residuals are deviations in units of ``noise_px``, as reprojection errors are in px.
     """
 
-    def __init__(self, camera: pycolmap.Camera, prior: CameraPrior, noise_px: float) -> None:
+    def __init__(
+        self, camera: pycolmap.Camera, prior: CameraPrior, noise_px: float, fixed: Sequence[int]
+    ) -> None:
+        """Begin.
+
+        Args:
+            camera: Whose parameters are observed.
+            prior: What is known of them.
+            noise_px: Standard deviation of keypoints.
+            fixed: Indices of the parameters that are held, which cost nothing.
+        """
         super().__init__()
         number = len(camera.params)
         self.focal = list(camera.focal_length_idxs())
@@ -98,6 +113,11 @@ class _IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
         self.weights: Array = np.zeros(number)
         self.weights[self.focal] = noise_px / prior.sigma
         self.weights[list(camera.extra_params_idxs())] = noise_px / DISTORTION_SIGMA
+        indices = list(camera.principal_point_idxs())
+        center = prior.principal_point or usual_principal_point(camera)
+        self.mean[indices] = center.center_px
+        self.weights[indices] = noise_px / np.array(center.sigmas_px)
+        self.weights[list(fixed)] = 0.0
         self.set_num_residuals(number)
         self.set_parameter_block_sizes([number])
 
@@ -163,6 +183,7 @@ class Adjuster:
         fixed = {model.images[image_id].camera_id for image_id in others} | self.constant
         config = self._config(model, images, cameras & fixed, fix_gauge=image_ids is None)
         options = self._options(model)
+        options.refine_principal_point = any(map(self._is_center_free, cameras - fixed))
         problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
         self._add_tie_points(problem, model)
         for key in sorted(cameras - fixed):
@@ -182,7 +203,6 @@ class Adjuster:
     def _options(self, model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentOptions:
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
         options.refine_focal_length = self.refining.refine_focal_length
-        options.refine_principal_point = self.refining.refine_principal_point
         options.refine_extra_params = self.refining.refine_extra_params
         options.refine_sensor_from_rig = self.refining.refine_sensor_from_rig
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -239,17 +259,37 @@ class Adjuster:
                 problem.add_residual_block(cost, loss, blocks)
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
+        """Hold what of a camera is known, and add the prior of what is not."""
         prior = self.priors[camera.camera_id]
-        focal = list(camera.focal_length_idxs())
-        if not prior.sigma:  # distortion alone is refined
-            fixed = [*focal, *camera.principal_point_idxs()]
-            if len(fixed) == len(camera.params):
-                return  # COLMAP holds it already
+        fixed = self._fixed_parameters(camera)
+        if len(fixed) == len(camera.params):
+            problem.set_parameter_block_constant(camera.params)
+            return
+        if fixed:
             manifold = pyceres.SubsetManifold(len(camera.params), fixed)
             problem.set_manifold(camera.params, manifold)
-            return
-        cost = _IntrinsicsCost(camera, prior, self.noise_px)
-        problem.add_residual_block(cost, None, [camera.params])
+        if prior.sigma:
+            cost = IntrinsicsCost(camera, prior, self.noise_px, fixed)
+            problem.add_residual_block(cost, None, [camera.params])
+
+    def _fixed_parameters(self, camera: pycolmap.Camera) -> list[int]:
+        """Return the indices of the parameters of a camera that are held."""
+        prior = self.priors[camera.camera_id]
+        fixed = list[int]()
+        if not (self.refining.refine_focal_length and prior.sigma):
+            fixed += camera.focal_length_idxs()
+        if not self._is_center_free(camera.camera_id):
+            fixed += camera.principal_point_idxs()
+        if not (self.refining.refine_extra_params and prior.has_distortion):
+            fixed += camera.extra_params_idxs()
+        return sorted(fixed)
+
+    def _is_center_free(self, camera_id: int) -> bool:
+        """Tell whether the principal point of a camera is refined."""
+        prior = self.priors[camera_id]
+        return bool(prior.principal_point) or (
+            self.refining.refine_principal_point and prior.sigma > 0.0
+        )
 
 
 def _solver_options(max_iterations: int, num_images: int) -> Any:

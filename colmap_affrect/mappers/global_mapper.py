@@ -147,5 +147,5 @@ class GlobalMapper:
                 camera.params = given[key]
                 has_changed = True
         if has_changed:
-            priors = camera_priors(model.cameras.values(), task.cameras)
+            priors = camera_priors(model.cameras.values(), task.cameras, task.lines)
             Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(model, FINAL)

@@ -56,7 +56,7 @@ class ModelScorer:
             num_agreeing = self.graph.agreement(pair, poses, cameras) * num
             total += pair_log_ratio(num_agreeing, num)
         used = {camera.camera_id: camera for camera in cameras.values()}
-        costs = [self.priors[key].cost(camera.mean_focal_length()) for key, camera in used.items()]
+        costs = [self.priors[key].cost_of(camera) for key, camera in used.items()]
         return total - sum(costs)
 
     def is_confirmed(self, model: pycolmap.Reconstruction) -> bool:

@@ -25,11 +25,13 @@ MAX_LOG_SPREAD = 0.5  # of focal lengths: farther apart they are no surer parts 
 # A bridge edge between two components may be of two scenes, found by chance among all pairs.
 CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (judged)
 CHANCE_SCALE = 10.0  # inliers more that make the former less likely by a factor of e (judged)
+MIN_SHARE_OF_AXIS = 1e-6  # whose logarithm is taken
 MIN_LOSS = 0.7  # of the log odds: what takes less, half of the odds, is no reason to doubt
 NUM_REASONS = 2  # that are said of a photograph
 
 FOCAL_CONTRADICTED = "the given focal length does not fit"
 FOCAL_UNKNOWN = "any focal length fits"
+AXIS_UNKNOWN = "its optical axis may be elsewhere: a crop, or a view camera"
 CONTRADICTIONS = (
     "most of its matches disagree with this position",
     "of the matches of its pairs agree with the model",
@@ -201,6 +203,7 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
     losses = [
         _Loss(-features.tie_point_log_odds, "its tie points disagree"),
         _Loss(math.log1p(odds_of_two_scenes), f"with others it hangs on {edge} alone"),
+        _Loss(-math.log(max(1.0 - features.axis_doubt, MIN_SHARE_OF_AXIS)), AXIS_UNKNOWN),
     ]
     mendable = 0.0
     for name, fitted in coefficients.terms.items():
@@ -210,7 +213,7 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
         losses.append(loss)
         if name in OF_MATCHES:
             mendable += max(0.0, loss.log_odds)
-    probability = _probability(log_odds) / (1.0 + odds_of_two_scenes)
+    probability = _probability(log_odds) / (1.0 + odds_of_two_scenes) * (1.0 - features.axis_doubt)
     return Confidence(
         probability, _main_reasons(losses), _probability(log_odds + mendable) - probability
     )

@@ -12,6 +12,7 @@ import numpy as np
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import connected_parts, lone_ties
 from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
+from colmap_affrect.mappers.axis_observability import axis_doubts
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import camera_priors
 from colmap_affrect.mappers.focal_observability import fitting_focals, focal_growths
@@ -67,6 +68,8 @@ class ReliabilityFeatures:
     bridge_edge: str
     """The pair without which it and others, at most half of all, would be apart, or empty."""
     num_bridge_inliers: int  # of that pair
+    axis_doubt: float = 0.0
+    """Probability that its rotation is off because nobody knows its principal point."""
 
 
 class _ModelContext:
@@ -80,7 +83,7 @@ class _ModelContext:
         self.cameras = cameras_of(self.model)
         used = {camera.camera_id: camera for camera in self.cameras.values()}
         self.used_cameras = used
-        self.priors = camera_priors(used.values(), task.cameras)
+        self.priors = camera_priors(used.values(), task.cameras, task.lines)
         self.scorer = ModelScorer(self.graph, self.priors)
         self.pairs = self.graph.pairs_inside(self.poses)
         self.agreements: dict[Ids, float] = {}
@@ -133,6 +136,7 @@ def features_of(
     residuals = tie_points_of(task, context.graph).residuals(context.model)
     log_odds = tie_point_log_odds(residuals)
     bridges = _bridge_edges(context)
+    doubts_of_axes = axis_doubts(context.model, task, context.priors)
     names = context.graph.names
     found = {}
     for image_id in context.pairs_of:
@@ -142,7 +146,7 @@ def features_of(
         log_ratio = _pair_log_ratio(context, image_id) + track_log_ratios.get(image_id, 0.0)
         bridge = bridges.get(image_id)
         found[names[image_id]] = ReliabilityFeatures(
-            log_likelihood_ratio=log_ratio - context.priors[key].cost(focal_px),
+            log_likelihood_ratio=log_ratio - context.priors[key].cost_of(camera),
             agreement=_agreement(context, image_id),
             num_three_view_points=num_three_view_points[image_id],
             focal_growth=growths.get(key, 1.0),
@@ -154,6 +158,7 @@ def features_of(
             tie_point_log_odds=log_odds.get(image_id, 0.0),
             bridge_edge=" - ".join(names[i] for i in bridge.ids) if bridge else "",
             num_bridge_inliers=len(bridge.matches) if bridge else 0,
+            axis_doubt=doubts_of_axes.get(key, 0.0),
         )
     return found
 

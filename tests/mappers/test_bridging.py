@@ -33,7 +33,7 @@ def grower(tmp_path_factory: pytest.TempPathFactory) -> Grower:
     task = task_with_given_cameras(path)
     graph = PairGraph.read(path)
     native = mapper_of("sparse").native(task, SEED)
-    priors = camera_priors(graph.cameras.values(), task.cameras)
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
     fixed = frozenset(priors)
     adjuster = Adjuster(priors, NOISE_PX, native.get_global_bundle_adjustment(), fixed)
     return Grower(graph, adjuster, native, lambda _: None)

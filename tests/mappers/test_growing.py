@@ -38,7 +38,7 @@ def grower_of(path: Path) -> Grower:
     task = task_with_given_cameras(path)
     graph = PairGraph.read(path)
     native = mapper_of("sparse", init_min_num_inliers=1).native(task, SEED)
-    priors = camera_priors(graph.cameras.values(), task.cameras)
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
     refining = native.get_global_bundle_adjustment()
     adjuster = Recorder(priors, NOISE_PX, refining, frozenset(priors))
     return Grower(graph, adjuster, native, lambda _: None)

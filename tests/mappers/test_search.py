@@ -26,6 +26,7 @@ from colmap_affrect.mappers.camera_priors import (
     EXIF_SIGMA,
     USUAL_FOCAL,
     USUAL_SIGMA,
+    ZOOMS,
     CameraPrior,
     camera_prior,
     camera_priors,
@@ -34,7 +35,7 @@ from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer, pair_log_ratio
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
 from colmap_affrect.mappers.search import Search
-from colmap_affrect.mappers.sparse import OWN_CAMERAS
+from colmap_affrect.mappers.sparse import COLMAP_MODEL, OWN_CAMERAS
 
 TRUE_FOCAL = 1280.0
 SIZE = (1024, 768)
@@ -270,12 +271,49 @@ def test_bridges_are_built_anew_with_a_focal_length_that_a_model_has_found(tmp_p
     native = mapper_of("sparse").native(MappingTask(path, None, cameras={1: record}), 0)
     native.mapper.init_max_forward_motion = 1.0
     graph = PairGraph.read(path)
-    priors = camera_priors(graph.cameras.values(), {1: record})
+    priors = camera_priors(graph.cameras.values(), {1: record}, {})
     adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
     search = RecordingSearch(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
     (found,) = search.best(graph)
     assert found.reconstruction.num_reg_images() == 4
     assert search.tried_px == pytest.approx([USUAL_FOCAL * 1000, 977.5], rel=0.02)
+
+
+@dataclass(frozen=True)
+class NeverCertain(RecordingSearch):
+    """Tries all focal lengths."""
+
+    def is_certain(self, *_: Any, **__: Any) -> bool:
+        return False
+
+
+def test_cameras_of_one_image_each_begin_at_focal_lengths_from_wide_to_long(
+    scene: Scene,
+) -> None:
+    task = task_of(scene, UNKNOWN)
+    native = mapper_of("sparse").native(task, 0)
+    graph = PairGraph.read(scene[0])
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
+    adjuster = Adjuster(priors, NOISE_PX, native.get_global_bundle_adjustment())
+    search = NeverCertain(adjuster, ModelScorer(graph, priors), native, 1, lambda _: None)
+    (found,) = search.best(graph)
+    assert focals(found.reconstruction) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.03)
+    for zoom in ZOOMS:
+        assert (
+            min(abs(tried / (zoom * USUAL_FOCAL * SIZE[0]) - 1) for tried in search.tried_px) < 0.01
+        )
+
+
+def test_colmaps_own_model_is_taken_where_ours_scores_lower(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Search, "best", lambda *_: [])
+    (found,) = mapper_of("sparse").map(task_of(scene, UNKNOWN), tmp_path, 0, lambda _: None)
+    assert found.moves == (COLMAP_MODEL,)
+    assert focals(found.reconstruction) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.05)
+    assert not mapper_of("sparse").map(
+        task_with_given_cameras(scene[0]), tmp_path, 0, lambda _: None
+    )
 
 
 def test_a_token_stops_the_search(scene: Scene, tmp_path: Path) -> None:
