@@ -182,8 +182,7 @@ class Adjuster:
         others = registered.difference(images)
         fixed = {model.images[image_id].camera_id for image_id in others} | self.constant
         config = self._config(model, images, cameras & fixed, fix_gauge=image_ids is None)
-        options = self._options(model)
-        options.refine_principal_point = any(map(self._is_center_free, cameras - fixed))
+        options = self._options(model, cameras - fixed)
         problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
         self._add_tie_points(problem, model)
         for key in sorted(cameras - fixed):
@@ -200,9 +199,35 @@ class Adjuster:
             return math.inf
         return float(summary.final_cost) / self.noise_px**2
 
-    def _options(self, model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentOptions:
+    def pose_covariance(self, model: pycolmap.Reconstruction) -> pycolmap.BACovariance | None:
+        """Return the covariance of the poses of a model that has been adjusted.
+
+        Three points are held, which changes nothing of what does not depend on the frame of the
+        model, as relative directions. It is in units in which keypoints have a variance of one.
+
+        Returns:
+            The covariance, None where it cannot be computed.
+        """
+        images = sorted(model.reg_image_ids())
+        cameras = {model.images[image_id].camera_id for image_id in images}
+        config = self._config(model, images, cameras & self.constant, fix_gauge=False)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
+        options = self._options(model, cameras - self.constant)
+        problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+        self._add_tie_points(problem, model)
+        for key in sorted(cameras - self.constant):
+            if problem.has_parameter_block(model.cameras[key].params):
+                self._add_prior(problem, model.cameras[key])
+        wanted = pycolmap.BACovarianceOptions()
+        wanted.params = pycolmap.BACovarianceOptionsParams.POSES
+        return pycolmap.estimate_ba_covariance_from_problem(wanted, model, problem)
+
+    def _options(
+        self, model: pycolmap.Reconstruction, free_cameras: Iterable[int]
+    ) -> pycolmap.BundleAdjustmentOptions:
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
         options.refine_focal_length = self.refining.refine_focal_length
+        options.refine_principal_point = any(map(self._is_center_free, free_cameras))
         options.refine_extra_params = self.refining.refine_extra_params
         options.refine_sensor_from_rig = self.refining.refine_sensor_from_rig
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY

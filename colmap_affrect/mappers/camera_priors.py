@@ -31,7 +31,7 @@ LYING_LINES = 0.1  # share of photographs whose lines say something else than th
 SCALED_CROPS = 0.3  # share of crops that were enlarged or shrunk, too (judged)
 DISTORTION_SIGMA = 0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
 CENTER_SIGMA = 0.02  # longer sides, of the principal point of a whole photograph (judged)
-SHIFTED_SIGMA = 0.1  # longer sides, of that of a crop, or of a view camera up and down (judged)
+SHIFTED_SIGMA = 0.15  # longer sides, of that of a crop, or of a view camera up and down (judged)
 SHIFTED_SHARE = 0.2  # of the photographs of which nothing is known (judged)
 NO_SHARE = 1e-9  # of measurements that are false
 WIDE_SIGMA = 1.0  # of the logarithm of a focal length of which nothing is expected
@@ -123,6 +123,24 @@ class CameraPrior:
         if self.principal_point:
             cost += self.principal_point.cost(camera.principal_point_x, camera.principal_point_y)
         return cost
+
+
+def with_distortion_of(
+    priors: Mapping[int, CameraPrior], cameras: Iterable[pycolmap.Camera]
+) -> dict[int, CameraPrior]:
+    """Return the priors of the cameras of a model, which hold distortion where that was held.
+
+    Args:
+        priors: By camera id.
+        cameras: Of the model.
+    """
+    found = dict(priors)
+    for camera in cameras:
+        prior = priors[camera.camera_id]
+        if prior.is_unknown:
+            has_distortion = not camera.is_undistorted()
+            found[camera.camera_id] = replace(prior, has_distortion=has_distortion)
+    return found
 
 
 @dataclass(frozen=True)

@@ -16,20 +16,27 @@ from colmap_affrect.mappers.model_score import GRID
 from colmap_affrect.mappers.pair_graph import PairGraph
 
 NUM_POSE_PARAMETERS = 6
+MIN_NUM_IMAGES = 3
+"""Images of a camera, from which on they tell its distortion: what else is wrong of a model is not
+the same in all of them (judged)."""
 MIN_REDUNDANCY = 60.0
-"""Redundant observations of all images of a camera, from which on they tell its distortion: fewer
-follow what else is wrong of a model (judged)."""
+"""Redundant observations of one or two images, from which on these tell it (judged)."""
 
 
 def cameras_that_tell_distortion(graph: PairGraph) -> frozenset[int]:
     """Return the ids of the cameras whose distortion the verified pairs of a graph tell."""
     redundancies: defaultdict[int, float] = defaultdict(float)
+    num_images: defaultdict[int, int] = defaultdict(int)
     for image_id, num_partners in _num_partners(graph).items():
         camera = graph.cameras[image_id]
-        redundancies[camera.camera_id] += _redundancy(
-            camera, graph.keypoints[image_id], num_partners
-        )
-    return frozenset(key for key, number in redundancies.items() if number >= MIN_REDUNDANCY)
+        key = camera.camera_id
+        redundancies[key] += redundancy_of(camera, graph.keypoints[image_id], num_partners)
+        num_images[key] += 1
+    found = set[int]()
+    for key, redundancy in redundancies.items():
+        if num_images[key] >= MIN_NUM_IMAGES or redundancy >= MIN_REDUNDANCY:
+            found.add(key)
+    return frozenset(found)
 
 
 def _num_partners(graph: PairGraph) -> dict[int, Indices]:
@@ -41,7 +48,7 @@ def _num_partners(graph: PairGraph) -> dict[int, Indices]:
     return found
 
 
-def _redundancy(camera: pycolmap.Camera, keypoints: Array, num_partners: Indices) -> float:
+def redundancy_of(camera: pycolmap.Camera, keypoints: Array, num_partners: Indices) -> float:
     """Return how many observations of an image are redundant.
 
     Args:

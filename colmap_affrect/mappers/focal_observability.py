@@ -13,7 +13,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, EarlyStop
 from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.camera_priors import CameraPrior, camera_priors
+from colmap_affrect.mappers.camera_priors import CameraPrior, camera_priors, with_distortion_of
 from colmap_affrect.mappers.model_score import num_occupied_cells
 from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs, sampling_step
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -83,15 +83,14 @@ def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each uncalibrated camera, while all else may move.
     """
-    priors = camera_priors(cameras_of(model).values(), task.cameras, task.lines)
+    cameras = cameras_of(model).values()
+    priors = camera_priors(cameras, task.cameras, task.lines)
+    priors = with_distortion_of(priors, cameras)
     recorded = sorted(priors.keys() & task.cameras.keys())
     unknown = [key for key in recorded if priors[key].is_unknown]
     if not unknown or not _is_tried(model):
         return {}
     fixed = frozenset(key for key in recorded if task.cameras[key].is_fixed)
-    for key in unknown:
-        has_distortion = not model.cameras[key].is_undistorted()
-        priors[key] = replace(priors[key], has_distortion=has_distortion)
     is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     trials = _FocalTrials(with_fewer_points(model), priors, refining, fixed)
@@ -117,7 +116,7 @@ def fitting_focals(
         priors: Priors of the focal lengths, by camera id.
 
     Returns:
-        The focal lengths in px by id of the camera. None where freeing the given ones lowers the
+        The focal lengths in px by id of the camera. Empty where freeing the given ones lowers the
         cost by less than free parameters are worth (BIC): half the logarithm of the number of
         observations each, of which those in one cell of an image count once.
     """

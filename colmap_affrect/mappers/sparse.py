@@ -30,6 +30,7 @@ OWN_CAMERAS = "with a camera for each photograph"
 COLMAP_MODEL = "from COLMAP's model"
 
 NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from (judged)
+FORWARD_MOTION = "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
 
 
@@ -79,7 +80,8 @@ class SparseMapper(IncrementalMapper):
 
         is_small = len(graph.keypoints) < LARGE and not task.extend
         if is_small:
-            native.mapper.init_max_forward_motion = 1.0  # the score decides on such pairs
+            if FORWARD_MOTION not in self.options.mapper_options:
+                native.mapper.init_max_forward_motion = 1.0  # the score decides on such pairs
             return self._map_small(task, graph, native, output_path, show_or_stop)
         search = self._search(task, graph, native, show_or_stop)
         search = replace(search, num_starts=1)

@@ -103,7 +103,7 @@ def test_models_of_crops_begin_with_the_focal_length_of_the_whole_photograph() -
     assert prior.starts_px[0] == 2400.0
     assert prior.cost(2400.0) < 1.0
     assert prior.principal_point
-    assert prior.principal_point.sigmas_px == pytest.approx([100.0, 100.0])
+    assert prior.principal_point.sigmas_px == pytest.approx([150.0, 150.0])
 
 
 def test_a_shift_that_lines_tell_frees_the_principal_point_and_others_do_not() -> None:
