@@ -258,7 +258,7 @@ def _examine_models(
     diagnosis: Diagnosis, workspace: Workspace, models: Sequence[ModelSummary]
 ) -> None:
     """Say what models there are, and whether some are gone."""
-    if workspace.lacks_models() and workspace.made_from("map"):
+    if workspace.lacks_models() and workspace.mapped:
         diagnosis.add("error", workspace.sparse, "models are gone", f"{SAME_RUN}: maps again")
     listed = ", ".join(str(len(model.registered_names)) for model in models) or "no"
     diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")

@@ -439,7 +439,7 @@ def map_and_report(
     options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
-    sizes = read_sizes(workspace.database)
+    sizes = {name: (one.width, one.height) for name, one in context.graph.cameras.items()}
     marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
@@ -477,7 +477,8 @@ def map_and_report(
     replace_text(workspace.report, result.to_json())
     if page:
         pictures = draw_pairs_to_check(context, result, pair_inliers)
-        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures)
+        cameras = context.graph.cameras
+        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures, cameras)
         write_run_page(workspace, result, content, context.progress)
     return result
 

@@ -290,13 +290,6 @@ def camera_matrix(camera: pycolmap.Camera) -> Array:
     return matrix
 
 
-def read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
-    """Return the camera of every image of a database by image name."""
-    with open_database(path) as database:
-        cameras = cameras_of_images(database)
-        return {image.name: cameras[image.image_id] for image in database.read_all_images()}
-
-
 def cameras_of_images(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
     """Return the camera of each image by image id."""
     cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
 from colmap_affrect.errors import WorkspaceError, damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
@@ -153,7 +153,7 @@ def map_database(
     snapshots = sparse_path.with_name(sparse_path.name + ".snapshots")
     keeps_models = task.extend or task.previous_models
     remove_own([partial] if keeps_models else [partial, sparse_path])
-    num_images = len(image_ids(task.database_path))
+    num_images = len(graph_of(task, MIN_NUM_MATCHES).names)
     progress = _Progress(next_image, num_images)
     try:
         with with_snapshots(task, mapper.options, snapshots, num_images) as whole:
