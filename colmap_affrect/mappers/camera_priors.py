@@ -15,7 +15,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
-from colmap_affrect.geometry import lines as lines_of_one
+from colmap_affrect.geometry import lines as line_model
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.lines import KNOWN_SIGMA, LineCamera
 
@@ -103,8 +103,13 @@ class CameraPrior:
     sigma: float  # standard deviation of its logarithm; 0 where it is given and held
     principal_point: PrincipalPointPrior | None = None  # None where it is held
     has_distortion: bool = True  # whether distortion is refined; else it stays as it is
-    starts_px: tuple[float, ...] = field(default=(), compare=False)
-    """Focal lengths near which models begin, the likeliest first; the median where empty."""
+    given_starts_px: tuple[float, ...] = field(default=(), compare=False)
+    """Focal lengths near which models begin, the likeliest first; the median alone where empty."""
+
+    @property
+    def starts_px(self) -> tuple[float, ...]:
+        """Focal lengths near which models begin, the likeliest first; one at least."""
+        return self.given_starts_px or (self.focal_px,)
 
     @property
     def is_unknown(self) -> bool:
@@ -183,12 +188,12 @@ def measurement_of_lines(camera: LineCamera) -> Measurement | None:
 
     A :class:`LineCamera` has been multiplied with what is usual, which is divided out here.
     """
-    usual_precision = lines_of_one.USUAL_FOCAL_SIGMA**-2
+    usual_precision = line_model.USUAL_FOCAL_SIGMA**-2
     precision = camera.focal_sigma**-2 - usual_precision
     if precision <= 0.0:
         return None
     weighted = math.log(camera.focal) * camera.focal_sigma**-2
-    weighted -= math.log(lines_of_one.USUAL_FOCAL) * usual_precision
+    weighted -= math.log(line_model.USUAL_FOCAL) * usual_precision
     focal = LogNormal(math.exp(weighted / precision), precision**-0.5)
     return Measurement(focal, LYING_LINES)
 
@@ -223,7 +228,7 @@ def camera_prior(
         focal.focal,
         focal.sigma,
         _principal_point(camera, record, lines),
-        starts_px=_starts(focal, uncropped_px),
+        given_starts_px=_starts(focal, uncropped_px),
     )
 
 

@@ -182,7 +182,7 @@ class Search:
         """Return a search whose unknown focal lengths begin at one of their starts, or the last."""
         priors = {}
         for key, prior in self.unknown.items():
-            starts_px = prior.starts_px or (prior.focal_px,)
+            starts_px = prior.starts_px
             sigma = min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma
             start_px = starts_px[min(number, len(starts_px) - 1)]
             priors[key] = replace(prior, focal_px=start_px, sigma=sigma)

@@ -1,5 +1,6 @@
 """The sparse mapper: mapping as one estimate, for small sets with few matches."""
 
+import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -8,6 +9,7 @@ from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
@@ -32,6 +34,8 @@ COLMAP_MODEL = "from COLMAP's model"
 NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from (judged)
 FORWARD_MOTION = "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
+
+logger = logging.getLogger(__name__)
 
 
 class SparseOptions(PipelineOptions):
@@ -115,7 +119,8 @@ class SparseMapper(IncrementalMapper):
         hypothesis, which scores higher where they differ, or some images are parts of others.
         """
         own = self._search(task, graph, native, show)
-        by_colmap = partial(super().map, task, output_path, native.random_seed, show)
+        bare = replace(task, image_path=None, snapshot_path=None)
+        by_colmap = partial(super().map, bare, output_path, native.random_seed, show)
         best = list[MappedModel]()
         cameras = with_shared_cameras(task.cameras) if task.may_share else task.cameras
         if len(cameras) < len(task.cameras):
@@ -283,7 +288,12 @@ class _HypothesisTest:
         search = self.search
         if not search.unknown or search.graph.has_rigs or self.task.previous_models:
             return
-        models = sorted(self.by_colmap(), key=lambda m: -m.reconstruction.num_reg_images())
+        try:
+            models = self.by_colmap()
+        except AffrectError as error:  # ours stays
+            logger.info("%s", error)
+            return
+        models.sort(key=lambda mapped: -mapped.reconstruction.num_reg_images())
         grower = search.grower(search.graph)
         found = list[MappedModel]()
         for mapped in models[:NUM_COLMAP_MODELS]:
