@@ -28,7 +28,9 @@ LINES_SIGMA = 0.1
 """Least deviation of the logarithm of a focal length by lines: pairs know it better, and lines of
 one building err together (judged)."""
 LYING_LINES = 0.1  # share of photographs whose lines say something else than they seem to (judged)
-SCALED_CROPS = 0.3  # share of crops that were enlarged or shrunk, too (judged)
+CROP_SIGMA = 0.2
+"""Of the logarithm of the focal length of a crop, around that of the whole photograph in px: some
+crops were enlarged or shrunk, too (judged)."""
 DISTORTION_SIGMA = 0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
 CENTER_SIGMA = 0.02  # longer sides, of the principal point of a whole photograph (judged)
 SHIFTED_SIGMA = 0.15  # longer sides, of that of a crop, or of a view camera up and down (judged)
@@ -219,22 +221,22 @@ def camera_prior(
         measured = measurement_of_lines(line_camera)
         if measured:
             told.append(measured)
-    uncropped_px = record.uncropped_px if record else 0.0
-    if uncropped_px:
-        told.append(Measurement(LogNormal(uncropped_px / longer_px, EXIF_SIGMA), SCALED_CROPS))
-    focal = product(USUAL, told) if told else USUAL
+    usual = USUAL
+    if record and record.uncropped_px:
+        usual = LogNormal(record.uncropped_px / longer_px, CROP_SIGMA)
+    focal = product(usual, told) if told else usual
     focal = LogNormal(focal.focal * longer_px, max(focal.sigma, LINES_SIGMA))
     return CameraPrior(
         focal.focal,
         focal.sigma,
         _principal_point(camera, record, lines),
-        given_starts_px=_starts(focal, uncropped_px),
+        given_starts_px=_starts(focal),
     )
 
 
-def _starts(focal_px: LogNormal, uncropped_px: float) -> tuple[float, ...]:
+def _starts(focal_px: LogNormal) -> tuple[float, ...]:
     """Return the focal lengths near which models begin, the likeliest first."""
-    starts = [uncropped_px] if uncropped_px else []
+    starts = list[float]()
     zooms = ZOOMS if focal_px.sigma > KNOWN_SIGMA else ZOOMS[:1]
     for zoom in zooms:
         starts.append(focal_px.focal * zoom ** (focal_px.sigma / USUAL_SIGMA))

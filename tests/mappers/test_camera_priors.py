@@ -92,6 +92,8 @@ def test_without_lines_models_begin_with_lenses_from_wide_to_long() -> None:
     prior = camera_prior(camera(), NOTHING)
     assert (prior.focal_px, prior.sigma) == (USUAL_FOCAL * 1000, USUAL_SIGMA)
     assert prior.starts_px == pytest.approx([zoom * USUAL_FOCAL * 1000 for zoom in ZOOMS])
+    absurd = camera_prior(camera(), NOTHING, [by_lines(4.0)])  # lines lie more often than that
+    assert absurd.focal_px < 1600.0
     vague = camera_prior(camera(), NOTHING, [by_lines(1.6, 0.3)])
     assert len(vague.starts_px) == len(ZOOMS)
     assert max(vague.starts_px) / min(vague.starts_px) < max(ZOOMS) / min(ZOOMS)
@@ -100,8 +102,10 @@ def test_without_lines_models_begin_with_lenses_from_wide_to_long() -> None:
 def test_models_of_crops_begin_with_the_focal_length_of_the_whole_photograph() -> None:
     crop = replace(NOTHING, uncropped_px=2400.0)
     prior = camera_prior(camera(), crop)
-    assert prior.starts_px[0] == 2400.0
-    assert prior.cost(2400.0) < 1.0
+    assert prior.starts_px[0] == pytest.approx(2400.0)
+    assert prior.cost(1.5 * 2400.0) == pytest.approx(2.05, abs=0.1)  # it may have been scaled, too
+    by_lines_too = camera_prior(camera(), crop, [by_lines(2.3)])
+    assert by_lines_too.focal_px == pytest.approx(2320.0, rel=0.02)
     assert prior.principal_point
     assert prior.principal_point.sigmas_px == pytest.approx([150.0, 150.0])
 
@@ -123,6 +127,7 @@ def test_a_principal_point_costs_by_its_deviation() -> None:
     moved = camera(1150.0)
     prior = replace(camera_prior(moved, NOTHING), principal_point=usual_principal_point(moved))
     assert prior.cost_of(moved) == pytest.approx(0.0)
+    assert usual_principal_point(moved).sigmas_px == (20.0, 20.0)
     moved.principal_point_y += 2.0 * CENTER_SIGMA * 1000
     assert prior.cost_of(moved) == pytest.approx(2.0)
 
