@@ -56,6 +56,7 @@ from colmap_affrect.pipeline import match as match
 from colmap_affrect.pipeline import run as run
 from colmap_affrect.pipeline import verify as verify
 from colmap_affrect.progress import Progress as Progress
+from colmap_affrect.project.line_report import LineReport as LineReport
 from colmap_affrect.project.report import ModelSummary as ModelSummary
 from colmap_affrect.project.report import ReconstructionReport as ReconstructionReport
 from colmap_affrect.project.report import StageReport as StageReport
@@ -63,6 +64,9 @@ from colmap_affrect.recipes import ExtractionOptions as ExtractionOptions
 from colmap_affrect.recipes import Recipe as Recipe
 from colmap_affrect.recipes import load_recipe as load_recipe
 from colmap_affrect.recipes import recipe_names as recipe_names
+from colmap_affrect.report.line_pictures import LineReports as LineReports
+from colmap_affrect.report.line_pictures import camera_from_lines as camera_from_lines
+from colmap_affrect.report.line_pictures import report_lines as report_lines
 from colmap_affrect.report.run_report import RunReport as RunReport
 from colmap_affrect.session.context import Resources as Resources
 from colmap_affrect.session.run_options import RunOptions as RunOptions

@@ -31,8 +31,8 @@ NUM_KEPT = 3  # of these, which are refined for each focal length
 MIN_SINE = 1e-3  # of the angle between planes that meet in a direction of a first frame
 NUM_STEPS = 5  # of refinement without a shift
 NUM_STEPS_SHIFTED = 3  # of refinement for each shift, from there
-TEMPER = 2.0  # lines that count as one piece of evidence: what is built errs together
-MODEL_SIGMA = 0.05
+TEMPER = 3.0  # lines that count as one piece of evidence: what is built errs together
+MODEL_SIGMA = 0.04
 """Deviation of log focal length that is left where lines are many. This and ``TEMPER`` are fitted
 by ``tests/benchmarks/lines.py``, with each scene left out in turn."""
 USUAL_FOCAL = 1.2  # longer sides: what COLMAP guesses
@@ -40,6 +40,7 @@ USUAL_FOCAL_SIGMA = 0.5  # of the logarithm of the focal lengths that photograph
 KNOWN_SIGMA = 0.15  # of log focal length, below which lines know it
 MIDDLE_SIGMA = 0.02  # longer sides, of the axis of a photograph that is as the camera took it
 SHIFTED_SIGMA = 0.15  # longer sides, of the axis of a print: view cameras shift, and prints are cut
+MIN_EVIDENCE = 3.0  # nats, from which on lines have their directions not by chance
 SHIFT_EVIDENCE = 3.0  # nats, from which on lines say that the axis is not in the middle
 
 
@@ -91,12 +92,14 @@ class Explanation:
         shift: of the principal point, down from the middle, in longer sides.
         rotation: (3, 3), rows are the three directions in the camera's frame.
         kinds: (N,) number of the direction of each segment, ``CHANCE`` for none.
+        evidence: nats by which the lines are likelier with these directions than by chance.
     """
 
     focal: float
     shift: float
     rotation: Floats
     kinds: Indices
+    evidence: float
 
     @property
     def up(self) -> Floats:
@@ -152,7 +155,8 @@ class Lines:
         shift = float(SHIFTS[column])
         rotation = self.likelihood.rotations[row, column]
         fit = VanishingFit(self.segments, rotation[None], np.array([focal]), np.array([shift]))
-        return Explanation(focal, shift, rotation, fit.kinds()[0])
+        evidence = float(self.likelihood.log_likelihoods[row, column])
+        return Explanation(focal, shift, rotation, fit.kinds()[0], evidence)
 
 
 def measure_lines(segments: Segments) -> Lines:

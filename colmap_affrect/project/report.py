@@ -11,6 +11,7 @@ from typing import Any
 
 from colmap_affrect.errors import such_as
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.line_report import LineReport
 
 NUM_WORST = 3  # tie points that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
@@ -357,6 +358,8 @@ class ReconstructionReport(Summarized):
     ``matches_before`` and ``matches_after``; empty where no pair needed it."""
     cameras: tuple[dict[str, Any], ...] = ()
     """The cameras, and where their focal lengths are from."""
+    lines: dict[str, LineReport] = field(default_factory=dict)
+    """What the straight lines of photographs say of their cameras, by name."""
     by_hand: tuple[str, ...] = ()
     """What was done otherwise than matches alone say."""
     effort: str = ""
