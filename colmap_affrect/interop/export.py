@@ -5,7 +5,7 @@ import io
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,14 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.upright import turn_upright, upright_of_run
 
 logger = logging.getLogger(__name__)
 
 USUAL = ("ply", "text", "cameras")  # formats that need no photographs
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
+UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright
 FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL and nerfstudio
 
 
@@ -47,6 +49,7 @@ class Source:
     path: Path  # folder of the model
     model: pycolmap.Reconstruction  # its content
     image_path: Path | None  # folder of the photographs; None if it is not known
+    is_upright: bool = False  # whether z is known to point up
 
     def images(self) -> list[pycolmap.Image]:
         """Return the registered images by name."""
@@ -66,7 +69,8 @@ def export(
 ) -> dict[str, Path]:
     """Write a COLMAP model in some formats.
 
-    The output folder is made if missing; nothing in it is overwritten.
+    The output folder is made if missing; nothing in it is overwritten. Where straight lines of
+    several photographs agree on what is upright, models of runs are turned so that z is up.
 
     Args:
         model_path: folder of a model, or the output folder of a run, whose largest model it is.
@@ -75,7 +79,7 @@ def export(
             ``USUAL``, without text where COLMAP could not read it back.
         image_path: the photographs to undistort, by default those of the run.
         camera_model: of ``text`` and ``cameras``, fitted to the cameras; empty: their own.
-        note: is told how well that fits.
+        note: is told how well that fits, and whether the model was turned.
 
     Returns:
         What was written, by format.
@@ -91,6 +95,11 @@ def export(
         raise OptionError(f"--image-path {image_path}: no such folder")
     photographs = image_path or Workspace(resolved(model_path).parent.parent).photographs()
     source = Source(model_path, read_finished_model(model_path), photographs)
+    upright = upright_of_run(model_path, source.model)
+    if upright is not None:
+        turn_upright(source.model, upright)
+        source = replace(source, is_upright=True)
+        note(f"upright     {upright.text()}: z is up")
     if not formats:
         formats = _usual(source)
     if camera_model:
@@ -218,7 +227,7 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
     try:
-        flat = Source(path, read_given_model(path / "sparse"), None)
+        flat = Source(path, read_given_model(path / "sparse"), None, source.is_upright)
     except (OptionError, StoreError) as error:  # which COLMAP does not say when it writes
         raise why_not_written(path / "sparse", error) from error
     frames = []
@@ -262,7 +271,7 @@ def _place(source: Source) -> dict[str, Any]:
     middle = np.median(points or poses[:, :, 3], axis=0)
     half = np.linalg.norm(poses[:, :, 3] - middle, axis=1).mean() / 2.64 or 1.0
     box = [(middle - half).tolist(), (middle + half).tolist()]
-    up = -poses[:, :, 1].mean(axis=0)
+    up = UP if source.is_upright else -poses[:, :, 1].mean(axis=0)
     return {"aabb_scale": 32, "aabb": box, "up": (up / np.linalg.norm(up)).tolist()}
 
 
