@@ -45,6 +45,7 @@ _NAMES_OF_MODULES = {
     "matchers.nearest": ("NearestOptions",),
     "pairs.lists": ("PairOptions",),
     "progress": ("Progress",),
+    "project.reasons": ("Doubt", "Missing"),
     "project.report": ("ModelSummary", "ReconstructionReport", "StageReport"),
     "recipes": ("ExtractionOptions", "Recipe", "load_recipe", "recipe_names"),
     "project.line_report": ("LineReport",),

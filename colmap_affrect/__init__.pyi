@@ -57,6 +57,8 @@ from colmap_affrect.pipeline import run as run
 from colmap_affrect.pipeline import verify as verify
 from colmap_affrect.progress import Progress as Progress
 from colmap_affrect.project.line_report import LineReport as LineReport
+from colmap_affrect.project.reasons import Doubt as Doubt
+from colmap_affrect.project.reasons import Missing as Missing
 from colmap_affrect.project.report import ModelSummary as ModelSummary
 from colmap_affrect.project.report import ReconstructionReport as ReconstructionReport
 from colmap_affrect.project.report import StageReport as StageReport

@@ -9,6 +9,7 @@ from small_comparison import IMAGE_SIZE, write_scene
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import (
     Advice,
     Bridge,
@@ -34,7 +35,7 @@ def small_report(folder: Path) -> ReconstructionReport:
         90,
         3.5,
         0.25,
-        doubtful={NAMES[3]: "hangs on few <points>"},
+        doubtful={NAMES[3]: (Doubt("mirrored_copy", {"original": "<b>.jpg"}),)},
         probabilities=dict(zip(NAMES, (0.99, 0.95, 0.7, 0.4), strict=False)),
         bridges={NAMES[2]: Bridge(NAMES[0], 12, 15, 0.031)},
     )
@@ -45,7 +46,7 @@ def small_report(folder: Path) -> ReconstructionReport:
     failure = f"{folder / 'photographs' / 'f.png'}: not a readable image"
     return ReconstructionReport(
         images_total=6,
-        unregistered={NAMES[4]: "no verified pair", NAMES[5]: "unreadable"},
+        unregistered={NAMES[4]: Missing("no_verified_pair"), NAMES[5]: Missing("unreadable")},
         models=(model,),
         num_verified_pairs=15,
         num_pairs=15,

@@ -299,7 +299,7 @@ def test_a_notebook_shows_counts_photographs_and_what_to_try(
     }  # fmt: skip
     assert pairs[NAMES[0]] == "99%"
     assert pairs["c.png"] == "70%"
-    assert pairs["40%"] == "doubtful: hangs on few <points>"
+    assert pairs["40%"] == "doubtful: may be a mirrored copy of <b>.jpg"
     assert pairs["e.png"] == "no verified pair"
     assert pairs["Try: one camera"].startswith("colmap-affrect run")
     assert text[-1] == str(tmp_path / "out")

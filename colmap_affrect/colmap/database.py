@@ -154,16 +154,6 @@ def num_matched_pairs(path: Path) -> int:
     )
 
 
-def keypoint_counts(path: Path) -> dict[str, int]:
-    """Return the number of keypoints of each image that has some on record, also none, by name."""
-    with open_database(path) as database:
-        return {
-            image.name: database.num_keypoints_for_image(image.image_id)
-            for image in database.read_all_images()
-            if database.exists_keypoints(image.image_id)
-        }
-
-
 def unverified_pairs(path: Path) -> Indices:
     """Return the (N, 2) image ids with raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:

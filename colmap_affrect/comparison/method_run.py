@@ -41,6 +41,7 @@ from colmap_affrect.progress import SILENT, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_bytes, replace_text
 from colmap_affrect.project.outputs import new_results, remove_own, temporary_folder
 from colmap_affrect.project.paths import GivenPath, PathLike
+from colmap_affrect.project.reasons import texts_of
 from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary
@@ -331,7 +332,7 @@ class MethodRun:
             mean_track_length=largest.mean_track_length,
             mean_reprojection_error_px=largest.mean_reprojection_error_px,
             sure=largest.sure,
-            doubtful=largest.doubtful,
+            doubtful=texts_of(largest.doubtful),
             wall_s=watch.seconds,
         )
 

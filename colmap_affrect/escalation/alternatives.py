@@ -197,8 +197,8 @@ def _map_copy(context: Context, mapper: Mapper, choice: Choice, target: Path) ->
 
 def _choose(context: Context, choice: Choice, folder: Path, notes: Mapping[str, Any]) -> None:
     """Choose matches, and keep in mind that the models in a folder are to follow them."""
-    there_is_a_model = {CLIMBING: context.matches.note(FINISHED), RESTORING: folder.name}
-    context.matches.choose(choice.matches, choice.measured_worths, **there_is_a_model, **notes)
+    of_models = {CLIMBING: context.matches.note(FINISHED), RESTORING: folder.name}
+    context.matches.choose(choice.matches, choice.measured_worths, **of_models, **notes)
 
 
 def take_over_chosen(escalation: Escalation) -> None:

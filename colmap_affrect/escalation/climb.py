@@ -30,7 +30,7 @@ from colmap_affrect.stages.map import map_images
 
 
 def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
-    """Map, and match again, until nothing helps; ``sparse/`` has the last model.
+    """Map, and match again, until nothing helps; ``sparse/`` has the best models found.
 
     A killed run goes on: once pairs are matched again, the first model is not made anew.
 

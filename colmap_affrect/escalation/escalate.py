@@ -8,9 +8,9 @@ other. Which pairs are matched again, and at which level, is decided anew after 
 (:mod:`colmap_affrect.escalation.set_state`); the step that has begun is on record, so that a killed
 run goes on in the same way.
 
-Images are matched again that the model before has not, or is not sure of. While there is none,
-those that have no strong pair, or few features in tracks through three; a small set is mapped when
-one has.
+Images are matched again that are missing in the model, or that it is not sure of. While there is
+no model, these are the images without a strong pair and those with few features in tracks through
+three images; a small set is mapped as soon as one image has a strong pair.
 """
 
 import logging

@@ -139,7 +139,8 @@ class Situation:
         """Return the best step of a level within a budget."""
         weights = dict(self.weights)
         if not self.is_measured(number):
-            # Frames that are not measured take like for same: not for images that others anchor.
+            # Features without shapes mistake similar things for the same: images that others anchor
+            # do not need them.
             for name in self.anchored:
                 weights.pop(name, None)
         gain = self.gain(number, weights)

@@ -42,14 +42,11 @@ class SetState:
 
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of the pairs that may be used, 0 of those that are not verified."""
-        ids = self.context.graph.ids
         verified = self.context.num_verified_inliers()
         found = dict[Pair, int]()
-        for first, second in self.pairs:
-            are_there = first in ids and second in ids
-            if are_there and self.context.by_hand.allows(first, second):
-                count = verified.get((first, second)) or verified.get((second, first), 0)
-                found[first, second] = count
+        for first, second in self.context.usable(self.pairs):
+            count = verified.get((first, second)) or verified.get((second, first), 0)
+            found[first, second] = count
         return found
 
     def models(self) -> list[ModelSummary]:

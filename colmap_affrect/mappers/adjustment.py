@@ -182,6 +182,29 @@ class Adjuster:
             return math.inf
         return float(summary.final_cost) / self.noise_px**2
 
+    def pose_covariance(self, model: pycolmap.Reconstruction) -> pycolmap.BACovariance | None:
+        """Return the covariance of the poses of a model that has been adjusted.
+
+        Three points are held, which changes nothing of what does not depend on the frame of the
+        model, as relative directions. It is in units in which keypoints have a variance of one.
+
+        Returns:
+            The covariance, None where it cannot be computed.
+        """
+        images = sorted(model.reg_image_ids())
+        cameras = {model.images[image_id].camera_id for image_id in images}
+        config = self._config(model, images, cameras & self.constant, fix_gauge=False)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
+        options = self._options(model)
+        problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+        self._add_tie_points(problem, model)
+        for key in sorted(cameras - self.constant):
+            if problem.has_parameter_block(model.cameras[key].params):
+                self._add_prior(problem, model.cameras[key])
+        wanted = pycolmap.BACovarianceOptions()
+        wanted.params = pycolmap.BACovarianceOptionsParams.POSES
+        return pycolmap.estimate_ba_covariance_from_problem(wanted, model, problem)
+
     def _options(self, model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentOptions:
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
         options.refine_focal_length = self.refining.refine_focal_length

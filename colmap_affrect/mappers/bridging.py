@@ -1,10 +1,10 @@
-"""Bridges: images that one verified pair alone connects with a model.
+"""Bridges: images that are registered by the relative pose of one verified pair.
 
 The pair gives rotation and direction of translation, but not the scale, since its features are
 not those whose depth the model knows. They lie beside them, though: the ratio of the depths of the
 model to those of the pair, at neighbouring positions, is the scale
 (:mod:`colmap_affrect.geometry.two_views`).
-A bridge is scored by all other verified pairs of the image that it brings in.
+Bridges are ranked by all verified pairs of an image with the model.
 """
 
 from collections.abc import Iterator

@@ -120,7 +120,7 @@ def fitting_focals(
         priors: Priors of the focal lengths, by camera id.
 
     Returns:
-        The focal lengths in px by id of the camera. None where freeing the given ones lowers the
+        The focal lengths in px by id of the camera. Empty where freeing the given ones lowers the
         cost by less than free parameters are worth (BIC): half the logarithm of the number of
         observations each, of which those in one cell of an image count once.
     """

@@ -162,7 +162,7 @@ def map_database(
             found = mapper.map(whole, raw, mapper.options.random_seed, progress.show)
             remove_own([raw])
         scored = [_without_wrong_images(model, task) for model in found]
-        kept = [model for model in scored if model.confidences]
+        kept = _large_enough(scored, 1 if task.extend else mapper.options.min_model_size)
         kept.sort(key=lambda model: model.size, reverse=True)
         summaries = _write_models(kept, task, partial)
         remove_own([sparse_path])
@@ -170,6 +170,11 @@ def map_database(
     finally:
         _remove_unfinished(partial)
     return summaries
+
+
+def _large_enough(models: Sequence[_ScoredModel], min_num_images: int) -> list[_ScoredModel]:
+    """Return the models of which so many images are left."""
+    return [model for model in models if len(model.confidences) >= min_num_images]
 
 
 def _remove_unfinished(partial: Path) -> None:
@@ -278,9 +283,9 @@ def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
         kept = kept_probability(one.probability)
         probabilities[name] = kept
         if kept < DOUBTFUL:
-            doubtful[name] = one.reason
+            doubtful[name] = one.reasons
         elif kept < SURE:
-            unsure[name] = one.reason
+            unsure[name] = one.reasons
     return ModelSummary(
         registered_names=tuple(sorted(focals_px)),
         num_points3D=model.num_points3D(),
@@ -291,7 +296,7 @@ def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
         doubtful=doubtful,
         unsure=unsure,
         bridges={name: bridge for name, bridge in bridges.items() if name in focals_px},
-        taken_out={name: one.reason for name, one in scored.taken_out.items()},
+        taken_out={name: one.reasons for name, one in scored.taken_out.items()},
         focals_px=focals_px,
         moves=scored.mapped.moves,
         tie_points=tie_points_of(task, graph).report(model),

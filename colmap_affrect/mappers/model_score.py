@@ -67,8 +67,8 @@ class ModelScorer:
     def track_log_ratios(self, model: pycolmap.Reconstruction) -> dict[int, float]:
         """Return the log-likelihood ratio of each image's features that two others match.
 
-        Cells of the image that hold such features count as often as is the share of these features
-        that observe a point seen by three images or more.
+        Right are as many of the grid cells of the image that hold such features as is the share of
+        these features whose point three images see, or more.
         """
         num_partners = self._num_partners(model)
         points = {image_id: seen_points(model.images[image_id]) for image_id in num_partners}

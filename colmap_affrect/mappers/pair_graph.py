@@ -30,7 +30,8 @@ CameraById = Mapping[int, pycolmap.Camera]  # by image id
 
 # An inlier agrees with poses up to this Sampson error, the larger of the two.
 MAX_ERROR_PX = 4.0  # COLMAP's limit for observations (filter_max_reproj_error)
-MAX_ERROR = 0.003  # of the longer side: features of a shrunk photograph (judged)
+MAX_ERROR = 0.003
+"""Of the longer side, of a match that a pose explains: 3 px of photographs shrunk to 1,000 (judged)."""
 MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
 MAX_MATCHES = 500  # inliers of a pair that are sampled for agreement and relative poses
@@ -242,7 +243,7 @@ class PairGraph:
         """Return the relative poses that explain a pair, the likeliest one first.
 
         The first one is of its essential matrix, the others are those into which its homography
-        can be decomposed: of a plane seen twice both solutions may have all points before both
+        can be decomposed: of a plane seen twice both solutions may have all points in front of both
         cameras, so that only other pairs can tell which one is right.
 
         Args:
@@ -281,7 +282,7 @@ class PairGraph:
 
 @lru_cache(maxsize=1)
 def graph_of(task: MappingTask, min_num_matches: int) -> PairGraph:
-    """Return the graph of what is to be mapped; of one task it is read once."""
+    """Return the graph of what is to be mapped; what was asked for last is not read again."""
     return PairGraph.read(task.database_path, min_num_matches)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.focal_observability import MAX_GROWTH, MIN_GROWTH
 from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
+from colmap_affrect.project.reasons import Doubt
 
 # Shapes of the terms, judged where the share of right photographs no longer changes.
 LOG_RATIO_SCALE = 3.0  # log-likelihood ratio, from which on more counts by its logarithm only
@@ -25,15 +26,11 @@ MAX_LOG_SPREAD = 0.5  # of focal lengths: farther apart they are no surer parts 
 # A bridge edge between two components may be of two scenes, found by chance among all pairs.
 CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (judged)
 CHANCE_SCALE = 10.0  # inliers more that make the former less likely by a factor of e (judged)
+MAX_ERROR_DEG = 5.0  # of poses that count as right, in BENCHMARKS and in the fit
+MIN_SIGMA_DEG = 1e-3  # of directions; they are divided by
 MIN_LOSS = 0.7  # of the log odds: what takes less, half of the odds, is no reason to doubt
 NUM_REASONS = 2  # that are said of a photograph
 
-FOCAL_CONTRADICTED = "the given focal length does not fit"
-FOCAL_UNKNOWN = "any focal length fits"
-CONTRADICTIONS = (
-    "most of its matches disagree with this position",
-    "of the matches of its pairs agree with the model",
-)
 COEFFICIENTS = Path(__file__).with_suffix(".json")
 
 
@@ -42,7 +39,7 @@ class Term:
     """A term of the regression."""
 
     value: Callable[[ReliabilityFeatures], float]  # the larger the surer
-    reason: Callable[[ReliabilityFeatures], str]  # what to say where it is small
+    reason: Callable[[ReliabilityFeatures], Doubt]  # what to doubt where it is small
 
 
 def _log_ratio(features: ReliabilityFeatures) -> float:
@@ -51,75 +48,70 @@ def _log_ratio(features: ReliabilityFeatures) -> float:
     return math.copysign(math.log1p(abs(log_ratio) / LOG_RATIO_SCALE), log_ratio)
 
 
-def _log_ratio_reason(features: ReliabilityFeatures) -> str:
+def _log_ratio_reason(features: ReliabilityFeatures) -> Doubt:
     if features.log_likelihood_ratio < 0.0:
-        return CONTRADICTIONS[0]
-    return "few matches support its position"
+        return Doubt("matches_disagree")
+    return Doubt("few_matches")
 
 
 def _agreement(features: ReliabilityFeatures) -> float:
     return features.agreement
 
 
-def _agreement_reason(features: ReliabilityFeatures) -> str:
-    percent = math.floor(100.0 * features.agreement)
-    return f"only {percent}% {CONTRADICTIONS[1]}"
+def _agreement_reason(features: ReliabilityFeatures) -> Doubt:
+    return Doubt("little_agreement", {"percent": math.floor(100.0 * features.agreement)})
 
 
 def _three_view_points(features: ReliabilityFeatures) -> float:
     return math.log1p(min(features.num_three_view_points, MAX_THREE_VIEW_POINTS))
 
 
-def _three_view_points_reason(features: ReliabilityFeatures) -> str:
+def _three_view_points_reason(features: ReliabilityFeatures) -> Doubt:
     num = features.num_three_view_points
     if not num:
-        return "none of its points is seen by two other photographs"
-    return f"only {num} of its points are seen by two other photographs"
+        return Doubt("no_three_view_points")
+    return Doubt("few_three_view_points", {"num": num})
 
 
 def _focal_observability(features: ReliabilityFeatures) -> float:
     return math.log(min(max(features.focal_growth, MIN_GROWTH), MAX_GROWTH))
 
 
-def _focal_observability_reason(_: ReliabilityFeatures) -> str:
-    return f"{FOCAL_UNKNOWN}, and the position of the camera depends on that"
+def _focal_observability_reason(_: ReliabilityFeatures) -> Doubt:
+    return Doubt("focal_unknown")
 
 
 def _given_focal(features: ReliabilityFeatures) -> float:
     return -float(features.fitting_focal_px > 0.0)
 
 
-def _given_focal_reason(features: ReliabilityFeatures) -> str:
-    given_px = features.focal_px
-    return f"{FOCAL_CONTRADICTED}, {given_px:.0f} px: {features.fitting_focal_px:.0f} px does"
+def _given_focal_reason(features: ReliabilityFeatures) -> Doubt:
+    values = {"given_px": features.focal_px, "fitting_px": features.fitting_focal_px}
+    return Doubt("focal_contradicted", {**values})
 
 
 def _parallax(features: ReliabilityFeatures) -> float:
     return -max(features.pure_rotation_ratio, USUAL_ROTATION_RATIO)
 
 
-def _parallax_reason(features: ReliabilityFeatures) -> str:
-    ratio = features.pure_rotation_ratio
-    return f"a camera that only turned explains {ratio:.0%} of the matches: no parallax"
+def _parallax_reason(features: ReliabilityFeatures) -> Doubt:
+    return Doubt("no_parallax", {"share": features.pure_rotation_ratio})
 
 
 def _mirrored_copy(features: ReliabilityFeatures) -> float:
     return -float(bool(features.mirrored_original))
 
 
-def _mirrored_copy_reason(features: ReliabilityFeatures) -> str:
-    return f"may be a mirrored copy of {features.mirrored_original}"
+def _mirrored_copy_reason(features: ReliabilityFeatures) -> Doubt:
+    return Doubt("mirrored_copy", {"original": features.mirrored_original})
 
 
 def _focal_spread(features: ReliabilityFeatures) -> float:
     return -min(math.log(features.focal_spread), MAX_LOG_SPREAD)
 
 
-def _focal_spread_reason(features: ReliabilityFeatures) -> str:
-    return (
-        "focal lengths of photographs of its size are up to "
-        f"{features.focal_spread:.2f} times apart: some may be parts of others"
-    )
+def _focal_spread_reason(features: ReliabilityFeatures) -> Doubt:
+    return Doubt("focal_spread", {"ratio": features.focal_spread})
 
 
 TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
@@ -140,16 +132,16 @@ class Confidence:
     """How sure a model is of a photograph."""
 
     probability: float  # that its pose is right
-    reason: str  # what speaks most against that, empty if nothing does
+    reasons: tuple[Doubt, ...]  # what speaks most against that
     gain: float = 0.0  # what more matches may add to the probability
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class _Loss:
     """What something takes from the log odds."""
 
     log_odds: float
-    reason: str
+    reason: Doubt
 
 
 @dataclass(frozen=True)
@@ -197,11 +189,8 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
     coefficients = _coefficients()
     log_odds = coefficients.constant + features.tie_point_log_odds
     odds_of_two_scenes = _odds_of_two_scenes(features)
-    edge = f"the {features.num_bridge_inliers} inliers of {features.bridge_edge}"
-    losses = [
-        _Loss(-features.tie_point_log_odds, "its tie points disagree"),
-        _Loss(math.log1p(odds_of_two_scenes), f"with others it hangs on {edge} alone"),
-    ]
+    share_of_directions = _share_of_directions(features)
+    losses = _other_losses(features)
     mendable = 0.0
     for name, fitted in coefficients.terms.items():
         value = TERMS[name].value(features)
@@ -210,10 +199,24 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
         losses.append(loss)
         if name in OF_MATCHES:
             mendable += max(0.0, loss.log_odds)
-    probability = _probability(log_odds) / (1.0 + odds_of_two_scenes)
-    return Confidence(
-        probability, _main_reasons(losses), _probability(log_odds + mendable) - probability
-    )
+    probability = _probability(log_odds) * share_of_directions / (1.0 + odds_of_two_scenes)
+    with_matches = _probability(log_odds + mendable) * share_of_directions
+    return Confidence(probability, _main_reasons(losses), with_matches - probability)
+
+
+def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
+    """Return what is taken beside the terms of the regression."""
+    losses = [_Loss(-features.tie_point_log_odds, Doubt("tie_points_disagree"))]
+    if features.bridge_edge:
+        odds = _odds_of_two_scenes(features)
+        num_inliers = features.num_bridge_inliers
+        edge = Doubt("bridge_edge", {"num_inliers": num_inliers, "pair": features.bridge_edge})
+        losses.append(_Loss(math.log1p(odds), edge))
+    if features.direction_sigma_deg:
+        share = _share_of_directions(features)
+        near = Doubt("near_others", {"sigma_deg": features.direction_sigma_deg})
+        losses.append(_Loss(-math.log(share), near))
+    return losses
 
 
 def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:
@@ -223,12 +226,21 @@ def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:
     return math.exp((CHANCE_INLIERS - features.num_bridge_inliers) / CHANCE_SCALE)
 
 
+def _share_of_directions(features: ReliabilityFeatures) -> float:
+    """Return the probability that noise moves the directions to others by less than the limit.
+
+    Both angles of a direction are normal, with half of the variance each.
+    """
+    sigma_deg = max(features.direction_sigma_deg, MIN_SIGMA_DEG)
+    return -math.expm1(-((MAX_ERROR_DEG / sigma_deg) ** 2))
+
+
 def _probability(log_odds: float) -> float:
     return 1.0 / (1.0 + math.exp(-log_odds))
 
 
-def _main_reasons(losses: list[_Loss]) -> str:
+def _main_reasons(losses: list[_Loss]) -> tuple[Doubt, ...]:
     """Return the reasons of the largest losses, of one where none is large."""
-    worst = sorted((loss for loss in losses if loss.log_odds >= MIN_LOSS), reverse=True)
-    shown = worst[:NUM_REASONS] or [max(losses)]
-    return "; ".join(loss.reason for loss in shown)
+    ranked = sorted(losses, key=lambda loss: -loss.log_odds)
+    worst = [loss for loss in ranked[:NUM_REASONS] if loss.log_odds >= MIN_LOSS]
+    return tuple(loss.reason for loss in worst or ranked[:1])

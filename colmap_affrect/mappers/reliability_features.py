@@ -9,14 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import connected_parts, lone_ties
 from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
-from colmap_affrect.mappers.adjustment import focal_priors
+from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster, focal_priors
 from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.direction_uncertainty import direction_sigmas_deg
 from colmap_affrect.mappers.focal_observability import fitting_focals, focal_growths
 from colmap_affrect.mappers.model_score import ModelScorer, pair_log_ratio
 from colmap_affrect.mappers.pair_graph import (
+    MAX_ERROR,
     MIN_NUM_MATCHES,
     MIN_SHARE,
     Ids,
@@ -27,7 +30,7 @@ from colmap_affrect.mappers.pair_graph import (
     sampling_step,
 )
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
-from colmap_affrect.mappers.tie_points import tie_point_log_odds, tie_points_of
+from colmap_affrect.mappers.tie_points import TiePoints, tie_point_log_odds, tie_points_of
 
 # The terms of the regression are fitted to features that are measured with these numbers, which
 # are judged on the benchmark scenes; after a change fit again.
@@ -36,7 +39,6 @@ MIN_TOLD = 0.03
 parts of photographs it is 0.15."""
 NUM_ROTATION_PAIRS = 4  # strongest pairs of a frame that are compared with a pure rotation
 MAX_ROTATION_PAIRS = 300  # the same of a model, to save time
-MAX_ROTATION_ERROR = 0.003  # longer sides, of a match that a rotation explains, as in verification
 MIN_MIRRORED_SHARE = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
 images a tenth by chance."""
@@ -67,6 +69,8 @@ class ReliabilityFeatures:
     bridge_edge: str
     """The pair without which it and others, at most half of all, would be apart, or empty."""
     num_bridge_inliers: int  # of that pair
+    direction_sigma_deg: float = 0.0
+    """Deviation that the directions of translation to at least half of the others do not exceed."""
 
 
 class _ModelContext:
@@ -130,9 +134,10 @@ def features_of(
     originals = _mirrored_originals(context)
     fitting_focals_px = fitting_focals(context.model, task, context.priors)
     focal_spreads = _focal_spreads(context, growths)
-    residuals = tie_points_of(task, context.graph).residuals(context.model)
-    log_odds = tie_point_log_odds(residuals)
+    tie_points = tie_points_of(task, context.graph)
+    log_odds = tie_point_log_odds(tie_points.residuals(context.model))
     bridges = _bridge_edges(context)
+    directions_deg = _direction_sigmas_deg(context, tie_points)
     names = context.graph.names
     found = {}
     for image_id in context.pairs_of:
@@ -154,6 +159,7 @@ def features_of(
             tie_point_log_odds=log_odds.get(image_id, 0.0),
             bridge_edge=" - ".join(names[i] for i in bridge.ids) if bridge else "",
             num_bridge_inliers=len(bridge.matches) if bridge else 0,
+            direction_sigma_deg=directions_deg.get(image_id, 0.0),
         )
     return found
 
@@ -197,7 +203,7 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
     step = sampling_step(len(strongest), MAX_ROTATION_PAIRS)
     for pair in list(strongest.values())[::step]:
         sizes = context.graph.sizes(pair.ids)
-        max_error_px = MAX_ROTATION_ERROR * max(map(max, sizes))
+        max_error_px = MAX_ERROR * max(map(max, sizes))
         points1, points2 = context.graph.points(pair)
         found[pair.ids] = pure_rotation_ratio(points1, points2, sizes, max_error_px)
     return found
@@ -211,6 +217,15 @@ def _pure_rotation_ratio(
     own = [ratios[pair.ids] for pair in with_frame if pair.ids in ratios]
     known = own or list(ratios.values())
     return float(np.mean(known)) if known else 0.0
+
+
+def _direction_sigmas_deg(context: _ModelContext, tie_points: TiePoints) -> dict[int, float]:
+    """Return how uncertain the directions from each image to others are, with its priors."""
+    recorded = context.priors.keys() & context.task.cameras.keys()
+    fixed = frozenset(key for key in recorded if context.task.cameras[key].is_fixed)
+    refining = pycolmap.BundleAdjustmentOptions()
+    adjuster = Adjuster(context.priors, NOISE_PX, refining, fixed, tie_points=tie_points)
+    return direction_sigmas_deg(context.model, adjuster)
 
 
 def _mirrored_originals(context: _ModelContext) -> dict[int, int]:

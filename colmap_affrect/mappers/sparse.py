@@ -32,6 +32,7 @@ SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
 OWN_CAMERAS = "with a camera for each photograph"
 
+FORWARD_MOTION = "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
 
 
@@ -81,7 +82,8 @@ class SparseMapper(IncrementalMapper):
 
         is_small = len(graph.keypoints) < LARGE and not task.extend
         if is_small:
-            native.mapper.init_max_forward_motion = 1.0  # the score decides on such pairs
+            if FORWARD_MOTION not in self.options.mapper_options:
+                native.mapper.init_max_forward_motion = 1.0  # the score decides on such pairs
             return self._map_small(task, graph, native, show_or_stop)
         search = self._search(task, graph, native, show_or_stop)
         search = replace(search, num_starts=1)

@@ -82,6 +82,7 @@ def _ranks(num_features: Indices, num_images: Indices) -> Indices:
         num_images: Images that these are of, (T,).
     """
     is_ambiguous = num_features > num_images
+    # The seed is fixed: what is left out does not depend on the seed of mapping.
     by_chance = np.random.default_rng(0).random(len(num_images))
     order = np.lexsort((by_chance, -num_images, is_ambiguous))
     ranks = np.empty(len(order), np.int64)

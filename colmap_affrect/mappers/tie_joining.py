@@ -59,7 +59,8 @@ class TieJoiner:
     def join(self, models: Sequence[MappedModel]) -> list[MappedModel]:
         """Return models with all that joins them, and all tie points observed; large ones first.
 
-        Bridges go on from there. Images that their tie points contradict get new poses.
+        Bridges go on from there. Images that their tie points
+        contradict are taken out, and registered again where these allow it.
         """
         if not self.points.keypoints:
             return list(models)

@@ -26,6 +26,7 @@ SCORE = re.compile(r"(?<![\s,])[\s,]+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+
 MAX_SUGGESTIONS = 8  # words of a line for which names that are like them are looked for
 LONGEST_LINE = 1 << 13  # characters: systems have no longer paths than half of it
 AT_ONCE = 1 << 16  # pairs that are given names together
+USUAL_IMAGES_IN_MEMORY = 40  # with 13,000 features each, while pairs are gone through
 
 
 class PairList(Sequence[Pair]):

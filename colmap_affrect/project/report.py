@@ -12,6 +12,7 @@ from typing import Any
 from colmap_affrect.errors import such_as
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.line_report import LineReport
+from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
 
 NUM_WORST = 3  # tie points that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
@@ -268,13 +269,13 @@ class ModelSummary:
     """Probability of each image that its pose is right within 5 degrees."""
     gains: dict[str, float] = field(default_factory=dict)
     """What more matches may add to these probabilities."""
-    doubtful: dict[str, str] = field(default_factory=dict)
+    doubtful: dict[str, tuple[Doubt, ...]] = field(default_factory=dict)
     """Why images are rather wrong than right."""
-    unsure: dict[str, str] = field(default_factory=dict)
+    unsure: dict[str, tuple[Doubt, ...]] = field(default_factory=dict)
     """Why images are neither sure nor doubtful."""
     bridges: dict[str, Bridge] = field(default_factory=dict)
     """How images came in that are in no track through three images."""
-    taken_out: dict[str, str] = field(default_factory=dict)
+    taken_out: dict[str, tuple[Doubt, ...]] = field(default_factory=dict)
     """Why images that were surely wrong were taken out."""
     focals_px: dict[str, float] = field(default_factory=dict)
     """Focal length of the camera of each image."""
@@ -298,8 +299,8 @@ class ModelSummary:
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
         lines = _some(f"joined      {name} {one.text()}" for name, one in self.bridges.items())
-        lines += _some(f"unsure      {line}" for line in by_story(self.unsure))
-        lines += _some(f"doubtful    {line}" for line in by_story(self.doubtful))
+        lines += _some(f"unsure      {line}" for line in by_story(texts_of(self.unsure)))
+        lines += _some(f"doubtful    {line}" for line in by_story(texts_of(self.doubtful)))
         alike = (f"one view    {a} and {b}: no depth between them" for a, b in self.one_view)
         lines += _some(alike)
         return [
@@ -329,7 +330,7 @@ class ReconstructionReport(Summarized):
 
     images_total: int
     """Number of photographs."""
-    unregistered: dict[str, str]
+    unregistered: dict[str, Missing]
     """Why images are in no model or in a smaller one, by their names."""
     models: tuple[ModelSummary, ...]
     """The models, the largest first, as written to ``sparse/0``, ``sparse/1`` and so on."""
@@ -423,6 +424,9 @@ class ReconstructionReport(Summarized):
             "images_registered": len(largest.registered_names),
             **{key: getattr(largest, key) for key in OF_LARGEST},
             **found,
+            "unregistered": {name: why.to_mapping() for name, why in self.unregistered.items()},
+            "unsure": mappings_of(largest.unsure),
+            "doubtful": mappings_of(largest.doubtful),
             "points3D": largest.num_points3D,
             "bridges": {name: asdict(bridge) for name, bridge in largest.bridges.items()},
             "tie_points": [asdict(residual) for residual in largest.tie_points],
@@ -445,7 +449,8 @@ class ReconstructionReport(Summarized):
         if self.extended:
             lines += [f"extended    {len(self.extended)} were there, {len(self.added)} came in"]
             lines += [f"            new {name}" for name in self.added]
-        lines += _some(f"        not {line}" for line in by_story(self.unregistered))
+        missing = {name: why.text() for name, why in self.unregistered.items()}
+        lines += _some(f"        not {line}" for line in by_story(missing))
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
         lines += _some(f"by hand     {text}" for text in self.by_hand)
         if self.guided:

@@ -42,6 +42,7 @@ Names = tuple[str, str]  # of a pair of images
 
 MAX_INT16 = 32767
 NOT_KNOWN = Content()
+PAIRS_PER_WRITE = 64  # a run that is ended loses at most as many
 # Notes of matches:
 STATIONARY = "stationary_cells"  # [size, cells] of the places that never move
 STEP = "step"  # level and pairs of the step of escalation that has begun and not ended
@@ -51,7 +52,7 @@ CLIMBING = "climbing_list"  # the same, of which there was a model before pairs 
 EFFORT = "effort"  # how much was tried for images in need
 LEARNING = "learning"  # level and pairs of learned matching that is kept beside what is there
 LOOKED_AT = "learned_looked_at"  # what models of learned matches are worth, and of which pairs
-RESTORING = "restoring"  # matches are those of better models before, the models not yet
+RESTORING = "restoring"  # folder of the models that the matches are of, and that follow them
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""

@@ -1,7 +1,6 @@
 """What may help photographs that are missing or doubtful, with commands to paste."""
 
 import itertools
-import re
 import shlex
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -10,9 +9,9 @@ from pathlib import Path
 from colmap_affrect.errors import such_as
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.parallel.executor import available_cores
+from colmap_affrect.project.reasons import Doubt, DoubtCode
 from colmap_affrect.project.report import Advice, MatchedAgain, ModelSummary
 from colmap_affrect.project.tables import as_row
 from colmap_affrect.session.context import Context, Inputs
@@ -20,7 +19,8 @@ from colmap_affrect.session.context import Context, Inputs
 STRONGEST = "default"  # of the recipes
 ENOUGH = 100  # inliers of a pair that make a model wherever it shows depth
 MIN_GAIN = 0.05  # of a probability, by more matches
-FITTING_PX = re.compile(rf"{FOCAL_CONTRADICTED}, .*?(\d+) px does")
+CONTRADICTED: Collection[DoubtCode] = ("matches_disagree", "little_agreement")
+"""Doubts of photographs whose matches are rather wrong than few."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,14 @@ class _Case:
         return self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
 
     @property
-    def doubts(self) -> str:
+    def doubts(self) -> list[Doubt]:
         """Why images are doubtful or were taken out."""
-        return "; ".join([*self.model.doubtful.values(), *self.model.taken_out.values()])
+        of_images = [*self.model.doubtful.values(), *self.model.taken_out.values()]
+        return list(itertools.chain.from_iterable(of_images))
+
+    def has_doubt(self, codes: Collection[DoubtCode]) -> bool:
+        """Return whether an image is doubted for one of some reasons."""
+        return any(doubt.code in codes for doubt in self.doubts)
 
     @property
     def inputs(self) -> Inputs | None:
@@ -95,11 +100,12 @@ def advice(
 
 
 def _of_fitting_focal(case: _Case) -> list[Advice]:
-    fitting = FITTING_PX.search(case.doubts)
-    if not (case.may_change_cameras and fitting):
+    contradicted = [doubt for doubt in case.doubts if doubt.code == "focal_contradicted"]
+    if not (case.may_change_cameras and contradicted):
         return []
-    why = f"{FOCAL_CONTRADICTED}, {fitting[1]} px does"
-    return [Advice(why, _anew(case.context, "--focal-length-px", fitting[1]))]
+    fitting_px = f"{contradicted[0].values['fitting_px']:.0f}"
+    why = f"the given focal length does not fit, {fitting_px} px does"
+    return [Advice(why, _anew(case.context, "--focal-length-px", fitting_px))]
 
 
 def _of_other_recipe(case: _Case) -> list[Advice]:
@@ -134,7 +140,7 @@ def _of_bridges(case: _Case) -> list[Advice]:
 
 
 def _of_unknown_focal(case: _Case) -> list[Advice]:
-    if not (case.may_change_cameras and FOCAL_UNKNOWN in case.doubts):
+    if not (case.may_change_cameras and case.has_doubt(["focal_unknown"])):
         return []
     why = "give lens and film, plate or sensor; if you do not know them, try a normal lens"
     return [Advice(why, _anew(case.context, "--focal-mm", "50", "--film-width-mm", "36"))]
@@ -144,7 +150,7 @@ def _of_masks(case: _Case) -> list[Advice]:
     inputs = case.inputs
     if not (inputs and inputs.masks == MaskOptions()):
         return []
-    if not any(text in case.doubts for text in CONTRADICTIONS):
+    if not case.has_doubt(CONTRADICTED):
         return []
     why = "mask what moves, repeats or is written on photographs (black, in a folder masks)"
     return [Advice(why, _anew(case.context, "--mask-path", "masks"))]

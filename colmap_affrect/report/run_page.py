@@ -14,6 +14,7 @@ from colmap_affrect.colmap.database import read_cameras
 from colmap_affrect.errors import such_as
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.reasons import FATES, Doubt, text_of, texts_of
 from colmap_affrect.project.report import (
     MAX_LINES,
     SOURCES,
@@ -146,7 +147,8 @@ def _kinds_legend(views: Sequence[View3D]) -> dict[str, str]:
 def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
     """Return what became of a photograph."""
     if name not in model.registered_names:
-        text = report.unregistered.get(name, "not registered")
+        why = report.unregistered.get(name)
+        text = why.text() if why else FATES["not_registered"]
         if name in report.failures:
             text += f": {report.failures[name]}"
         return Card(name, "missing", text, ("all", "missing"))
@@ -164,26 +166,30 @@ def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
     if name in model.probabilities:
         text += f", right with a probability of {probability_text(model.probabilities[name])}"
     if name in model.unsure:
-        why = model.unsure[name]
-        reasons = list(model.unsure.values())
-        text += "; not sure" + f": {why}" * (reasons.count(why) == 1)
+        text += "; not sure" + _own_reason(name, model.unsure)
     if name in model.doubtful:
         kind = "doubtful"
-        text += "; doubtful"
+        text += "; doubtful" + _own_reason(name, model.doubtful)
         groups.append("doubtful")
-        reason = model.doubtful[name]
-        if list(model.doubtful.values()).count(reason) == 1:  # else it is above the sheet only
-            text += f": {reason}"
     return Card(name, kind, text, tuple(groups))
+
+
+def _own_reason(name: str, doubts: Mapping[str, tuple[Doubt, ...]]) -> str:
+    """Return why an image is doubted; nothing where others are for the same reason.
+
+    Such a reason is above the sheet only.
+    """
+    reasons = doubts[name]
+    return f": {text_of(reasons)}" if list(doubts.values()).count(reasons) == 1 else ""
 
 
 def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     """Return what cannot be trusted, or why there is no model and what became of photographs."""
     if report.models:
-        unsure = [f"not sure: {line}" for line in by_story(model.unsure)]
-        return by_story(model.doubtful) + unsure
+        unsure = [f"not sure: {line}" for line in by_story(texts_of(model.unsure))]
+        return by_story(texts_of(model.doubtful)) + unsure
     why = report.why_no_model
-    fates = {name: fate.partition(";")[0] for name, fate in report.unregistered.items()}
+    fates = {name: why.fate() for name, why in report.unregistered.items()}
     return [f"{why[0].upper()}{why[1:]}.", *by_story(fates)]
 
 

@@ -12,6 +12,7 @@ from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.errors import NoModelError, OptionError, shown
 from colmap_affrect.options import documented
 from colmap_affrect.project.line_report import LineReport, line_report
+from colmap_affrect.project.reasons import text_of
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
@@ -101,9 +102,9 @@ class RunReport(ReconstructionReport):
         for name in self.registered_names:
             chance = model.probabilities.get(name) if model else None
             percent = "" if chance is None else f"{chance:.0%}"
-            why = model.doubtful.get(name, "") if model else ""
+            why = text_of(model.doubtful.get(name, ())) if model else ""
             rows.append([_text(name), percent, _text(f"doubtful: {why}" if why else "registered")])
-        rows += [[_text(name), "", _text(why)] for name, why in self.unregistered.items()]
+        rows += [[_text(name), "", _text(why.text())] for name, why in self.unregistered.items()]
         more = f"<p>and {len(rows) - MAX_ROWS:,} more</p>" if len(rows) > MAX_ROWS else ""
         table = _table(["photograph", "probability", "what became of it"], rows[:MAX_ROWS])
         return f"<details><summary>Photographs</summary>{table}{more}</details>"

@@ -252,6 +252,15 @@ class Context:
         names = self.features.names()
         return lists.read_pairs(path, names) if len(names) > 1 else PairList.of(())
 
+    def usable(self, pairs: Iterable[Pair]) -> list[Pair]:
+        """Return the pairs whose images the database has, but those rejected by hand."""
+        ids = self.graph.ids
+        found = list[Pair]()
+        for first, second in pairs:
+            if first in ids and second in ids and self.by_hand.allows(first, second):
+                found.append((first, second))
+        return found
+
     def num_verified_inliers(self) -> dict[Pair, int]:
         """Return the number of inliers of each verified pair; another program has its threshold."""
         is_foreign = self.workspace.is_foreign

@@ -30,6 +30,7 @@ from colmap_affrect.project.argument_types import checks_arguments
 
 SIFT_SIZE = 128  # values of the one kind of descriptors that whole numbers stand for
 IMAGES_IN_MEMORY = 60
+USUAL_FEATURES = 8000  # of an image, to tell how much there is to compare
 
 Arrays = tuple[Floats, Any]
 """(N, 2) keypoints in px, and the (N, D) descriptors of an image."""
@@ -106,7 +107,8 @@ def matched(
         read: returns (N, 2) keypoints and (N, D) descriptors of an image.
         options: of the matcher.
     """
-    matcher = NearestNeighbors(options or NearestOptions(), MatcherContext())
+    context = MatcherContext(num_comparisons=len(pairs) * USUAL_FEATURES**2)
+    matcher = NearestNeighbors(options or NearestOptions(), context)
     sizes = dict[int, str]()
 
     @lru_cache(maxsize=IMAGES_IN_MEMORY)

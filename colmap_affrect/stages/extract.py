@@ -220,8 +220,8 @@ def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None
 
 
 # Inputs that have changed since a run began: what was made from them is forgotten, and made again.
-# Features hang on photographs, masks and depth maps; matches on the features of two images; pairs,
-# the database and all that follows on all images, and on cameras that are given.
+# Features depend on photographs, masks and depth maps; matches on the features of two images;
+# pairs, the database and all that follows on all images, and on cameras that are given.
 
 
 def _refuse_other_photographs(

@@ -22,16 +22,14 @@ from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
 from colmap_affrect.geometry.tilts import are_individual_shapes
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
-from colmap_affrect.pairs.lists import Pair, ordered_for_reuse
+from colmap_affrect.pairs.lists import USUAL_IMAGES_IN_MEMORY, Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import FeatureStore, GuidedPair
+from colmap_affrect.project.stores import PAIRS_PER_WRITE, FeatureStore, GuidedPair
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import extracted_px
 
-IMAGES_IN_MEMORY = 40  # of 13,000 features
-PAIRS_PER_WRITE = 64
 MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
 NOTHING: Indices = np.zeros((0, 2), np.int64)
 
@@ -113,7 +111,7 @@ class GuidedMatcher:
         """Name the features; they are read when an image comes first."""
         self._store = store
         self._options = options
-        self._images = lru_cache(IMAGES_IN_MEMORY)(self._read)
+        self._images = lru_cache(USUAL_IMAGES_IN_MEMORY)(self._read)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return GuidedMatcher, (self._store, self._options)
@@ -200,7 +198,7 @@ class Guiding:
         executor = self.context.executor or Threads(available_cores())
         matcher = GuidedMatcher(features, self.options)
         stationary = StationaryFilter(features, self.context.matches)
-        ordered = ordered_for_reuse(pairs, IMAGES_IN_MEMORY)
+        ordered = ordered_for_reuse(pairs, USUAL_IMAGES_IN_MEMORY)
         for begin in range(0, len(ordered), PAIRS_PER_WRITE):
             batch = ordered[begin : begin + PAIRS_PER_WRITE]
             tasks = self._tasks(batch)

@@ -16,6 +16,7 @@ from colmap_affrect.mappers.mapping import map_database, model_folders, read_sum
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.paths import resolved
+from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 
@@ -115,19 +116,9 @@ def unmeasured_pairs(context: Context) -> list[Pair]:
     is_measured = [level.features.has_shapes for level in context.extraction.levels]
     if not any(is_measured):
         return []
-    pairs = usable_pairs(context)
+    pairs = context.usable(context.listed_pairs())
     levels = context.matches.levels(pairs)
     return [pair for pair, level in levels.items() if not is_measured[level]]
-
-
-def usable_pairs(context: Context) -> list[Pair]:
-    """Return the listed pairs whose images the database has, but those rejected by hand."""
-    ids = context.graph.ids
-    return [
-        (first, second)
-        for first, second in context.listed_pairs()
-        if first in ids and second in ids and context.by_hand.allows(first, second)
-    ]
 
 
 def _inputs(context: Context, extend: Extension | None) -> str:
@@ -168,7 +159,7 @@ def unregistered(
     names: Sequence[str],
     models: Sequence[ModelSummary],
     pair_inliers: Mapping[Pair, int],
-) -> dict[str, str]:
+) -> dict[str, Missing]:
     """Tell for each image outside the largest model why it is not in it.
 
     Args:
@@ -186,7 +177,7 @@ def unregistered(
         partners[second][first] = count
     largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     registered = set(largest.registered_names)
-    reasons = dict[str, str]()
+    reasons = dict[str, Missing]()
     for name in names:
         if name in registered:
             continue
@@ -196,26 +187,24 @@ def unregistered(
     return reasons
 
 
-def _why_not_mapped(context: Context, name: str, others: Sequence[ModelSummary]) -> str:
-    """Return why an image could not be in the largest model; empty where it could."""
+def _why_not_mapped(context: Context, name: str, others: Sequence[ModelSummary]) -> Missing | None:
+    """Return why an image could not be in the largest model; None where it could."""
     for number, model in enumerate(others, start=1):
         if name in model.registered_names:
-            return f"in another model, sparse/{number}"
+            return Missing("another_model", number)
     if name in context.by_hand.left_out:
-        return "left out by hand"
+        return Missing("left_out")
     num_keypoints = context.graph.num_keypoints
     if name not in num_keypoints:
-        return "unreadable"
-    return "" if num_keypoints[name] else "no features"
+        return Missing("unreadable")
+    return None if num_keypoints[name] else Missing("no_features")
 
 
-def _why_lost(name: str, partners: Mapping[str, int], largest: ModelSummary) -> str:
+def _why_lost(name: str, partners: Mapping[str, int], largest: ModelSummary) -> Missing:
     """Return why an image with features is not in the largest model, by its verified pairs."""
     if not partners:
-        return "no verified pair"
-    best = sorted(partners.items(), key=lambda item: -item[1])[:NUM_BEST_PAIRS]
-    pairs = ", ".join(f"{other} ({count} inliers)" for other, count in best)
-    why = "not registered"
+        return Missing("no_verified_pair")
+    best = dict(sorted(partners.items(), key=lambda item: -item[1])[:NUM_BEST_PAIRS])
     if name in largest.taken_out:
-        why = f"taken out, {largest.taken_out[name]}"
-    return f"{why}; verified with {pairs}"
+        return Missing("taken_out", partners=best, doubts=largest.taken_out[name])
+    return Missing("not_registered", partners=best)

@@ -19,11 +19,18 @@ from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.matchers.base import MATCHERS, ImageFeatures, MatcherContext, MatcherOptions
-from colmap_affrect.pairs.lists import Pair, PairList, ordered_for_reuse
+from colmap_affrect.pairs.lists import USUAL_IMAGES_IN_MEMORY, Pair, PairList, ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import FINISHED, IN_VAIN, FeatureStore, MatchStore, PairMatches
+from colmap_affrect.project.stores import (
+    FINISHED,
+    IN_VAIN,
+    PAIRS_PER_WRITE,
+    FeatureStore,
+    MatchStore,
+    PairMatches,
+)
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.session.context import Context, Resources, require_same_files
 from colmap_affrect.session.database_export import write_images_and_keypoints, write_matches
@@ -31,15 +38,13 @@ from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
 
-PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
 MANY_MATCHES = 300  # of the features matched first: photographs of different things have up to 76
 NUM_TRIED = 40  # pairs matched by all features before many are
 MIN_GROWTH = 1.1  # of the matches that confirm each other, by all features; small scans have none
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
-IMAGES_IN_MEMORY = 40  # of 13,000 features
-BYTES_PER_FEATURE = 614  # of a feature ready for matching, with descriptors of 128
+BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
 
 Found = TypeVar("Found")
 
@@ -269,7 +274,8 @@ class Matching:
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     max_num_features: int = 0  # of each image, those of the largest responses; 0: all
-    num_kept: int = IMAGES_IN_MEMORY
+    num_comparisons: float = 0  # about how many pairs of features there will be to compare
+    num_kept: int = USUAL_IMAGES_IN_MEMORY
 
 
 def iterate_matches(
@@ -286,8 +292,10 @@ def iterate_matches(
     limit = matching.max_num_features
     if limit:
         counts = {name: min(count, limit) for name, count in counts.items()}
+    num_comparisons = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    matcher = CachedMatcher(replace(matching, num_kept=max(2, num_kept)))
+    known = replace(matching, num_comparisons=num_comparisons, num_kept=max(2, num_kept))
+    matcher = CachedMatcher(known)
     ordered = ordered_for_reuse(pairs, max(1, num_kept // 2))
     yield from executor.map(matcher, ordered, [matching.store.path])
 
@@ -315,7 +323,7 @@ class CachedMatcher:
         self._weights = resolve(options.weights, resources.weights_path)
         if sent is not None:
             require_same_files(self._weights, sent)
-        context = MatcherContext(self._weights, resources.device)
+        context = MatcherContext(self._weights, resources.device, matching.num_comparisons)
         self.matcher = MATCHERS.make(options, context)
         self._images = lru_cache(matching.num_kept)(self._prepare)
         self._lock = threading.Lock()

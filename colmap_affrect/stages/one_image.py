@@ -38,7 +38,7 @@ class ExtractedImage:
 
     features: LocalFeatures  # frames in px of the stored image
     image_size: tuple[int, int]  # (width, height) of the stored image in px
-    warning: str = ""  # why it was not rectified or not on the GPU; empty if all went well
+    warning: str = ""  # why it was not rectified; empty if all went well
     stretched: bool = False  # whether its contrast was low and was stretched
     mask_is_white: bool = False  # whether it has a mask, which leaves out nothing
     lines: Lines | None = None  # straight ones; None where they were not asked for

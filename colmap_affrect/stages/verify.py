@@ -1,11 +1,12 @@
 """Verify: two-view geometries of the matched pairs, into the database."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import ExtractedPx, VerificationOptions, verify_pairs
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.progress import SILENT
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.database_export import write_images_and_keypoints, write_matches
@@ -56,12 +57,9 @@ def update_verified(
         todo = colmap_database.pairs_to_verify(database)
         if len(todo):
             colmap_database.require_database_space(context.workspace.database, len(todo))
-        advance: Callable[[int], None] | None = None
-        if not shows:
+        progress = context.progress if shows else SILENT
+        with progress.stage("verify", len(todo), "pairs") as advance:
             verify_pairs(database, todo, context.verification, sizes_px, advance)
-        else:
-            with context.progress.stage("verify", len(todo), "pairs") as advance:
-                verify_pairs(database, todo, context.verification, sizes_px, advance)
     return len(todo)
 
 

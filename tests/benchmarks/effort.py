@@ -162,6 +162,15 @@ def right_at(rows: Sequence[Row], seconds: float) -> int:
     return int(there[-1]["right"])
 
 
+def last_row_of(rows: Sequence[Row], effort: str) -> Row:
+    """Return the model that an effort ends with; time is counted after learned matching.
+
+    The last row has none: it is the model of the whole run.
+    """
+    budget = EFFORTS[effort].budget_s(rows[0]["first_model_s"], has_model=True)
+    return [row for row in rows if row.get("spent_s", math.inf) <= budget][-1]
+
+
 def draw(found: dict[str, list[Row]], path: Path) -> None:
     """Draw the photographs that are right in all subsets against the seconds spent on each."""
     import matplotlib.pyplot as plt
@@ -171,10 +180,13 @@ def draw(found: dict[str, list[Row]], path: Path) -> None:
     right = [sum(right_at(rows, limit) for rows in known) for limit in seconds]
     figure, axes = plt.subplots(figsize=(7, 3.5))
     axes.step([max(1.0, limit) for limit in seconds], right, where="post")
-    for name, effort in EFFORTS.items():
-        if effort.least_s:
-            axes.axvline(effort.least_s, color="tab:orange", linewidth=1)
-            axes.text(effort.least_s, right[0], f" {name}", color="tab:orange")
+    for name in EFFORTS:
+        last = [last_row_of(rows, name) for rows in known]
+        spent = [row["cpu_s"] - rows[0]["cpu_s"] for row, rows in zip(last, known, strict=True)]
+        mean_s = sum(spent) / len(spent)
+        num_right = sum(row["right"] for row in last)
+        axes.plot(mean_s, num_right, "o", label=f"--effort {name}: {num_right} in {mean_s:.0f} s")
+    axes.legend(loc="lower right")
     axes.set_xscale("log")
     axes.set_xlabel("seconds of one core spent on each set after its first model")
     axes.set_ylabel(f"photographs right, {len(known)} sets")

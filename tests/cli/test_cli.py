@@ -22,6 +22,7 @@ from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.reliability import Confidence
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 
@@ -433,7 +434,9 @@ def test_model_that_nobody_can_trust_ends_with_3(
     verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def score(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
-        return dict.fromkeys(model_poses(mapped.reconstruction), Confidence(0.3, "no parallax"))
+        return dict.fromkeys(
+            model_poses(mapped.reconstruction), Confidence(0.3, (Doubt("few_matches"),))
+        )
 
     monkeypatch.setattr(mapping, "score_images", score)
     assert main(["map", "--output-path", str(verified), "--overwrite"]) == 3
@@ -441,6 +444,6 @@ def test_model_that_nobody_can_trust_ends_with_3(
     assert "results " in printed.out
     assert not {"colmap gui", "colmap-affrect export"} & set(printed.out.splitlines())
     assert "\nnext" not in printed.out
-    assert ": no parallax\n" in printed.out
+    assert ": few matches support its position\n" in printed.out
     assert printed.err.splitlines()[-1].startswith("error: nothing in the model can be trusted;")
     assert json.loads((verified / "report.json").read_text())["status"] == "doubtful"

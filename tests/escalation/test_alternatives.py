@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,7 +34,6 @@ from colmap_affrect.escalation.alternatives import (
 )
 from colmap_affrect.escalation.escalate import Escalation, begin, matched_again
 from colmap_affrect.escalation.set_state import SetState
-from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.project.report import ModelSummary
@@ -54,11 +53,7 @@ features = { name = "shapeless", max_num_features = 900 }
 UNSURE = ModelSummary(NAMES[:2], 50, 2.0, 0.5, probabilities=dict.fromkeys(NAMES[:2], 0.6))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _shapeless() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EXTRACTORS.built_in, "shapeless", "shapeless_features:Shapeless")
-        yield
+pytestmark = pytest.mark.usefixtures("shapeless_features_are_known")
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ NAMES = ["view_1_tilt00.jpg", "view_2_tilt30.jpg", "view_6_tilt75.jpg"]
 EASY = (NAMES[0], NAMES[1])
 HARD = (NAMES[0], NAMES[2])
 CAMERAS = CameraOptions(mode="single", model="PINHOLE", params="720,720,360,270")
-SMALL = ["max_image_size_px=480", "features.max_num_features=1500",
+SMALL = ["max_image_size_px=440", "features.max_num_features=1500",
          "features.max_num_rectified_features=3000"]  # fmt: skip
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +12,8 @@ from verified import copy_of, verified
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.expected_gain import Step
-from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import PairMatches, Worth
 from colmap_affrect.project.workspace import Workspace
@@ -33,11 +32,7 @@ strong_num_inliers = 1000000
 """
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _shapeless() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EXTRACTORS.built_in, "shapeless", "shapeless_features:Shapeless")
-        yield
+pytestmark = pytest.mark.usefixtures("shapeless_features_are_known")
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +75,9 @@ def test_images_that_measured_frames_hold_need_no_others(context: Context) -> No
     names = tuple(sorted(NAMES))
     escalation = escalation_of(context)
     states = escalation_of(context).state.states()
-    model = ModelSummary(names, 9, 2.0, 0.5, doubtful={NAMES[0]: "few matches"})
+    model = ModelSummary(names, 9, 2.0, 0.5, doubtful={NAMES[0]: (Doubt("few_matches"),)})
     assert escalation.state._anchored(model, states) == set(NAMES) - {NAMES[3]}
-    all_doubtful = replace(model, doubtful=dict.fromkeys(names, "few matches"))
+    all_doubtful = replace(model, doubtful=dict.fromkeys(names, (Doubt("few_matches"),)))
     assert escalation.state._anchored(all_doubtful, states) == set()
     without = replace(model, registered_names=names[1:])
     assert names[0] not in escalation.state._anchored(without, states)

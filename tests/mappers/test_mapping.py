@@ -35,6 +35,7 @@ from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import map_and_report
+from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
@@ -170,7 +171,9 @@ def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
 
     def scored(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
         names = sorted(image.name for image in mapped.reconstruction.images.values())
-        return {n: Confidence(p, "a reason") for n, p in zip(names, given, strict=True)}
+        return {
+            n: Confidence(p, (Doubt("few_matches"),)) for n, p in zip(names, given, strict=True)
+        }
 
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=3, num_points3D=150)
@@ -178,8 +181,19 @@ def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
     (model,), _ = reconstruct(path, mapper_of("incremental"))
     first, second, third = model.registered_names
     assert list(model.probabilities.values()) == [0.499, 0.899, 0.999]
-    assert (model.doubtful, model.unsure) == ({first: "a reason"}, {second: "a reason"})
+    doubts = (Doubt("few_matches"),)
+    assert (model.doubtful, model.unsure) == ({first: doubts}, {second: doubts})
     assert model.sure == (third,)
+
+
+@pytest.mark.parametrize("name", ["sparse", "incremental", "global"])
+def test_models_of_fewer_images_than_wanted_are_dropped(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=3, num_points3D=150)
+    models, _ = reconstruct(path, mapper_of(name, min_model_size=4))
+    assert not models
+    (model,), _ = reconstruct(path, mapper_of(name, min_model_size=3))
+    assert len(model.registered_names) == 3
 
 
 def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_leaves_nothing(
@@ -225,7 +239,7 @@ def test_two_places_make_two_models_the_largest_first(two_places: Workspace, map
     small = tuple(sorted(f"here/{name}" for name in NAMES[:2]))
     assert [model.registered_names for model in report.models] == [large, small]
     assert report.status == "partial"
-    assert report.unregistered == dict.fromkeys(small, "in another model, sparse/1")
+    assert report.unregistered == dict.fromkeys(small, Missing("another_model", 1))
     assert "models      2, of 3, 2 images" in report.summary()
     assert [*map(tuple, report.to_mapping()["models"])] == [large, small]
     folders = sorted(path for path in two_places.sparse.iterdir() if path.is_dir())
@@ -243,9 +257,9 @@ def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
 
     def score(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
         names = sorted(model_poses(mapped.reconstruction))
-        found = dict.fromkeys(names, Confidence(0.99, ""))
+        found = dict.fromkeys(names, Confidence(0.99, ()))
         if len(names) == 3:
-            found[names[-1]] = Confidence(probability, "no parallax")
+            found[names[-1]] = Confidence(probability, (Doubt("few_matches"),))
         return found
 
     monkeypatch.setattr(mapping, "score_images", score)

@@ -18,6 +18,7 @@ from colmap_affrect.mappers.adjustment import Adjuster, FocalPrior
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.reliability import TERMS, confidence, score_images
 from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import DOUBTFUL, SURE
 
 
@@ -83,7 +84,7 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
     assert bad.keys() == TERMS.keys()
     for name, (features, text) in bad.items():
         assert TERMS[name].value(features) < TERMS[name].value(good)
-        assert text in TERMS[name].reason(features)
+        assert text in TERMS[name].reason(features).text()
         assert confidence(features).probability <= confidence(good).probability
 
 
@@ -125,10 +126,11 @@ def test_terms_are_those_that_the_weights_were_fitted_to(
 
 def test_two_reasons_are_said_and_no_small_ones() -> None:
     doubted = replace(GOOD, log_likelihood_ratio=-20.0, agreement=0.2, mirrored_original="c.jpg")
-    assert confidence(doubted).reason.count(";") == 1
+    assert len(confidence(doubted).reasons) == 2
     small = replace(GOOD, log_likelihood_ratio=-20.0, num_three_view_points=60)
-    assert "of its points" not in confidence(small).reason
-    assert "of its points" in confidence(replace(small, num_three_view_points=3)).reason
+    assert [doubt.code for doubt in confidence(small).reasons] == ["matches_disagree"]
+    both = confidence(replace(small, num_three_view_points=3)).reasons
+    assert [doubt.code for doubt in both] == ["matches_disagree", "few_three_view_points"]
 
 
 def test_a_bridge_edge_counts_by_its_inliers() -> None:
@@ -137,6 +139,17 @@ def test_a_bridge_edge_counts_by_its_inliers() -> None:
         features = replace(GOOD, bridge_edge="a.jpg - b.jpg", num_bridge_inliers=num_inliers)
         probabilities.append(confidence(features).probability / confidence(GOOD).probability)
     assert probabilities == pytest.approx([0.12, 0.5, 0.88, 1.0], abs=0.01)
+
+
+def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses() -> None:
+    probabilities = []
+    for sigma_deg in (0.0, 1.0, 3.0, 6.0, 60.0):
+        features = replace(GOOD, direction_sigma_deg=sigma_deg)
+        probabilities.append(confidence(features).probability / confidence(GOOD).probability)
+    assert probabilities == pytest.approx([1.0, 1.0, 0.94, 0.5, 0.007], abs=0.005)
+    at_one_place = confidence(replace(GOOD, direction_sigma_deg=6.0))
+    assert at_one_place.reasons == (Doubt("near_others", {"sigma_deg": 6.0}),)
+    assert at_one_place.gain < 0.1  # more matches do not help
 
 
 def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(tmp_path: Path) -> None:
@@ -155,7 +168,8 @@ def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(tmp_path: Pa
     assert found[names[3]].num_bridge_inliers == num
     alone, few = (confidence(replace(found[names[3]], num_bridge_inliers=num)) for num in (200, 29))
     assert few.probability < DOUBTFUL < alone.probability - 0.3
-    assert f"hangs on the 29 inliers of {names[1]} - {names[4]} alone" in few.reason
+    edge = {"num_inliers": 29, "pair": f"{names[1]} - {names[4]}"}
+    assert Doubt("bridge_edge", edge) in few.reasons
     assert few.gain > 0.5
 
 

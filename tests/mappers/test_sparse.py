@@ -24,6 +24,7 @@ from colmap_affrect.mappers.reliability import score_images
 from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
 from colmap_affrect.mappers.tie_joining import BY_HAND
 from colmap_affrect.mappers.tie_points import ImageResidual, tie_point_log_odds, tie_points_of
+from colmap_affrect.project.report import DOUBTFUL, SURE
 
 MAX_SCALE_ERROR = 0.03
 
@@ -159,7 +160,8 @@ def test_lost_photograph_comes_back_by_six_points_in_two_others(tmp_path: Path) 
     residuals = tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)
     assert len(residuals) == 18
     assert residuals[0].error_px < 10.0
-    assert score_images(model, task)["3.jpg"].probability > 0.8
+    # The noise of six marks moves its direction by up to seven degrees.
+    assert DOUBTFUL < score_images(model, task)["3.jpg"].probability < SURE
 
 
 def test_a_mark_that_is_far_off_is_named_as_the_worst(tmp_path: Path) -> None:

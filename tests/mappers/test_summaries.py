@@ -11,6 +11,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import SUMMARY, read_given_model
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.mapping import read_summary, write_summary
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import Bridge, ModelSummary
 
 MODEL = ModelSummary(
@@ -18,10 +19,10 @@ MODEL = ModelSummary(
     num_points3D=120,
     mean_track_length=2.25,
     mean_reprojection_error_px=0.512,
-    doubtful={"č.jpg": "held by only 9 points"},
+    doubtful={"č.jpg": (Doubt("few_three_view_points", {"num": 9}), Doubt("few_matches"))},
     probabilities={"a.jpg": 0.98, "č.jpg": 0.4},
     bridges={"č.jpg": Bridge("a.jpg", 32, 36, 0.031)},
-    taken_out={"d.jpg": "held by only 3 points"},
+    taken_out={"d.jpg": (Doubt("no_parallax", {"share": 0.9}),)},
     focals_px={"a.jpg": 812.5, "č.jpg": 900.0},
     one_view=(("a.jpg", "č.jpg"),),
 )

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import (
     Advice,
     Bridge,
@@ -23,7 +24,11 @@ SMALL = ModelSummary(("e.png", "f.png"), 50, 2.0, 0.25)
 
 REPORT = ReconstructionReport(
     images_total=5,
-    unregistered={"broken.png": "unreadable", "e.png": "not registered", "f.png": "no features"},
+    unregistered={
+        "broken.png": Missing("unreadable"),
+        "e.png": Missing("not_registered"),
+        "f.png": Missing("no_features"),
+    },
     models=(LARGE, SMALL),
     num_verified_pairs=3,
     num_pairs=10,
@@ -49,9 +54,13 @@ REPORT = ReconstructionReport(
     ),
 )
 
-SHAKY = replace(LARGE, doubtful={"a.png": "held by only 9 points"})
-TURNED = replace(LARGE, doubtful={"a.png": "no parallax", "č d.png": "no parallax"})
-EMPTY = replace(REPORT, models=(), unregistered={"a.png": "no verified pair"}, images_total=1)
+SHAKY = replace(LARGE, doubtful={"a.png": (Doubt("few_three_view_points", {"num": 9}),)})
+TURNED = replace(
+    LARGE, doubtful=dict.fromkeys(LARGE.registered_names, (Doubt("no_parallax", {"share": 0.9}),))
+)
+EMPTY = replace(
+    REPORT, models=(), unregistered={"a.png": Missing("no_verified_pair")}, images_total=1
+)
 
 
 def test_report_has_the_promised_keys_and_reads_back() -> None:
@@ -64,7 +73,11 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
     }  # fmt: skip
     assert read == {
         "status": "partial", "images_total": 5, "images_registered": 2, "num_models": 2,
-        "registered_names": ["a.png", "č d.png"], "unregistered": REPORT.unregistered,
+        "registered_names": ["a.png", "č d.png"], "unregistered": {
+            "broken.png": {"code": "unreadable", "text": "unreadable"},
+            "e.png": {"code": "not_registered", "text": "not registered"},
+            "f.png": {"code": "no_features", "text": "no features"},
+        },
         "doubtful": {}, "unsure": {}, "probabilities": {}, "moves": [], "guided": {},
         "advice": [
             {"why": "it tries more", "command": "colmap-affrect run"},
@@ -136,15 +149,16 @@ def test_summary_says_where_exif_is_wrong_or_needs_the_size_of_the_sensor() -> N
 def test_summary_says_what_cannot_be_trusted() -> None:
     shaky = replace(SHAKY, probabilities={"a.png": 0.31, "č d.png": 0.9})
     text = replace(REPORT, models=(shaky,)).summary()
-    assert "doubtful    a.png: held by only 9 points\n" in text
+    assert "doubtful    a.png: only 9 of its points are seen by two other photographs\n" in text
     assert "sure        1, right with a probability of 90% or more\n" in text
 
 
 def test_summary_says_why_photographs_are_not_sure() -> None:
+    doubts = (Doubt("no_three_view_points"),)
     why = "none of its points is seen by two other photographs"
     names = LARGE.registered_names[:2]
     sure = dict.fromkeys(names, 0.7)
-    two = replace(LARGE, bridges={}, probabilities=sure, unsure=dict.fromkeys(names, why))
+    two = replace(LARGE, bridges={}, probabilities=sure, unsure=dict.fromkeys(names, doubts))
     text = replace(REPORT, models=(two,)).summary()
     line = f"unsure      {names[0]}, {names[1]}: {why}"
     assert f"sure        0, right with a probability of 90% or more\n{line}\n" in text
@@ -167,9 +181,10 @@ def test_cameras_that_mapping_makes_one_are_said_to_be() -> None:
 
 
 def test_long_lists_end_where_the_screen_does() -> None:
-    report = replace(REPORT, unregistered={f"{i}.png": f"pair {i}" for i in range(100)})
+    many = {f"{i}.png": Missing("another_model", i + 1) for i in range(100)}
+    report = replace(REPORT, unregistered=many)
     assert "and 88 more, see report.json" in report.summary()
-    report = replace(REPORT, unregistered={f"{i}.png": "no features" for i in range(100)})
+    report = replace(REPORT, unregistered=dict.fromkeys(many, Missing("no_features")))
     assert "        not 0.png, 1.png," in report.summary()
     assert "10.png, 11.png and 88 more: no features\n" in report.summary()
     assert len(report.to_mapping()["unregistered"]) == 100

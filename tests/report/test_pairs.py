@@ -21,9 +21,10 @@ from small_run import small_report
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import keypoint_counts, open_database
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
+from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stores import GuidedPair
 from colmap_affrect.report import pairs
@@ -91,6 +92,13 @@ def test_numbers_of_lines_are_bounded_for_inliers_and_the_others(
         assert drawn.count(rgb(COLORS[kind])) == min(num, 200)
 
 
+def num_keypoints(path: Path) -> dict[str, int]:
+    """Keypoints in a database by image."""
+    with open_database(path) as database:
+        images = database.read_all_images()
+        return {i.name: database.num_keypoints_for_image(i.image_id) for i in images}
+
+
 class Stores(SimpleNamespace):
     """Of a run whose odd features are of warps; from number 60 on they have no shapes."""
 
@@ -102,7 +110,7 @@ class Stores(SimpleNamespace):
         super().__init__(
             workspace=SimpleNamespace(sparse=folder / "sparse", begun=begun, is_changed=False),
             extraction=SimpleNamespace(levels=levels),
-            counts=keypoint_counts(folder / "database.db"),
+            counts=num_keypoints(folder / "database.db"),
             features=self,
             matches=self,
         )
@@ -217,8 +225,10 @@ def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
 
 
 def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
-    model = ModelSummary(tuple("abcdef"), 9, 2.0, 0.5, doubtful={"f": "why"})
-    report = replace(small_report(tmp_path), models=(model,), unregistered={"g": "not registered"})
+    model = ModelSummary(tuple("abcdef"), 9, 2.0, 0.5, doubtful={"f": (Doubt("few_matches"),)})
+    report = replace(
+        small_report(tmp_path), models=(model,), unregistered={"g": Missing("not_registered")}
+    )
     verified = {
         ("a", "b"): 900, ("b", "c"): 800, ("c", "d"): 50, ("d", "e"): 40, ("a", "f"): 30,
         ("e", "f"): 20, ("f", "g"): 60, ("a", "c"): 700,
@@ -247,7 +257,7 @@ def test_of_many_pairs_twelve_are_shown_and_without_a_model_the_missing_ones(
     doubtful = dict.fromkeys(names, "why")
     whole = replace(report, models=(ModelSummary(tuple(names), 9, 2.0, 0.5, doubtful=doubtful),))
     assert len(pairs_to_check(whole, verified, {})) == 12
-    without = replace(report, models=(), unregistered={"007.jpg": "not registered"})
+    without = replace(report, models=(), unregistered={"007.jpg": Missing("not_registered")})
     assert pairs_to_check(without, verified, {}) == {("006.jpg", "007.jpg"): "007.jpg is missing"}
 
 

@@ -15,6 +15,7 @@ from small_comparison import IMAGE_SIZE
 from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import pictures
 from colmap_affrect.report.run_page import RunContent, inlier_matrix, write_run_page
@@ -33,7 +34,8 @@ def html(folder: Path) -> str:
 def test_everything_of_the_report_is_told(html: str) -> None:
     for text in (
         "<title>4 of 6 photographs registered</title>", "right with a probability of 95%",
-        "d.png: hangs on few &lt;points&gt;", "right with a probability of 40%; doubtful: hangs",
+        "d.png: may be a mirrored copy of &lt;b&gt;.jpg",
+        "right with a probability of 40%; doubtful: may",
         ">colmap-affrect run --output-path out-2<", "no verified pair",
         "unreadable: f.png: not a readable image",
         "12 of 15 depths agree, scale +-3.1%",
@@ -127,7 +129,7 @@ def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
     values = {
         "models": (),
         "num_verified_pairs": 0,
-        "unregistered": dict.fromkeys(NAMES, "no features"),
+        "unregistered": dict.fromkeys(NAMES, Missing("no_features")),
         "cameras": (),
     }
     nothing = type(report)(**{**vars(report), **values})

@@ -18,6 +18,7 @@ from small_scene import FOCAL_PX, world_to_camera, write_photographs
 from small_scene import IMAGE_SIZE as SCENE_SIZE
 from small_scene import NAMES as SCENE_NAMES
 
+from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.report import ModelSummary, Residual
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.run_page import RunContent, write_run_page
@@ -99,7 +100,11 @@ def page(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     residuals = (Residual("corner", names[0], 7.25),)
     model = ModelSummary(tuple(names[:4]), 90, 3.5, 0.25, tie_points=residuals)
     report = small_report(tmp_path)
-    values = {**vars(report), "models": (model,), "unregistered": dict.fromkeys(names[4:], "lost")}
+    values = {
+        **vars(report),
+        "models": (model,),
+        "unregistered": dict.fromkeys(names[4:], Missing("not_registered")),
+    }
     content = RunContent(names, {}, tmp_path / "photographs", marks)
     return write_run_page(workspace, type(report)(**values), content)
 

@@ -26,9 +26,9 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
-from colmap_affrect.mappers.reliability import CONTRADICTIONS, FOCAL_CONTRADICTED, FOCAL_UNKNOWN
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import (
     Bridge,
     MatchedAgain,
@@ -175,14 +175,16 @@ def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.M
     tied = f"{again} --tie-points tie-points.csv"
     more = anew.format("--recipe default")
     assert commands([lost], model) == [more, tied, ""]
-    unknown = replace(model, doubtful={lost: FOCAL_UNKNOWN})
+    unknown = replace(model, doubtful={lost: (Doubt("focal_unknown"),)})
     assert commands([], unknown) == [anew.format("--focal-mm 50 --film-width-mm 36")]
-    wrong = replace(model, taken_out={lost: f"{FOCAL_CONTRADICTED}, 9 px: 8 px does"})
+    contradicted = Doubt("focal_contradicted", {"given_px": 9.0, "fitting_px": 8.1})
+    wrong = replace(model, taken_out={lost: (contradicted,)})
     assert commands([lost], wrong)[0] == anew.format("--focal-length-px 8")
-    disputed = replace(model, doubtful={lost: f"9% {CONTRADICTIONS[1]}"}, gains={lost: 0.3})
+    disagreeing = Doubt("little_agreement", {"percent": 9})
+    disputed = replace(model, doubtful={lost: (disagreeing,)}, gains={lost: 0.3})
     assert commands([], disputed) == [more, anew.format("--mask-path masks")]
     bridged = {lost: Bridge(NAMES[1], 5, 9, 0.2)}
-    alone = replace(model, doubtful={lost: f"bridged by {NAMES[1]} alone"}, bridges=bridged)
+    alone = replace(model, doubtful={lost: (Doubt("few_matches"),)}, bridges=bridged)
     assert commands([], alone) == [f"{again} --reject-pair '{lost},{NAMES[1]}'"]
     said = replace(context, by_hand=ByHand(tie_points_path=Path("t.csv")), command=())
     (_, tie_points, _) = advice(said, [lost], [model], 0)

@@ -1,0 +1,100 @@
+"""How well a model tells in which direction its photographs stand from each other.
+
+Photographs that were taken from nearly one place have relative positions that noise decides, and
+where their focal lengths are not known an error of these moves them along their axes. The
+covariance of the bundle adjustment, with its priors of intrinsics, tells how far (Triggs et al.,
+Bundle adjustment - a modern synthesis, 2000, Sec. 9).
+"""
+
+import math
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.mappers.adjustment import Adjuster
+
+MAX_NUM_IMAGES = 100
+"""Larger models are not looked at: the time grows with the cube of the images, and half of so many
+hardly stand at one place."""
+
+
+def direction_sigmas_deg(model: pycolmap.Reconstruction, adjuster: Adjuster) -> dict[int, float]:
+    """Return how uncertain the directions from each image to others are.
+
+    Args:
+        model: That has been adjusted.
+        adjuster: With the priors of its cameras.
+
+    Returns:
+        By image id the deviation in degrees that the directions of translation to at least half of
+        the others do not exceed. Images of which it is not known are left out.
+    """
+    image_ids = sorted(model.reg_image_ids())
+    if not 3 <= len(image_ids) <= MAX_NUM_IMAGES:
+        return {}
+    if not all(model.images[image_id].is_ref_in_frame() for image_id in image_ids):
+        return {}  # COLMAP has no covariances of rigs
+    covariance = adjuster.pose_covariance(model)
+    if covariance is None:
+        return {}
+    noise_px = adjuster.noise_px
+    sigmas_deg: dict[int, list[float]] = {image_id: [] for image_id in image_ids}
+    for number, first in enumerate(image_ids):
+        for second in image_ids[number + 1 :]:
+            sigma_deg = _direction_sigma_deg(model, covariance, first, second)
+            if sigma_deg is not None:
+                sigmas_deg[first].append(noise_px * sigma_deg)
+                sigmas_deg[second].append(noise_px * sigma_deg)
+    num_needed = math.ceil((len(image_ids) - 1) / 2)
+    found = dict[int, float]()
+    for image_id, of_image in sigmas_deg.items():
+        if len(of_image) >= num_needed:
+            found[image_id] = sorted(of_image)[num_needed - 1]
+    return found
+
+
+def _direction_sigma_deg(
+    model: pycolmap.Reconstruction,
+    covariance: pycolmap.BACovariance,
+    first: int,
+    second: int,
+) -> float | None:
+    """Return the deviation of the direction from one image to another, in the frame of the first.
+
+    It is that of both angles together, the root of the sum of their variances, for keypoints with a
+    variance of one. COLMAP's own covariance of relative poses takes the parameters of a pose for
+    those of SE(3); they are half the angles of a rotation, applied last, and the translation.
+    """
+    own = covariance.get_cam_cov_from_world(first)
+    others = covariance.get_cam_cov_from_world(second)
+    common = covariance.get_cam_cross_cov_from_world(first, second)
+    if own is None or others is None or common is None:
+        return None
+    joint = np.block([[own, common], [np.transpose(common), others]])
+    first_pose = model.images[first].cam_from_world()
+    second_pose = model.images[second].cam_from_world()
+    rotation: Array = first_pose.rotation.matrix() @ second_pose.rotation.matrix().T
+    center: Array = rotation @ second_pose.translation
+    to_second: Array = first_pose.translation - center
+    distance = float(np.linalg.norm(to_second))
+    if distance == 0.0:
+        return 180.0
+    jacobian = np.hstack(
+        [
+            2.0 * _cross_matrix(center),
+            np.eye(3),
+            -2.0 * rotation @ _cross_matrix(second_pose.translation),
+            -rotation,
+        ]
+    )
+    direction = to_second / distance
+    across = np.eye(3) - np.outer(direction, direction)
+    variance = float(np.trace(across @ jacobian @ joint @ jacobian.T @ across))
+    return math.degrees(math.sqrt(max(variance, 0.0)) / distance)
+
+
+def _cross_matrix(vector: Array) -> Array:
+    """Return the (3, 3) matrix that takes a vector to its cross product with (3,) ``vector``."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,0 +1,99 @@
+"""How uncertain directions between photographs are: as much as noise moves them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.mappers import direction_uncertainty
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, FocalPrior
+from colmap_affrect.mappers.direction_uncertainty import direction_sigmas_deg
+
+FOCAL_PX = 1200.0
+FAR = ((0.0, 0.0, 0.0), (4.0, 0.5, 0.3), (-3.0, 1.0, 0.5), (1.0, -3.0, 0.2))
+NEAR = ((0.0, 0.0, 0.0), (0.05, 0.02, 0.1), (-0.04, 0.06, 0.05), (4.0, 0.5, 0.3))
+"""Three of them stand at one place, seen from 12 away."""
+
+
+def model_of(
+    centers: tuple[tuple[float, float, float], ...], noise_px: float = 0.0, seed: int = 0
+) -> pycolmap.Reconstruction:
+    """Points that all images see, with noise on their keypoints; no camera is turned."""
+    random = np.random.default_rng(5)
+    points = random.uniform((-4, -3, 9), (4, 3, 15), (120, 3))
+    noise = np.random.default_rng(seed)
+    model = pycolmap.Reconstruction()
+    tracks = [pycolmap.Track() for _ in points]
+    for number, center in enumerate(centers, 1):
+        camera = pycolmap.Camera.create_from_model_name(
+            number, "SIMPLE_RADIAL", FOCAL_PX, 1600, 1200
+        )
+        model.add_camera_with_trivial_rig(camera)
+        rays = points - center
+        pixels = FOCAL_PX * rays[:, :2] / rays[:, 2:] + (800.0, 600.0)
+        pixels += noise_px * noise.normal(size=pixels.shape)
+        image = pycolmap.Image(f"{number}.jpg", pixels, number, number)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), -np.array(center))
+        model.add_image_with_trivial_frame(image, pose)
+        for index, track in enumerate(tracks):
+            track.add_element(number, index)
+    for point, track in zip(points, tracks, strict=True):
+        model.add_point3D(point, track, np.zeros(3, np.uint8))
+    return model
+
+
+def adjuster(focal_sigma: float) -> Adjuster:
+    priors = {key: FocalPrior(FOCAL_PX, focal_sigma) for key in range(1, 5)}
+    return Adjuster(priors, NOISE_PX, pycolmap.BundleAdjustmentOptions())
+
+
+def direction(model: pycolmap.Reconstruction, first: int, second: int) -> NDArray[np.float64]:
+    poses = [model.images[i].cam_from_world() for i in (first, second)]
+    translation = (poses[1] * poses[0].inverse()).translation
+    return translation / np.linalg.norm(translation)
+
+
+@pytest.mark.parametrize("focal_sigma", [0.0, 0.3])
+def test_noise_moves_directions_as_far_as_is_said(focal_sigma: float) -> None:
+    adjusting = adjuster(focal_sigma)
+    errors_deg = list[float]()
+    for seed in range(20):
+        model = model_of(NEAR, 0.3, seed)
+        adjusting.adjust(model, FINAL)
+        cosine = direction(model, 1, 2) @ direction(model_of(NEAR), 1, 2)
+        errors_deg.append(np.degrees(np.arccos(min(1.0, cosine))))
+    found = float(np.sqrt(np.mean(np.square(errors_deg))))
+    said = direction_sigmas_deg(model_of(NEAR), adjusting)
+    expected = said[1] * 0.3 / NOISE_PX
+    assert 0.6 < found / expected < 1.6
+
+
+def test_photographs_at_one_place_are_uncertain_and_others_are_not() -> None:
+    near = direction_sigmas_deg(model_of(NEAR), adjuster(0.3))
+    far = direction_sigmas_deg(model_of(FAR), adjuster(0.3))
+    assert min(near[i] for i in (1, 2, 3)) > 5.0
+    assert max(far.values()) < 1.0
+    # Its directions to two of the three are as certain as those between far ones.
+    assert near[4] < 1.0
+
+
+def test_known_focal_lengths_make_directions_surer() -> None:
+    known = direction_sigmas_deg(model_of(NEAR), adjuster(0.0))
+    unknown = direction_sigmas_deg(model_of(NEAR), adjuster(0.3))
+    assert known[1] < 0.7 * unknown[1]
+
+
+def test_it_does_not_depend_on_the_frame_of_the_model() -> None:
+    model = model_of(NEAR)
+    before = direction_sigmas_deg(model, adjuster(0.3))
+    turn = pycolmap.Rotation3d(np.array([0.5, -0.4, 0.9]))
+    model.transform(pycolmap.Sim3d(3.0, turn, np.array([30.0, -20.0, 50.0])))
+    assert direction_sigmas_deg(model, adjuster(0.3)) == pytest.approx(before, rel=1e-3)
+
+
+def test_two_images_and_very_many_are_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not direction_sigmas_deg(model_of(FAR[:2]), adjuster(0.3))
+    monkeypatch.setattr(direction_uncertainty, "MAX_NUM_IMAGES", 3)
+    assert not direction_sigmas_deg(model_of(FAR), adjuster(0.3))
