@@ -35,6 +35,10 @@ def direction_sigmas_deg(model: pycolmap.Reconstruction, adjuster: Adjuster) -> 
         return {}
     if not all(model.images[image_id].is_ref_in_frame() for image_id in image_ids):
         return {}  # COLMAP has no covariances of rigs
+    if model.num_frames() > model.num_reg_frames():
+        # COLMAP looks for covariances of all frames, also of those without a pose.
+        model = pycolmap.Reconstruction(model)
+        model.tear_down()
     covariance = adjuster.pose_covariance(model)
     if covariance is None:
         return {}

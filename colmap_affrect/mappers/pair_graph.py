@@ -31,7 +31,7 @@ CameraById = Mapping[int, pycolmap.Camera]  # by image id
 # An inlier agrees with poses up to this Sampson error, the larger of the two.
 MAX_ERROR_PX = 4.0  # COLMAP's limit for observations (filter_max_reproj_error)
 MAX_ERROR = 0.003
-"""Of the longer side, of a match that a pose explains: 3 px of photographs shrunk to 1,000 (judged)."""
+"""Of the longer side, of a match that a pose explains: 3 px in a photograph of 1000 (judged)."""
 MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
 MAX_MATCHES = 500  # inliers of a pair that are sampled for agreement and relative poses

@@ -79,6 +79,16 @@ def test_photographs_at_one_place_are_uncertain_and_others_are_not() -> None:
     assert near[4] < 1.0
 
 
+def test_images_that_were_taken_out_are_passed_over() -> None:
+    model = model_of(NEAR)
+    before = direction_sigmas_deg(model, adjuster(0.3))
+    model.deregister_frame(model.images[4].frame_id)
+    found = direction_sigmas_deg(model, adjuster(0.3))
+    assert list(found) == [1, 2, 3]
+    assert found[1] > before[1]  # no far image holds the near ones
+    assert model.num_frames() == 4
+
+
 def test_known_focal_lengths_make_directions_surer() -> None:
     known = direction_sigmas_deg(model_of(NEAR), adjuster(0.0))
     unknown = direction_sigmas_deg(model_of(NEAR), adjuster(0.3))
