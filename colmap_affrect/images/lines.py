@@ -7,6 +7,7 @@ import numpy as np
 
 from colmap_affrect.data import GrayImage, Mask
 from colmap_affrect.geometry.arrays import Bools, Floats
+from colmap_affrect.geometry.conventions import colmap_from_pixel
 from colmap_affrect.geometry.lines import Lines, measure_lines
 from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.images.reading import shrink_to
@@ -68,6 +69,6 @@ def _in_mask(ends: Floats, mask: Mask, size: tuple[int, int]) -> Bools:
     """Return which (N, 4) segments have their middle where the mask allows."""
     middles = (ends[:, :2] + ends[:, 2:]) / 2.0
     scale = np.array([mask.shape[1], mask.shape[0]]) / size
-    places = np.floor((middles + 0.5) * scale).astype(np.int64)
+    places = np.floor(colmap_from_pixel(middles) * scale).astype(np.int64)
     places = np.clip(places, 0, [mask.shape[1] - 1, mask.shape[0] - 1])
     return mask[places[:, 1], places[:, 0]]
