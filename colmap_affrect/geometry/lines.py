@@ -144,7 +144,8 @@ class Lines:
         """
         if self.likelihood is None:
             return None
-        return line_camera(self.likelihood, shift_sigma or self.usual_shift_sigma)
+        sigma = self.usual_shift_sigma if shift_sigma is None else shift_sigma
+        return line_camera(self.likelihood, sigma)
 
     def explanation(self) -> Explanation | None:
         """Return which segments belong to which direction; None where they are too few."""
@@ -271,9 +272,7 @@ def _first_rotations(segments: Segments, random_seed: int) -> Floats:
     no_shift = np.zeros(NUM_TRIALS)
     kept = np.empty((len(FOCALS), NUM_KEPT, 3, 3))
     for number, focal in enumerate(FOCALS):
-        normals = _unit(
-            longest.lines * [focal, focal, 1.0]
-        )  # of planes through the camera's centre
+        normals = _unit(longest.lines * [focal, focal, 1.0])  # of planes with the camera's centre
         rotations = _frames(normals[chosen])
         scores = VanishingFit(longest, rotations, np.full(NUM_TRIALS, focal), no_shift).scores()
         kept[number] = rotations[np.argsort(-scores, kind="stable")[:NUM_KEPT]]

@@ -21,13 +21,12 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.interop.consensus import agreeing
 from colmap_affrect.interop.consensus import residuals as residuals_of
-from colmap_affrect.interop.finished_models import read_finished_model
+from colmap_affrect.interop.finished_models import read_finished_model, stand_upright
 from colmap_affrect.options import Options, Summarized, documented, takes_fields_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.paths import GivenPath, PathLike, as_path
 from colmap_affrect.project.tables import read_table
-from colmap_affrect.report.upright import turn_upright, upright_of_run
 
 GEOREFERENCE = "georeference.json"  # beside a model: what COLMAP's files have no place for
 MIN_WIDTH = 0.01  # of known places across the line that fits them best, in units of its length
@@ -156,7 +155,7 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
         right = _without(true, left_out)
         new_from_old, residuals, origin = _similarity(old, right, is_on_earth=is_on_earth)
     model.transform(new_from_old)
-    upright = _turn_upright(model_path, model) if reference.distances else ""
+    upright = stand_upright(model_folder(model_path), model) if reference.distances else ""
     why = why_unusable(model)
     if not why and new_from_old.scale <= 1.0 / FAR:
         why = "it has no extent"
@@ -168,15 +167,6 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
             content = dict(zip(ON_EARTH, origin, strict=True))
             replace_text(folder / GEOREFERENCE, json.dumps(content, indent=1) + "\n")
     return Alignment(float(new_from_old.scale), residuals, left_out, upright)
-
-
-def _turn_upright(model_path: Path, model: pycolmap.Reconstruction) -> str:
-    """Turn a model of a run upright by straight lines; return whose, empty where nobody knows."""
-    upright = upright_of_run(model_folder(model_path), model)
-    if upright is None:
-        return ""
-    turn_upright(model, upright)
-    return upright.text()
 
 
 def _without(places: Places, names: Collection[str]) -> Places:

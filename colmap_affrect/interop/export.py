@@ -23,7 +23,7 @@ from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
 from colmap_affrect.images.orientation import forget_orientation
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.interop.camera_models import with_camera_model
-from colmap_affrect.interop.finished_models import read_finished_model
+from colmap_affrect.interop.finished_models import read_finished_model, stand_upright
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.argument_types import checks_arguments
@@ -31,7 +31,6 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.upright import turn_upright, upright_of_run
 
 logger = logging.getLogger(__name__)
 
@@ -95,11 +94,10 @@ def export(
         raise OptionError(f"--image-path {image_path}: no such folder")
     photographs = image_path or Workspace(resolved(model_path).parent.parent).photographs()
     source = Source(model_path, read_finished_model(model_path), photographs)
-    upright = upright_of_run(model_path, source.model)
-    if upright is not None:
-        turn_upright(source.model, upright)
+    upright = stand_upright(model_path, source.model)
+    if upright:
         source = replace(source, is_upright=True)
-        note(f"upright     {upright.text()}: z is up")
+        note(f"upright     {upright}: z is up")
     if not formats:
         formats = _usual(source)
     if camera_model:

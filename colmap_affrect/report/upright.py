@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.lines import FOCALS, MIN_EVIDENCE, SHIFTS, Lines, upright_of
 from colmap_affrect.geometry.upright import agreed_up, upright_rotation
@@ -39,12 +39,13 @@ def upright_of_run(model_path: Path, model: pycolmap.Reconstruction) -> Upright 
         model: its content.
     """
     workspace = Workspace(resolved(model_path).parent.parent)
-    extends_another = " " in workspace.made_from("map") if workspace.features.exists() else True
-    if extends_another:  # or is of no run
+    if not workspace.features.exists():
         return None
     try:
+        if " " in workspace.made_from("map"):  # it extends another model, whose frame it keeps
+            return None
         return _upright(model, FeatureStore(workspace.features))
-    except StoreError as error:
+    except AffrectError as error:
         logger.warning("%s; so the model is not turned upright", error)
         return None
 

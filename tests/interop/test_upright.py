@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,7 @@ def test_exports_of_a_run_have_z_up_and_say_so(tmp_path: Path) -> None:
     assert_allclose(up_of(before, kept), UP, atol=1e-9)
 
 
-@pytest.mark.parametrize("case", ["contradiction", "by chance", "extends", "no run"])
+@pytest.mark.parametrize("case", ["contradiction", "by chance", "extends", "no run", "at work"])
 def test_nothing_is_turned_where_nobody_knows(tmp_path: Path, case: str) -> None:
     folder = tmp_path / "run"
     before = write_run(folder, evidence=2.0 if case == "by chance" else 20.0,
@@ -86,7 +87,9 @@ def test_nothing_is_turned_where_nobody_knows(tmp_path: Path, case: str) -> None
     if case == "no run":
         (folder / "features.h5").unlink()
     said = list[str]()
-    export(folder / "sparse" / "0", tmp_path / "out", "text", note=said.append)
+    at_work = Workspace(folder).locked() if case == "at work" else nullcontext()
+    with at_work:
+        export(folder / "sparse" / "0", tmp_path / "out", "text", note=said.append)
     assert said == []
     assert_allclose(up_of(before, exported(tmp_path / "out")), UP, atol=1e-6)
 
