@@ -39,7 +39,7 @@ CHANGED = "was changed since the last run"
 def watched(
     context: Context, *, follows: bool = True, maps: bool = False, discards: bool = False
 ) -> Iterator[None]:
-    """Mend the database before a command works in a folder, and seal it in the end.
+    """Mend the database before a command works in a folder, keep it open, and seal it in the end.
 
     ``follows``: bring it up to the last stage that was run; else the command does that. A command
     that only ``maps`` takes a changed one as it is, with a warning; one that ``discards`` all there
@@ -64,19 +64,21 @@ def watched(
         _make_again(context, why, follows=follows)
     workspace.seal.unlink(missing_ok=True)
     try:
-        yield
+        with context.graph.kept_open():
+            yield
     except AffrectError:
         if path.exists() and not damage_of(path):  # else it is looked through next time
-            _seal(workspace)
+            _seal(context)
         raise
-    _seal(workspace)
+    _seal(context)
 
 
-def _seal(workspace: Workspace) -> None:
+def _seal(context: Context) -> None:
+    workspace = context.workspace
     path = workspace.database
     if path.exists() and workspace.begun:
         with suppress(AffrectError):  # one that is not sealed is looked through next time
-            replace_text(workspace.seal, f"{rows_digest(path)}\n{_stamp(path)}\n")
+            replace_text(workspace.seal, f"{context.graph.digest()}\n{_stamp(path)}\n")
 
 
 def _stamp(path: Path) -> str:

@@ -27,11 +27,12 @@ from colmap_affrect.mappers.existing import (
 )
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.mend import watched
-from colmap_affrect.options import require_bools, takes_fields_of
+from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import Forecast, GivenProgress, Progress
+from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport, installed_versions, summed
@@ -439,7 +440,7 @@ def map_and_report(
     options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
-    sizes = read_sizes(workspace.database)
+    sizes = {name: (one.width, one.height) for name, one in context.graph.cameras.items()}
     marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
@@ -478,7 +479,8 @@ def map_and_report(
     replace_text(workspace.report, result.to_json())
     if page:
         pictures = draw_pairs_to_check(context, result, pair_inliers)
-        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures)
+        cameras = context.graph.cameras
+        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures, cameras)
         write_run_page(workspace, result, content, context.progress)
     return result
 

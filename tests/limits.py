@@ -20,7 +20,7 @@ LIMITS = {
     "lines of the longest function": 60,
     "imports between folders": 220,
     "words of ARCHITECTURE.md": 3_100,
-    "words of BENCHMARKS.md": 2_600,
+    "words of BENCHMARKS.md": 3_000,
 }
 """What a stranger can still read in one go. How many lines there are in all has no limit."""
 

@@ -8,8 +8,9 @@ from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
-from colmap_affrect.colmap.database import open_database, read_cameras
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.session.view_graph import ViewGraph
 
 SEED = 3
 
@@ -22,7 +23,7 @@ ALL_GIVEN = MappingTask(Path("database.db"), None, cameras={1: WHOLE})
 
 def task_with_given_cameras(database_path: Path, **values: Any) -> MappingTask:
     """Return a task for a database whose cameras are all given."""
-    cameras = {camera.camera_id: WHOLE for camera in read_cameras(database_path).values()}
+    cameras = {camera.camera_id: WHOLE for camera in ViewGraph(database_path).cameras.values()}
     return MappingTask(database_path, database_path.parent, cameras=cameras, **values)
 
 

@@ -21,6 +21,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pairs import PairPicture
 from colmap_affrect.report.pictures import Picture
 from colmap_affrect.report.run_page import RunContent, write_run_page
+from colmap_affrect.session.view_graph import ViewGraph
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "b\u202egnp.c", "c.png", "d.png", "e.png", "f.png")
 """The second one is shown turned round where nobody takes care."""
@@ -87,5 +88,6 @@ def make_run_page(folder: Path) -> Path:
         option=f"--reject-pair '{NAMES[0]},{NAMES[1]}'",
         picture=Picture.from_image(np.zeros((450, 900, 3), np.uint8)),
     )
-    content = RunContent(NAMES, pairs, photographs, pairs_to_check=[pair] * 3)
+    cameras = ViewGraph(workspace.database).cameras
+    content = RunContent(NAMES, pairs, photographs, pairs_to_check=[pair] * 3, cameras=cameras)
     return write_run_page(workspace, small_report(folder), content)

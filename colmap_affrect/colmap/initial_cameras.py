@@ -362,21 +362,26 @@ def import_images(
         missing = [name for name in missing if not why_unusable(image_path / name)]
         if missing:
             require_database_space(new, 2 * len(missing))
-            image_ids(read)  # makes it
-            mode = pycolmap.CameraMode.PER_IMAGE
-            try:
-                run_cancellable(lambda _: pycolmap.import_images(read, image_path, mode, missing))
-            except (RuntimeError, ValueError) as error:
-                if lacks_memory(error) or image_path.is_dir():
-                    raise
-                require_folder(image_path)  # it is gone, as with a drive
-            with open_database(read) as found, open_database(new) as database:
-                known.update(_take_over(initial, found, database))
+            with open_database(read) as found:  # which makes it
+                _read_images(read, image_path, missing)
+                with open_database(new) as database:
+                    known.update(_take_over(initial, found, database))
         if not new.exists():
             image_ids(new)  # makes an empty one
         if is_new:
             new.replace(path)
     return sorted(set(names) - known)
+
+
+def _read_images(path: Path, image_path: Path, names: Sequence[str]) -> None:
+    """Let COLMAP read images into a database; OptionError where their folder is gone meanwhile."""
+    mode = pycolmap.CameraMode.PER_IMAGE
+    try:
+        run_cancellable(lambda _: pycolmap.import_images(path, image_path, mode, names))
+    except (RuntimeError, ValueError) as error:
+        if lacks_memory(error) or image_path.is_dir():
+            raise
+        require_folder(image_path)  # it is gone, as with a drive
 
 
 def _take_over(

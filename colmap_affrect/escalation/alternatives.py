@@ -10,7 +10,7 @@ expected to be right.
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,26 +23,17 @@ from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import copy_with_keypoints, model_folders, read_summaries
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write, replace_text
+from colmap_affrect.project.match_state import LookedAt, Worth
 from colmap_affrect.project.outputs import remove_own, temporary_folder
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import (
-    CLIMBING,
-    FINISHED,
-    LOOKED_AT,
-    RESTORING,
-    MatchStore,
-    PairMatches,
-    Worth,
-)
+from colmap_affrect.project.stores import MatchStore, PairMatches
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.verify import verify_matches
 
 SCORE = "score.json"  # in the folder of the best models
-NOTHING_TO_GO_ON_FROM = 1.0
-"""Score of models below which not one relative pose is expected to be right."""
 
 
 def score(models: Sequence[ModelSummary]) -> float:
@@ -63,36 +54,16 @@ def present_score(context: Context) -> float:
 
 def _set_of(context: Context) -> str:
     """Return a digest of the pairs that are listed, and of what is said by hand."""
-    return f"{context.matches.note(FINISHED)} {context.by_hand.digest()}"
+    return f"{context.matches.state.listed} {context.by_hand.digest()}"
 
 
 # Learned matches
 
 
-@dataclass(frozen=True)
-class LookedAt:
-    """What models of learned matches are worth."""
-
-    score: float  # 0 where there are none
-    is_sure: bool  # of all images
-    score_without: float  # of the first models
-    is_chosen: bool = False
-
-    @classmethod
-    def of(cls, context: Context) -> "LookedAt | None":
-        """Return what is on record of these pairs; None before learned matching."""
-        known = context.matches.note(LOOKED_AT)
-        return cls(*known[1:]) if known and known[0] == _set_of(context) else None
-
-    def note(self, context: Context) -> list[Any]:
-        """Return what is kept on record."""
-        return [_set_of(context), self.score, self.is_sure, self.score_without, self.is_chosen]
-
-    @property
-    def is_enough(self) -> bool:
-        """Whether nothing is left to try with them, or nothing is there to go on from without."""
-        is_better = self.score > self.score_without
-        return is_better and (self.is_sure or self.score_without < NOTHING_TO_GO_ON_FROM)
+def looked_at_before(context: Context) -> LookedAt | None:
+    """Return what is on record of these pairs; None before learned matching."""
+    known = context.matches.state.looked_at
+    return known if known and known.of_set == _set_of(context) else None
 
 
 @dataclass(frozen=True)
@@ -120,13 +91,13 @@ def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
     found = read_summaries(learned)
     names = set(context.features.names()).difference(context.by_hand.left_out)
     is_sure = bool(found) and names.issubset(found[0].sure)
-    looked_at = LookedAt(score(found), is_sure, present_score(context))
-    context.matches.keep_note(LOOKED_AT, looked_at.note(context))
+    looked_at = LookedAt(_set_of(context), score(found), is_sure, present_score(context))
+    context.matches.keep(looked_at=looked_at)
 
 
 def is_to_be_looked_at(context: Context) -> bool:
     """Return whether models of learned matches may be better, and are not there to be chosen."""
-    looked_at = LookedAt.of(context)
+    looked_at = looked_at_before(context)
     if not looked_at:
         return True
     is_decided = looked_at.is_chosen or looked_at.score <= present_score(context)
@@ -144,7 +115,7 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
         Whether they were chosen.
     """
     context = escalation.context
-    looked_at = LookedAt.of(context)
+    looked_at = looked_at_before(context)
     if not looked_at or looked_at.is_chosen or not context.workspace.learned.exists():
         return False
     # At once: as it was then, also for a run that was killed since.
@@ -152,8 +123,8 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
     choice = _learned_choice(escalation) if is_wanted else None
     if not choice or not choice.matches:
         return False
-    chosen = {LOOKED_AT: replace(looked_at, is_chosen=True).note(context)}
-    _choose(context, choice, context.workspace.learned, chosen)
+    decided = replace(looked_at, is_chosen=True)
+    _choose(context, choice, context.workspace.learned, looked_at=decided)
     take_over_chosen(escalation)
     return True
 
@@ -195,16 +166,17 @@ def _map_copy(context: Context, mapper: Mapper, choice: Choice, target: Path) ->
 # Going over to other models
 
 
-def _choose(context: Context, choice: Choice, folder: Path, notes: Mapping[str, Any]) -> None:
+def _choose(context: Context, choice: Choice, folder: Path, **changes: Any) -> None:
     """Choose matches, and keep in mind that the models in a folder are to follow them."""
-    of_models = {CLIMBING: context.matches.note(FINISHED), RESTORING: folder.name}
-    context.matches.choose(choice.matches, choice.measured_worths, **of_models, **notes)
+    matches = context.matches
+    changes |= {"modelled": matches.state.listed, "follows": folder.name}
+    matches.choose(choice.matches, choice.measured_worths, **changes)
 
 
 def take_over_chosen(escalation: Escalation) -> None:
     """Let models follow the matches that were chosen, if they have not yet; a run was killed."""
     context = escalation.context
-    name = context.matches.note(RESTORING)
+    name = context.matches.state.follows
     if not name:
         return
     escalation.write()
@@ -212,7 +184,7 @@ def take_over_chosen(escalation: Escalation) -> None:
     if folder.exists():
         guide(context, context.guiding)
         _take_over(context, folder)
-    context.matches.keep_note(RESTORING, None)
+    context.matches.keep(follows="")
 
 
 def follow_keypoints(context: Context) -> None:
@@ -220,7 +192,7 @@ def follow_keypoints(context: Context) -> None:
 
     Mapping again would be of the same pairs, and might end elsewhere.
     """
-    if context.workspace.made_from("map") != context.verified_digest():
+    if context.workspace.mapped_from() != context.to_map():
         _take_over(context, context.workspace.sparse)
 
 
@@ -231,7 +203,7 @@ def _take_over(context: Context, sparse_path: Path) -> None:
         new.mkdir()
         for folder in model_folders(sparse_path):
             copy_with_keypoints(folder, new / folder.name, workspace.database)
-    workspace.record_mapped(context.verified_digest())
+    workspace.record_mapped(context.to_map())
 
 
 # The best models so far
@@ -244,7 +216,7 @@ def keep_best(context: Context) -> None:
     """
     workspace = context.workspace
     is_small = len(context.features.names()) <= SMALL
-    if not is_small or workspace.made_from("map") != context.verified_digest():
+    if not is_small or workspace.mapped_from() != context.to_map():
         return
     present = present_score(context)
     if present < best_score(context):
@@ -284,7 +256,7 @@ def restore_best(escalation: Escalation) -> bool:
     levels = context.matches.levels(pairs)
     changed = [p for p, level in before.levels(pairs).items() if level != levels[p]]
     choice = Choice(list(before.read(changed)), before.measured_worths(changed))
-    _choose(context, choice, best, {})
+    _choose(context, choice, best)
     take_over_chosen(escalation)
     return True
 

@@ -22,7 +22,6 @@ from colmap_affrect.escalation.escalate import Escalation, begin
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import model_folders
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
@@ -48,15 +47,15 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
     escalated = _learned(escalation, mapper, escalated)
     is_chosen = choose_learned(escalation, at_once=True)
     is_untouched = not is_chosen and not escalation.has_stepped
-    if is_untouched and context.matches.note(LEARNING):
+    if is_untouched and context.matches.state.learning:
         follow_keypoints(context)
     while True:
         while step := escalation.next_step():
             keep_best(context)
             escalated = escalation.taken(step, escalated)
-        before = context.workspace.made_from("map")
+        before = context.workspace.mapped_from()
         reports += _mapped_on(context, mapper, recipe)
-        has_mapped = context.workspace.made_from("map") != before  # perhaps there is no model
+        has_mapped = context.workspace.mapped_from() != before  # perhaps there is no model
         if has_mapped or restore_best(escalation) or choose_learned(escalation, at_once=False):
             continue
         forget_others(context)
@@ -78,12 +77,12 @@ def _learned(escalation: Escalation, mapper: Mapper, report: StageReport) -> Sta
 def _mapped_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
     """Map for the first time, unless a run before has gone on from there."""
     matches = context.matches
-    listed = matches.note(FINISHED)
-    if matches.note(CLIMBING) == listed and model_folders(context.workspace.sparse):
+    state = matches.state
+    if state.modelled == state.listed and model_folders(context.workspace.sparse):
         return []
     forget_others(context)  # of other pairs
     reports = [guide(context, recipe.guided), map_images(context, mapper)[0]]
-    matches.keep_note(CLIMBING, listed)
+    matches.keep(modelled=state.listed)
     return reports
 
 

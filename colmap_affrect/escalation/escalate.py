@@ -28,8 +28,9 @@ from colmap_affrect.escalation.set_state import SetState
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
+from colmap_affrect.project.match_state import Begun, Worth
 from colmap_affrect.project.report import MatchedAgain, StageReport
-from colmap_affrect.project.stores import EFFORT, LEARNING, STEP, Learned, PairMatches, Worth
+from colmap_affrect.project.stores import Learned, PairMatches
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.extract import extract_images
@@ -67,8 +68,8 @@ def begin(
     context.workspace.require("verify")
     options = options or context.escalation
     context.workspace.record_options("escalate", options.to_mapping())
-    if context.matches.note(EFFORT) != context.effort:
-        context.matches.keep_note(EFFORT, context.effort)
+    if context.matches.state.effort != context.effort:
+        context.matches.keep(effort=context.effort)
     escalation = Escalation(context, options)
     if escalation.has_begun:
         escalation.write()
@@ -96,7 +97,7 @@ def matched_again(context: Context) -> Tried:
     if not (weights or escalation.has_begun):  # large sets take long to go through
         return Tried()
     situation = state.situation(weights, models)
-    effort = escalation.matches.note(EFFORT) or context.effort
+    effort = escalation.matches.state.effort or context.effort
     return Tried(effort, tuple(tried(situation)), tuple(untried(situation)))
 
 
@@ -149,12 +150,13 @@ class Escalation:
     @property
     def has_stepped(self) -> bool:
         """Whether a step has begun, or was taken."""
-        return self.matches.note(STEP) is not None
+        return self.matches.state.has_stepped
 
     @property
     def has_begun(self) -> bool:
         """Whether learned matching or a step has begun, perhaps in a run that was killed."""
-        return self.has_stepped or self.matches.note(LEARNING) is not None
+        state = self.matches.state
+        return state.has_stepped or state.learning is not None
 
     @property
     def is_over_time(self) -> bool:
@@ -168,20 +170,19 @@ class Escalation:
         """
         if self.is_over_time:
             return None
-        begun = self.matches.note(STEP)
+        begun = self.matches.state.step
         if begun:
-            level, pairs = begun
-            return Step(level, self._left_of(level, [(first, second) for first, second in pairs]))
+            return Step(begun.level, self._left_of(begun))
         plan = self._plan()
         self.left_s = plan.left_s / available_cores()
         return plan.step if plan.step.pairs else None
 
-    def _left_of(self, level: int, pairs: Sequence[Pair]) -> list[Pair]:
+    def _left_of(self, begun: Begun) -> list[Pair]:
         """Return the pairs of a step that has begun for which its level was not tried yet."""
         tried_levels = self.matches.levels(self.state.pairs, "tried")
         left = list[Pair]()
-        for pair in pairs:
-            was_tried = tried_levels.get(pair, -1) >> level & 1
+        for pair in begun.pairs:
+            was_tried = tried_levels.get(pair, -1) >> begun.level & 1
             if not was_tried and self.context.by_hand.allows(*pair):
                 left.append(pair)
         return left
@@ -230,7 +231,7 @@ class Escalation:
             level: number of the level in the recipe.
         """
         if pairs:
-            self.matches.keep_note(STEP, [level, list(pairs)])
+            self.matches.keep(step=Begun(level, tuple(pairs)), has_stepped=True)
         learned = self.matches.learned(pairs)
         known = {pair: one for pair, one in learned.items() if one.matches.level == level}
         if known:
@@ -240,7 +241,7 @@ class Escalation:
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
         self.write()
-        self.matches.keep_note(STEP, [])
+        self.matches.keep(step=None, has_stepped=True)
 
     def plan_learning(self) -> bool:
         """Put on record which pairs are to be matched by a learned level, beside what is there.
@@ -251,7 +252,7 @@ class Escalation:
             Whether there are any; none of sets that are large or need nothing, nor where no learned
             level can be used.
         """
-        if self.matches.note(LEARNING):
+        if self.matches.state.learning:
             return True
         models = self.state.models()
         weights = self.state.weights(models)
@@ -262,7 +263,7 @@ class Escalation:
             return False
         step = learned_step(situation)
         if step.pairs:
-            self.matches.keep_note(LEARNING, [step.level, list(step.pairs)])
+            self.matches.keep(learning=Begun(step.level, tuple(step.pairs)))
         return bool(step.pairs)
 
     def learn(self) -> int:
@@ -271,16 +272,15 @@ class Escalation:
         Returns:
             How many were matched; some may be left where the time that the user gave is over.
         """
-        level, planned = self.matches.note(LEARNING)
-        pairs = [(first, second) for first, second in planned]
-        done = self.matches.learned_levels(pairs)
-        todo = [pair for pair in pairs if done[pair] < 0]
+        planned = self.matches.state.learning or Begun(0, ())
+        done = self.matches.learned_levels(planned.pairs)
+        todo = [pair for pair in planned.pairs if done[pair] < 0]
         num_matched = 0
         for begin in range(0, len(todo), PAIRS_AT_ONCE):
             if self.is_over_time:
                 break
             batch = todo[begin : begin + PAIRS_AT_ONCE]
-            self._match_with(batch, level, self._keep_learned)
+            self._match_with(batch, planned.level, self._keep_learned)
             num_matched += len(batch)
         self.write()  # the features are keypoints of the database, too
         return num_matched
@@ -288,8 +288,8 @@ class Escalation:
     @property
     def is_learned(self) -> bool:
         """Whether all pairs of :meth:`plan_learning` have learned matches."""
-        _, planned = self.matches.note(LEARNING)
-        return min(self.matches.learned_levels(map(tuple, planned)).values()) >= 0
+        planned = self.matches.state.learning
+        return planned is not None and min(self.matches.learned_levels(planned.pairs).values()) >= 0
 
     def write(self) -> None:
         """Bring the database up to what is stored, and verify what is new."""

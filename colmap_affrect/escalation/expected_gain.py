@@ -17,7 +17,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.stores import Worth
+from colmap_affrect.project.match_state import Worth
 from colmap_affrect.recipes import Level
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")

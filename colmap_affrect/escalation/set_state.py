@@ -6,7 +6,6 @@ It is read anew for every decision, from the stores and the view graph: each ste
 import math
 from collections.abc import Mapping, Sequence
 
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import weakly_connected_images
 from colmap_affrect.escalation import expected_gain
 from colmap_affrect.escalation.expected_gain import PairState
@@ -81,7 +80,7 @@ class SetState:
 
     def _is_mapped(self) -> bool:
         """Tell whether the models are those of the verified pairs."""
-        return self.context.workspace.made_from("map") == self.context.verified_digest()
+        return self.context.workspace.mapped_from() == self.context.to_map()
 
     def _insecure(self, wanted: set[str], *, num_images: int) -> set[str]:
         """Return the images that the next model may well lose; none where it will tell of them."""
@@ -138,7 +137,7 @@ class SetState:
             return {}
         graph = self.context.graph
         found = dict[Pair, int]()
-        with open_database(graph.path) as database:
+        with graph.reading() as database:
             for pair in pairs:
                 first, second = pair
                 matches = database.read_matches(graph.ids[first], graph.ids[second])

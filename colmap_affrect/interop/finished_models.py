@@ -20,11 +20,12 @@ def read_finished_model(folder: Path) -> pycolmap.Reconstruction:
         return read_given_model(folder)
     except (OptionError, StoreError):
         whole = resolved(folder)
-        if any(Workspace(path).is_in_use() for path in (whole, *whole.parents[:2])):
-            raise WorkspaceError(
-                f"{folder}: another colmap-affrect is writing this model; wait for it, and run the "
-                "same command again"
-            ) from None
+        for path in (whole, *whole.parents[:2]):
+            if Workspace(path).is_in_use():
+                raise WorkspaceError(
+                    f"{folder}: another colmap-affrect is writing this model; wait for it, and run "
+                    "the same command again"
+                ) from None
     return read_given_model(folder)  # the run may have ended just now
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
 from colmap_affrect.errors import WorkspaceError, damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
@@ -31,6 +31,7 @@ from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_pro
 MIN_PROBABILITY = 0.05
 """Images leave their model below this probability: nineteen of twenty such poses are wrong."""
 # What was begun is removed while a call of COLMAP may still write there.
+ENOUGH_OF_SMALL_SET = 0.8  # of all images: such a model is never too small (COLMAP)
 NUM_REMOVALS = 5  # times that this is tried
 REMOVAL_INTERVAL_S = 0.05  # between them
 
@@ -153,7 +154,7 @@ def map_database(
     snapshots = sparse_path.with_name(sparse_path.name + ".snapshots")
     keeps_models = task.extend or task.previous_models
     remove_own([partial] if keeps_models else [partial, sparse_path])
-    num_images = len(image_ids(task.database_path))
+    num_images = len(graph_of(task, MIN_NUM_MATCHES).names)
     progress = _Progress(next_image, num_images)
     try:
         with with_snapshots(task, mapper.options, snapshots, num_images) as whole:
@@ -162,7 +163,8 @@ def map_database(
             found = mapper.map(whole, raw, mapper.options.random_seed, progress.show)
             remove_own([raw])
         scored = [_without_wrong_images(model, task) for model in found]
-        kept = _large_enough(scored, 1 if task.extend else mapper.options.min_model_size)
+        min_model_size = 1 if task.extend else mapper.options.min_model_size
+        kept = _large_enough(scored, min_model_size, num_images)
         kept.sort(key=lambda model: model.size, reverse=True)
         summaries = _write_models(kept, task, partial)
         remove_own([sparse_path])
@@ -172,9 +174,12 @@ def map_database(
     return summaries
 
 
-def _large_enough(models: Sequence[_ScoredModel], min_num_images: int) -> list[_ScoredModel]:
-    """Return the models of which so many images are left."""
-    return [model for model in models if len(model.confidences) >= min_num_images]
+def _large_enough(
+    models: Sequence[_ScoredModel], min_model_size: int, num_images: int
+) -> list[_ScoredModel]:
+    """Return the models that are large enough, for the number of all images."""
+    least = max(1, min(min_model_size, int(ENOUGH_OF_SMALL_SET * num_images)))
+    return [model for model in models if len(model.confidences) >= least]
 
 
 def _remove_unfinished(partial: Path) -> None:

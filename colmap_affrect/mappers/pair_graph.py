@@ -101,18 +101,23 @@ class PairGraph:
             path: The database.
             min_num_matches: Pairs with fewer inliers are left out.
         """
+        with open_database(path) as database:
+            return cls.of(database, min_num_matches)
+
+    @classmethod
+    def of(cls, database: pycolmap.Database, min_num_matches: int = MIN_NUM_MATCHES) -> Self:
+        """Read the same from a database that is open."""
         options = pycolmap.DatabaseCacheOptions(
             min_num_matches=min_num_matches, load_all_images=True
         )
-        with open_database(path) as database:
-            names = {image.image_id: image.name for image in database.read_all_images()}
-            cameras = cameras_of_images(database)
-            verified = _read_pairs(database, min_num_matches)
-            cache = pycolmap.DatabaseCache.create(database, options)
-            keypoints = {}
-            for image_id in _images_of(verified):
-                rows = database.read_keypoints(image_id)
-                keypoints[image_id] = np.array(rows[:, :2], np.float32)
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        cameras = cameras_of_images(database)
+        verified = _read_pairs(database, min_num_matches)
+        cache = pycolmap.DatabaseCache.create(database, options)
+        keypoints = {}
+        for image_id in _images_of(verified):
+            rows = database.read_keypoints(image_id)
+            keypoints[image_id] = np.array(rows[:, :2], np.float32)
         strong, weak = _strongest(verified)
         return cls(cache, names, cameras, keypoints, strong, weak, min_num_matches)
 

@@ -1,6 +1,5 @@
-"""A HDF5 file of groups that are complete or do not count, which changes as a whole."""
+"""A HDF5 file that changes as a whole: what is there is complete."""
 
-import json
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ CHECKSUM = "crc32"  # of the values of a dataset, its attribute
 
 
 class GroupStore:
-    """A HDF5 file of complete groups."""
+    """A HDF5 file of entries: groups with attributes of their own, perhaps in groups without."""
 
     format = ""  # attribute of the file
     stage = ""  # that makes it again
@@ -62,23 +61,11 @@ class GroupStore:
                     )
                 yield file
 
-    def note(self, key: str) -> Any:
-        """Return what is kept with the whole file, as JSON has it; None where nothing is."""
-        if not self.path.exists():
-            return None
-        with self._open("r") as file:
-            return json.loads(file.attrs.get(key, "null"))
-
-    def keep_note(self, key: str, value: Any) -> None:
-        """Keep something with the whole file."""
-        with self._open("a") as file:
-            file.attrs[key] = json.dumps(value)
-
     def check_all(self) -> None:
         """Read all that is there; StoreError if it is damaged."""
         if self.path.exists():
             with self._open("r") as file:
-                for _, group in complete_groups(file):
+                for _, group in entries_of(file):
                     for name in group:  # items() has None for what cannot be opened
                         checked(group, name)
 
@@ -90,7 +77,6 @@ class GroupStore:
         for name, values in datasets.items():
             cls._write_dataset(group, name, values)
         group.attrs.update(attributes)
-        group.attrs["complete"] = True
 
     @staticmethod
     def _write_dataset(group: h5py.Group, name: str, values: Any) -> None:
@@ -112,21 +98,21 @@ def _checksum(values: Any) -> int:
     return zlib.crc32(np.ascontiguousarray(values).data)
 
 
-def is_complete(file: h5py.File, key: str) -> bool:
-    """Return whether a group is there and complete."""
-    return key in file and bool(file[key].attrs.get("complete", False))
+def has_entry(file: h5py.File, key: str) -> bool:
+    """Return whether there is an entry of this path."""
+    return key in file and len(file[key].attrs) > 0
 
 
-def complete_groups(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5py.Group]]:
-    """Yield the paths of all complete groups, and these.
+def entries_of(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5py.Group]]:
+    """Yield the paths of all entries, and these.
 
     Their datasets are not opened, which takes long, and links are not followed.
     """
-    if group.attrs.get("complete", False):
+    if path and len(group.attrs):
         yield path, group
         return
     for key in group:
         is_link = not isinstance(group.get(key, getlink=True), h5py.HardLink)
         inner = None if is_link else group[key]
         if isinstance(inner, h5py.Group):
-            yield from complete_groups(inner, f"{path}/{key}" if path else key)
+            yield from entries_of(inner, f"{path}/{key}" if path else key)

@@ -21,6 +21,7 @@ FILM_MM = 36.0  # longer side of small-format film, for which lenses are compare
 SEGMENTS = "line_segments"  # (N, 4) starts and ends, longer sides from the middle of the image
 LIKELIHOODS = "line_log_likelihoods"  # (F, S) of focal lengths and shifts
 ROTATIONS = "line_rotations"  # (F, S, 3, 3)
+LINE_DATASETS = (SEGMENTS, LIKELIHOODS, ROTATIONS)  # of an image, beside its features
 
 
 @documented

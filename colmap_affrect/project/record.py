@@ -7,7 +7,7 @@ What files hold is known by SHA-256 digests, with sizes and times so that an idl
 
 import hashlib
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -47,17 +47,23 @@ def stamp_of(paths: Iterable[Path]) -> str:
     return ", ".join(_or_empty(_stamp, path) for path in paths)
 
 
-def content_of(paths: Iterable[Path], known: Content | None = None) -> Content:
+def content_of(paths: Iterable[Path], known: Content | None = None, options: str = "") -> Content:
     """Return what files hold, without reading them if sizes and times are those that are known.
 
-    One that cannot be read counts as empty.
+    Args:
+        paths: of the files; one that cannot be read counts as empty.
+        known: what they held.
+        options: a digest of what counts beside them, empty if nothing does.
     """
     files = list(paths)
-    stamp = stamp_of(files)
+    stamp = ", ".join([stamp_of(files), options]) if options else stamp_of(files)
     if known and known.stamp == stamp:
         return known
-    digests = "\n".join(_or_empty(file_sha256, path) for path in files)
-    return Content(hashlib.sha256(digests.encode()).hexdigest() if files else "", stamp)
+    digests = [_or_empty(file_sha256, path) for path in files]
+    if options:
+        digests.append(options)
+    whole = "\n".join(digests)
+    return Content(hashlib.sha256(whole.encode()).hexdigest() if digests else "", stamp)
 
 
 def _or_empty(read: Callable[[Path], str], path: Path) -> str:
@@ -69,9 +75,10 @@ def _or_empty(read: Callable[[Path], str], path: Path) -> str:
 
 Stage = Literal["copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"]
 STAGES: tuple[str, ...] = get_args(Stage)
-FORMAT_VERSION = 11  # counts up when a stage records other options than before
-MADE_FROM = "made_from"  # digests of given files, and of the verified pairs that were mapped
-KEYS = ("recipe", "begun", *STAGES, MADE_FROM)
+FORMAT_VERSION = 12  # counts up when a stage records other options than before
+MADE_FROM = "made_from"  # digests of given files
+MAPPED = "mapped"  # what the models that are there were made from, and how many they are
+KEYS = ("recipe", "begun", *STAGES, MADE_FROM, MAPPED)
 
 PLACES = {
     "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",
@@ -80,6 +87,34 @@ PLACES = {
 """Options that say where files are: other places are no other options, what the files hold counts
 (:mod:`colmap_affrect.project.record`). But none at all is another option."""
 WEIGHTS = "weights"  # of a stage: the digests of files, beside its options
+OF_DATABASE = {"extract": ("cameras",)}
+"""Options of a stage that decide only on the database, which others make anew."""
+
+
+class MappedFrom(NamedTuple):
+    """What models were made from."""
+
+    verified: str  # digest of the database
+    by_hand: str = ""  # of what a person said; empty for nothing
+    extends: str = ""  # of the model that was extended, or OWN; empty for none
+
+
+OWN = "own"  # a model of the folder itself is extended
+
+
+class Mapped(BaseModel):
+    """The models that are there."""
+
+    model_config = ConfigDict(extra="forbid")
+    verified: str
+    by_hand: str = ""
+    extends: str = ""
+    number: int
+
+    @property
+    def made_from(self) -> MappedFrom:
+        """What they were made from."""
+        return MappedFrom(self.verified, self.by_hand, self.extends)
 
 
 class _Record(BaseModel):
@@ -88,6 +123,7 @@ class _Record(BaseModel):
     recipe: str = ""
     begun: list[Stage] = []
     made_from: dict[str, str] = {}
+    mapped: Mapped | None = None
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -119,10 +155,21 @@ def record_text(record: Mapping[str, Any]) -> str:
     return tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered})
 
 
-def first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Say where options on record differ from those given now; empty if they do not."""
-    old = flat(known)
-    new = flat(now)
+def first_difference(
+    known: Mapping[str, Any], now: Mapping[str, Any], free: Collection[str] = ()
+) -> str:
+    """Say where options that make other results differ from those given now.
+
+    Args:
+        known: those on record.
+        now: those given now.
+        free: keys whose values may differ.
+
+    Returns:
+        What differs first, empty if nothing does.
+    """
+    old = flat({key: value for key, value in known.items() if key not in free})
+    new = flat({key: value for key, value in now.items() if key not in free})
     # The name of a part first: with another one most other options differ too.
     for key in sorted(old.keys() | new.keys(), key=lambda k: (k.rpartition(".")[2] != "name", k)):
         before = old.get(key)

@@ -11,7 +11,6 @@ image or one batch of pairs and closed again; what is written in between appears
 (:mod:`colmap_affrect.project.atomic_files`).
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,31 +27,15 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.lines import Lines
-from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
-from colmap_affrect.project.line_report import (
-    LIKELIHOODS,
-    ROTATIONS,
-    SEGMENTS,
-    line_datasets,
-    lines_from_datasets,
-)
+from colmap_affrect.project.group_store import GroupStore, checked, entries_of, has_entry
+from colmap_affrect.project.line_report import LINE_DATASETS, line_datasets, lines_from_datasets
+from colmap_affrect.project.match_state import STATE_JSON, MatchState, Names, Worth
 from colmap_affrect.project.record import Content, stamp_of
-
-Names = tuple[str, str]  # of a pair of images
 
 MAX_INT16 = 32767
 NOT_KNOWN = Content()
 PAIRS_PER_WRITE = 64  # a run that is ended loses at most as many
-# Notes of matches:
-STATIONARY = "stationary_cells"  # [size, cells] of the places that never move
-STEP = "step"  # level and pairs of the step of escalation that has begun and not ended
-FINISHED = "finished_list"  # digest of the list whose pairs have all been matched and looked at
-IN_VAIN = "all_features_in_vain"  # that list, and whether all features bring no more than some
-CLIMBING = "climbing_list"  # the same, of which there was a model before pairs were matched again
-EFFORT = "effort"  # how much was tried for images in need
-LEARNING = "learning"  # level and pairs of learned matching that is kept beside what is there
-LOOKED_AT = "learned_looked_at"  # what models of learned matches are worth, and of which pairs
-RESTORING = "restoring"  # folder of the models that the matches are of, and that follow them
+STATE = "state"  # attribute of the file of matches
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]
 """By image: what it was extracted from, the number of its features, and (width, height) in px."""
@@ -70,9 +53,6 @@ class PairMatches:
     of_some: bool = False  # only of the features with the largest responses
 
 
-Worth = tuple[int, int]  # inliers; where there are none, how many matches confirm each other
-
-
 @dataclass(frozen=True)
 class Learned:
     """Matches of a pair by learned features, kept beside those in use, and what they are worth."""
@@ -86,7 +66,7 @@ def _entries_of(path: Path, _: str) -> Entries:
     """Go through a file, which takes long, unless that was done when its stamp was the same."""
     found: Entries = {}
     with FeatureStore(path)._open("r") as file:
-        for name, group in complete_groups(file):
+        for name, group in entries_of(file):
             width, height = checked(group, "image_size").tolist()
             found[name] = _content(group), len(group["keypoints"]), (width, height)
     return dict(sorted(found.items()))
@@ -102,7 +82,7 @@ def _level_ends(group: h5py.Group) -> dict[int, int]:
 
 
 def _line_datasets(group: h5py.Group) -> dict[str, NDArray[Any]]:
-    return {key: checked(group, key) for key in (SEGMENTS, LIKELIHOODS, ROTATIONS) if key in group}
+    return {key: checked(group, key) for key in LINE_DATASETS if key in group}
 
 
 def frame_datasets(lafs: Floats) -> dict[str, Singles]:
@@ -211,7 +191,7 @@ class FeatureStore(GroupStore):
         self._write(file, name, datasets, content=content.digest, stamp=content.stamp)
 
     def read(self, name: str) -> LocalFeatures:
-        """Read all features of one image; StoreError if they are missing or incomplete."""
+        """Read all features of one image; StoreError if they are missing."""
         with self._open("r") as file:
             return self._features(self._group(file, name))
 
@@ -227,7 +207,7 @@ class FeatureStore(GroupStore):
         return np.concatenate([np.arange(part.start, part.stop) for part in parts])
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
-        if not is_complete(file, name):
+        if not has_entry(file, name):
             raise StoreError(f"{self.path}: no features of {name}; run extract first")
         return file[name]
 
@@ -293,6 +273,19 @@ class MatchStore(GroupStore):
     format = "colmap_affrect/matches"
     stage = "match"
 
+    @property
+    def state(self) -> MatchState:
+        """How far matching and escalation of the whole set have come."""
+        if not self.path.exists():
+            return MatchState()
+        with self._open("r") as file:
+            return _read_state(file)
+
+    def keep(self, **changes: Any) -> None:
+        """Change fields of the state."""
+        with self._open("a") as file:
+            _change_state(file, changes)
+
     def write(
         self,
         pairs: Iterable[PairMatches],
@@ -321,7 +314,7 @@ class MatchStore(GroupStore):
         key = pair_key(*pair.names)
         known: dict[str, Any] = {"tried": 0}
         learned = None
-        if is_complete(file, key):
+        if has_entry(file, key):
             known = {name: file[key].attrs[name] for name in KEPT if name in file[key].attrs}
             learned = _read_learned(file[key], pair.names)
         known["tried"] |= 1 << pair.level
@@ -369,18 +362,17 @@ class MatchStore(GroupStore):
         return found
 
     def choose(
-        self, chosen: Iterable[PairMatches], measured_worths: Mapping[Names, Worth], **notes: Any
+        self, chosen: Iterable[PairMatches], measured_worths: Mapping[Names, Worth], **changes: Any
     ) -> None:
         """Let other matches take the place of those of their pairs, all or none.
 
         Args:
             chosen: matches that are used from now on.
             measured_worths: what the measured matches were worth that were used, by pair.
-            notes: what is kept with the whole file.
+            changes: of the state.
         """
         with self._open("a") as file:
-            for key, value in notes.items():
-                file.attrs[key] = json.dumps(value)
+            _change_state(file, changes)
             for pair in chosen:
                 self._write_pair(file, pair)
             for names, worth in measured_worths.items():
@@ -396,20 +388,19 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for note in (FINISHED, IN_VAIN, STEP, CLIMBING, LEARNING, LOOKED_AT, RESTORING):
-                file.attrs.pop(note, None)
-            for key, group in list(complete_groups(file)):
+            _write_state(file, _read_state(file).without_pairs())
+            for key, group in list(entries_of(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
                 is_escalated = group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs
                 if is_asked or is_escalated:
                     del file[key]
 
     def has(self, pairs: Sequence[Names]) -> Bools:
-        """Return, as (N,) bools, which of N pairs are there and complete."""
+        """Return, as (N,) bools, which of N pairs are there."""
         if not self.path.exists():
             return np.zeros(len(pairs), np.bool_)
         with self._open("r") as file:
-            there = (is_complete(file, pair_key(*pair)) for pair in pairs)
+            there = (has_entry(file, pair_key(*pair)) for pair in pairs)
             return np.fromiter(there, np.bool_, len(pairs))
 
     def nums_of_some(self, pairs: Iterable[Names]) -> dict[Names, int]:
@@ -437,9 +428,21 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             for name1, name2 in pairs:
                 key = pair_key(name1, name2)
-                if not is_complete(file, key):
+                if not has_entry(file, key):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
                 yield _read_matches(file[key], (name1, name2))
+
+
+def _read_state(file: h5py.File) -> MatchState:
+    return STATE_JSON.validate_json(file.attrs.get(STATE, "{}"))
+
+
+def _change_state(file: h5py.File, changes: Mapping[str, Any]) -> None:
+    _write_state(file, replace(_read_state(file), **changes))
+
+
+def _write_state(file: h5py.File, state: MatchState) -> None:
+    file.attrs[STATE] = STATE_JSON.dump_json(state).decode()
 
 
 def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatches:
@@ -488,7 +491,7 @@ class GuidedStore(GroupStore):
             return []
         with self._open("r") as file:
             found = []
-            for _, group in sorted(complete_groups(file), key=lambda item: item[0]):
+            for _, group in sorted(entries_of(file), key=lambda item: item[0]):
                 (first, second) = group.attrs["names"]
                 num = int(group.attrs["num_inliers"])
                 found.append(GuidedPair((str(first), str(second)), checked(group, "exact"), num))

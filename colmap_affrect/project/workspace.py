@@ -17,8 +17,12 @@ from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.record import (
     MADE_FROM,
+    MAPPED,
+    OF_DATABASE,
     STAGES,
     WEIGHTS,
+    Mapped,
+    MappedFrom,
     first_difference,
     read_record,
     record_text,
@@ -240,9 +244,25 @@ class Workspace:
         if any(self.made_from(what) != digest for what, digest in digests.items()):
             self._write_record({**record, MADE_FROM: known})
 
-    def record_mapped(self, inputs: str) -> None:
-        """Put on record what the models that are there were made from, and how many they are."""
-        self.record_made_from(map=inputs, models=str(self.num_models()))
+    @property
+    def mapped(self) -> Mapped | None:
+        """What is on record of the models that are there; None where they are to be made anew."""
+        values = self.recorded().get(MAPPED)
+        return Mapped(**values) if values else None
+
+    def mapped_from(self) -> MappedFrom | None:
+        """Return what these models were made from, as far as it is known."""
+        return self.mapped.made_from if self.mapped else None
+
+    def record_mapped(self, inputs: MappedFrom | None) -> None:
+        """Put on record what the models that are there were made from, and how many they are.
+
+        Args:
+            inputs: None where they are to be made anew.
+        """
+        values = {**inputs._asdict(), "number": self.num_models()} if inputs else None
+        if values != self.recorded().get(MAPPED):
+            self._write_record({**self.recorded(), MAPPED: values})
 
     def num_models(self) -> int:
         """Return how many models there are, 0, 1, ..."""
@@ -252,8 +272,8 @@ class Workspace:
 
     def lacks_models(self) -> bool:
         """Return whether models that were made are gone, removed by somebody or half removed."""
-        made = self.made_from("models")
-        return not self.sparse.exists() or (made.isdecimal() and self.num_models() < int(made))
+        number = self.mapped.number if self.mapped else 0
+        return not self.sparse.exists() or self.num_models() < number
 
     def record_options(
         self,
@@ -280,10 +300,12 @@ class Workspace:
             outputs.remove_own(self._results(stage))
             begun = self._begun_before(stage)
             record = record if begun else {}
-        if stage in begun and (why := first_difference(record[stage], options)):
-            raise ConflictError(
-                f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
-            )
+        if stage in begun:
+            why = first_difference(record[stage], options, OF_DATABASE.get(stage, ()))
+            if why:
+                raise ConflictError(
+                    f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
+                )
         begun = [name for name in STAGES if name in begun or name == stage]
         later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
         changed = {**record, **later, stage: dict(options), "begun": begun}
@@ -297,7 +319,7 @@ class Workspace:
         """
         if self.users_database:
             raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
-        self.record_made_from(map="")
+        self.record_mapped(None)
         outputs.remove_own(path for path in self._results("verify") if path != self.sparse)
         self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
 

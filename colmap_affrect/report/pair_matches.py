@@ -3,18 +3,17 @@
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
-from pathlib import Path
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import require_known
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.geometry.arrays import Array, Indices, rows_in
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.session.context import Context
+from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
 
 
@@ -43,28 +42,28 @@ class MatchedPair:
 class PairReader:
     """Reads pairs of a database, with what the stores and the model of a run know."""
 
-    def __init__(self, path: Path, context: Context) -> None:
+    def __init__(self, graph: ViewGraph, context: Context) -> None:
         """Read the model of a run, and how its pairs agree with it.
 
         Args:
-            path: the database.
+            graph: of the database.
             context: of the run; its folder need not have anything.
         """
         workspace = context.workspace
         model_path = workspace.sparse / "0"
         has_stores = "match" in workspace.begun and not workspace.is_changed
-        self.path = path
+        self.graph = graph
         self.run = context if has_stores else None
         self.model = (
             read_given_model(model_path) if model_path.exists() else pycolmap.Reconstruction()
         )
-        self.agreement = agreements(path, self.model)  # share of inliers, by verified pair
+        self.agreement = agreements(self.graph, self.model)  # share of inliers, by verified pair
 
     def read(self, names: Pair) -> MatchedPair:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
         sizes = []
         keypoints = []
-        with open_database(self.path) as database:
+        with self.graph.reading() as database:
             images = {image.name: image for image in database.read_all_images()}
             for name in names:
                 require_known(name, images)

@@ -39,6 +39,7 @@ from colmap_affrect.report.sheets import (
     text_row,
 )
 from colmap_affrect.session.context import Context
+from colmap_affrect.session.view_graph import ViewGraph
 
 COLORS: Mapping[int, str] = {
     MatchKind.OWN: PALETTE[0],
@@ -136,7 +137,7 @@ def draw_pair(
         database = Path(folder) / "database.db"
         copy_database(workspace.database, database, FATAL)
         with workspace.locked_if_possible() if is_run else nullcontext():
-            pair = PairReader(database, Context(workspace)).read(names)
+            pair = PairReader(ViewGraph(database), Context(workspace)).read(names)
     image_path = image_path or workspace.photographs()
     if not image_path:
         raise OptionError("--image-path: give the folder of the photographs")
@@ -179,7 +180,7 @@ def draw_pairs_to_check(
     image_path = context.workspace.photographs()
     if not image_path:
         return []
-    reader = PairReader(context.workspace.database, context)
+    reader = PairReader(context.graph, context)
     chosen = pairs_to_check(
         report,
         num_inliers,

@@ -10,7 +10,6 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import Marks
-from colmap_affrect.colmap.database import read_cameras
 from colmap_affrect.errors import such_as
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
@@ -64,6 +63,7 @@ class RunContent:
     image_path: Path | None = None  # folder of the photographs, if known
     marks: Marks = field(default_factory=dict)  # of the tie points by hand
     pairs_to_check: Sequence[PairPicture] = ()
+    cameras: Mapping[str, pycolmap.Camera] = field(default_factory=dict)  # in the database
 
 
 def write_run_page(
@@ -93,7 +93,7 @@ def write_run_page(
     num_inliers = {
         pair: count for pair, count in content.num_inliers.items() if known.issuperset(pair)
     }
-    cameras = read_cameras(workspace.database) if workspace.database.exists() else {}
+    cameras = content.cameras
     page = Page(
         template=TEMPLATES / "run.html",
         content={

@@ -25,14 +25,14 @@ from colmap_affrect.images.photographs import (
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.options import EffortName, Options
+from colmap_affrect.options import EffortName, Options, digest_of
 from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.paths import GivenPath, resolved
-from colmap_affrect.project.record import Content, content_of, file_sha256
+from colmap_affrect.project.record import Content, MappedFrom, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
@@ -91,15 +91,30 @@ class Inputs(Options):
     def contents(
         self, names: Iterable[str], options: ExtractionOptions, known: Mapping[str, Content]
     ) -> dict[str, Content]:
-        """Return what the files of images hold, read where it may not be what is ``known``."""
+        """Return what the files of images hold, read where it may not be what is ``known``.
+
+        Warps by depth depend on cameras, too; no other features do.
+        """
         found = {}
+        cameras = ""
+        if options.uses_depth and self.cameras != CameraOptions():
+            cameras = digest_of(self.cameras.to_mapping())
         for name in names:
             files = self.photographs.files(name)
             if options.uses_depth:
                 depth = options.depth.file(name)
                 files += [*([depth] if depth else []), *self.camera_files]
-            found[name] = content_of(files, known.get(name))
+            found[name] = content_of(files, known.get(name), cameras)
         return found
+
+    def cameras_digest(self) -> str:
+        """Return a digest of all that says which cameras images have, empty where nothing does."""
+        files = content_of(self.camera_files).digest
+        if self.cameras == CameraOptions():
+            return files
+        # A table or a model may lie elsewhere: what it holds is in the digest of the files.
+        options = self.cameras.changed(cameras_path="").to_mapping()
+        return digest_of([files, options])
 
     @property
     def camera_files(self) -> list[Path]:
@@ -235,10 +250,9 @@ class Context:
         if self.graph.path != self.workspace.database:
             object.__setattr__(self, "graph", ViewGraph(self.workspace.database))
 
-    def verified_digest(self) -> str:
-        """Return digests of the verified pairs and, after a plus, of what is said by hand."""
-        said = self.by_hand.digest()
-        return self.graph.digest() + (f"+{said}" if said else "")
+    def to_map(self, extends: str = "") -> MappedFrom:
+        """Return what models are made from now, perhaps with the digest of one that they extend."""
+        return MappedFrom(self.graph.digest(), self.by_hand.digest(), extends)
 
     def listed_pairs(self) -> PairList:
         """Return the pairs of the list whose images have features."""

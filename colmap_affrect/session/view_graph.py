@@ -2,11 +2,12 @@
 
 All stages of a command share one (``Context.graph``). What changes the database goes through
 :meth:`ViewGraph.opened`, or is followed by :meth:`ViewGraph.forget`; then the graph is read anew
-when it is next asked for. While a command works, its lock keeps other runs out of the folder.
+when it is next asked for. While a command works, its lock keeps other runs out of the folder, and
+the database stays open from one stage to the next (:meth:`ViewGraph.kept_open`).
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,6 +42,42 @@ class ViewGraph:
         self._images: ImageRows | None = None
         self._inliers: dict[Pair, Indices] | None = None
         self._digest = ""
+        self._is_kept_open = False
+        self._open = ExitStack()  # closes what is kept open
+        self._kept: pycolmap.Database | None = None
+
+    @contextmanager
+    def kept_open(self) -> Iterator[None]:
+        """Open the database at most once while the block works, unless it is forgotten there."""
+        self._is_kept_open = True
+        try:
+            yield
+        finally:
+            self._is_kept_open = False
+            self.close()
+
+    def close(self) -> None:
+        """Close a database that is kept open; it is opened again when it is next asked for."""
+        self._kept = None
+        self._open.close()
+
+    @contextmanager
+    def reading(self) -> Iterator[pycolmap.Database]:
+        """Open the database, or take it where it is open, to change nothing."""
+        if not self._is_kept_open:
+            with open_database(self.path) as database:
+                yield database
+            return
+        self._forget_if_gone()
+        if self._kept is None:
+            self._kept = self._open.enter_context(open_database(self.path))
+        try:
+            yield self._kept
+        except RuntimeError as error:
+            self._kept = None
+            # What has opened it makes one line of pycolmap's errors.
+            self._open.__exit__(type(error), error, error.__traceback__)
+            raise
 
     @contextmanager
     def opened(self, *, for_pairs: bool = False) -> Iterator[pycolmap.Database]:
@@ -51,14 +88,18 @@ class ViewGraph:
         """
         images = self._images if for_pairs else None
         try:
-            with open_database(self.path) as database:
+            with self.reading() as database:
                 yield database
         finally:
-            self.forget()
+            self._forget_rows()
             self._images = images
 
     def forget(self) -> None:
-        """Read everything anew when it is next asked for: the database has changed."""
+        """Read everything anew when it is next asked for: the database may be another one."""
+        self.close()
+        self._forget_rows()
+
+    def _forget_rows(self) -> None:
         self._images = None
         self._inliers = None
         self._digest = ""
@@ -98,6 +139,7 @@ class ViewGraph:
         """Return a SHA-256 of all rows but descriptors."""
         self._forget_if_gone()
         if not self._digest:
+            self.close()  # SQLite's own copy reads it: locks of pycolmap's would be lost
             self._digest = rows_digest(self.path)
         return self._digest
 
@@ -108,14 +150,14 @@ class ViewGraph:
     def _image_rows(self) -> ImageRows:
         self._forget_if_gone()
         if self._images is None:
-            with open_database(self.path) as database:
+            with self.reading() as database:
                 self._images = _read_images(database)
         return self._images
 
     def _all_inliers(self) -> dict[Pair, Indices]:
         self._forget_if_gone()
         if self._inliers is None:
-            with open_database(self.path) as database:
+            with self.reading() as database:
                 self._images = self._images or _read_images(database)
                 self._inliers = _read_inliers(database, self._images)
         return self._inliers

@@ -22,7 +22,7 @@ from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.paths import PathLike
-from colmap_affrect.project.record import WEIGHTS, Content, content_of
+from colmap_affrect.project.record import WEIGHTS, Content
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
@@ -259,9 +259,9 @@ def _forget_changed(
     changed = _changed(known, contents)
     are_all = are_all and not workspace.users_database
     gone = sorted(known.keys() - contents.keys()) if are_all else []
-    cameras = content_of(inputs.camera_files).digest
-    before = workspace.made_from("cameras")
-    other_cameras = ["cameras are given by other files"] if before not in ("", cameras) else []
+    cameras = inputs.cameras_digest()
+    has_others = bool(known) and workspace.made_from("cameras") != cameras
+    other_cameras = ["cameras are given otherwise"] if has_others else []
     lines = [*_counted(changed, "changed"), *_counted(gone, "gone"), *other_cameras]
     if lines:
         workspace.rewind(f"since it was made, {', '.join(lines)}")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import cameras_of_images, open_database
+from colmap_affrect.colmap.database import cameras_of_images
 from colmap_affrect.colmap.two_views import CALIBRATED, pair_model
 from colmap_affrect.colmap.verification import PairVerifier, weakly_connected_images
 from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
@@ -145,7 +145,6 @@ class Guiding:
         """
         self.context = context
         self.options = options
-        self.path = context.workspace.database
         self.ids = context.graph.ids
         max_size_px = context.extraction.max_image_size_px
         sizes = context.features.image_sizes()
@@ -218,7 +217,7 @@ class Guiding:
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
         """Return what is to be done for the pairs whose geometry says where matches may be."""
         tasks = []
-        with open_database(self.path) as database:
+        with self.context.graph.reading() as database:
             cameras = cameras_of_images(database)
             for names in pairs:
                 first = self.ids[names[0]]

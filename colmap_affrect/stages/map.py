@@ -17,8 +17,10 @@ from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.reasons import Missing
+from colmap_affrect.project.record import OWN, MappedFrom
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
+from colmap_affrect.session.view_graph import ViewGraph
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
@@ -52,8 +54,8 @@ def map_images(
     workspace.require("verify")
     inputs = _inputs(context, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    known = "" if workspace.lacks_models() else workspace.made_from("map")
-    if known != inputs and " " in known and not extend:
+    known = None if workspace.lacks_models() else workspace.mapped_from()
+    if known and known != inputs and known.extends and not extend:
         raise ConflictError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
@@ -63,12 +65,12 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     known_models = read_summaries(workspace.sparse)  # refuses edited ones
-    said_before = known.partition("+")[2]  # what was said by hand
+    said_before = known.by_hand if known else ""
     before = list[MappedModel]()
-    if goes_on and said_before == inputs.partition("+")[2]:
+    if goes_on and said_before == inputs.by_hand:
         before = _models_before(workspace.sparse, known_models)
     task = _task(context, extend, before)
-    workspace.record_made_from(map="")  # a run that is killed begins anew
+    workspace.record_mapped(None)  # a run that is killed begins anew
     with context.progress.stage("map", len(context.graph.ids), "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
     workspace.record_mapped(inputs)
@@ -95,6 +97,7 @@ def _task(context: Context, extend: Extension | None, before: Sequence[MappedMod
     tie_points: Mapping[str, Mapping[str, int]] = {}
     if by_hand != NOTHING:
         path = workspace.mapped_database
+        context.graph.close()  # SQLite's own copy reads it
         tie_points = by_hand.copy_database(workspace.database, path)
     return MappingTask(
         path,
@@ -121,22 +124,22 @@ def unmeasured_pairs(context: Context) -> list[Pair]:
     return [pair for pair, level in levels.items() if not is_measured[level]]
 
 
-def _inputs(context: Context, extend: Extension | None) -> str:
-    """Return digests of what is mapped and, after a space, of the model that is extended."""
-    verified = context.verified_digest()
+def _inputs(context: Context, extend: Extension | None) -> MappedFrom:
+    """Return what is mapped, and of which model that is extended."""
     if not extend:
-        return verified
+        return context.to_map()
     folder = resolved(model_folder(extend.model_path))
     own = folder.is_relative_to(resolved(context.workspace.sparse))
-    return f"{verified} {'own' if own else extend.digest()}"
+    return context.to_map(OWN if own else extend.digest())
 
 
-def agreements(path: Path, model: pycolmap.Reconstruction) -> dict[Pair, float]:
+def agreements(verified: ViewGraph, model: pycolmap.Reconstruction) -> dict[Pair, float]:
     """Return the share of inliers that agrees with a model by verified pair of a database.
 
     The strongest pairs of each photograph in the model count, the lower id of the database first.
     """
-    graph = PairGraph.read(path, 1)
+    with verified.reading() as database:
+        graph = PairGraph.of(database, 1)
     ids = {name: image_id for image_id, name in graph.names.items()}  # the model may have others
     same = {i: ids[image.name] for i, image in model.images.items() if image.name in ids}
     poses = {same[i]: pose for i, pose in poses_of(model).items() if i in same}

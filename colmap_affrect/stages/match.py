@@ -24,8 +24,6 @@ from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import (
-    FINISHED,
-    IN_VAIN,
     PAIRS_PER_WRITE,
     FeatureStore,
     MatchStore,
@@ -103,15 +101,15 @@ class _Missing:
 def _match_missing(context: Context, pairs: PairList, options: MatcherOptions) -> _Missing:
     """Match the pairs that are not stored, by some of their features first, and learn what stands.
 
-    A note has the digest of the list once all is done, so that an idle run looks at no pair.
+    The state has the digest of the list once all is done, so that an idle run looks at no pair.
     """
     matches = context.matches
     digest = file_sha256(context.workspace.pairs)
-    finished = matches.note(FINISHED)
+    finished = matches.state.listed
     is_finished = finished == digest and matches.num_pairs() == len(pairs)
     missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
     if missing:
-        matches.keep_note(FINISHED, None)
+        matches.keep(listed="")
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance, options.max_num_first)
     wanted = not_well_tied(matches, pairs) if pairs and not is_finished else []
@@ -119,14 +117,14 @@ def _match_missing(context: Context, pairs: PairList, options: MatcherOptions) -
         if not _is_in_vain(context, wanted, options, digest):
             match_pairs(context, wanted, options, advance)
     warnings = dict[str, str]()
-    has_new = bool(pairs) and (bool(missing) or finished is None)
+    has_new = bool(pairs) and (bool(missing) or not finished)
     if has_new and options.filter_stationary_matches:
         line = StationaryFilter(context.features, matches).learn(pairs)
         if line:
             warnings["matches"] = line
             logger.warning("matches: %s", line)
     if finished != digest:
-        matches.keep_note(FINISHED, digest)
+        matches.keep(listed=digest)
     return _Missing(len(missing), warnings)
 
 
@@ -186,16 +184,16 @@ def _is_in_vain(
 ) -> bool:
     """Tell whether all features tie pairs no better than some, by a sample where pairs are many."""
     matches = context.matches
-    known = matches.note(IN_VAIN)
-    is_known = bool(known) and known[0] == digest
+    known = matches.state.in_vain
+    is_known = known is not None and known[0] == digest
     if not is_known and len(pairs) > NUM_TRIED:
         sample = pairs[:: math.ceil(len(pairs) / NUM_TRIED)]
         with closing(matched_at_level(context, sample, options, 0)) as found:
             num_after = _sum_confirming(context.features, found)
         num_before = _sum_confirming(context.features, matches.read(sample))
-        known = [digest, num_after < MIN_GROWTH * num_before]
-        matches.keep_note(IN_VAIN, known)
-    return bool(known == [digest, True])
+        known = (digest, num_after < MIN_GROWTH * num_before)
+        matches.keep(in_vain=known)
+    return known == (digest, True)
 
 
 def _sum_confirming(features: FeatureStore, found: Iterable[PairMatches]) -> int:

@@ -23,7 +23,8 @@ from colmap_affrect.geometry.stationary import (
 )
 from colmap_affrect.images.reading import grown
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.stores import STATIONARY, FeatureStore, MatchStore, PairMatches
+from colmap_affrect.project.match_state import Size
+from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
@@ -53,8 +54,6 @@ CAMERA_STANDS_STILL = (
     "(--mask-path) where something turns before it"
 )
 
-Size = tuple[int, int]
-
 
 @dataclass(frozen=True)
 class _Places:
@@ -75,10 +74,9 @@ class StationaryFilter:
         self._features = features
         self._matches = matches
         self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
-        kept = matches.note(STATIONARY) or []  # the (N, 2) cells, column and row, by size
-        self._places: dict[Size, Mask] = {
-            tuple(size): _mask(np.array(cells, np.int64).reshape(-1, 2)) for size, cells in kept
-        }
+        self._places = dict[Size, Mask]()
+        for size, cells in matches.state.stationary:
+            self._places[size] = _mask(np.array(cells, np.int64).reshape(-1, 2))
 
     @cached_property
     def _sizes(self) -> dict[str, Size]:
@@ -122,8 +120,10 @@ class StationaryFilter:
                 self._places[size] = places.still | self._places.get(size, places.still)
         if not self._places:
             return idle
-        kept = [(size, np.argwhere(found.T).tolist()) for size, found in self._places.items()]
-        self._matches.keep_note(STATIONARY, kept)
+        kept = []
+        for size, mask in self._places.items():
+            kept.append((size, tuple(map(tuple, np.argwhere(mask.T).tolist()))))
+        self._matches.keep(stationary=tuple(kept))
         num_pairs = num_matches = 0
         for pair in pairs:
             (before,) = self._matches.read([pair])

@@ -37,7 +37,6 @@ from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.pipeline import run
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.stores import LOOKED_AT
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.run_options import RunOptions
@@ -141,6 +140,7 @@ def spent(context: Context) -> Row:
     models = escalation.state.models()
     situation = escalation.state.situation(escalation.state.weights(models), models)
     names = [level.name for level in situation.levels]
+    looked_at = context.matches.state.looked_at
     return {
         "first_model_s": round(situation.first_model_s, 1),
         "spent_s": round(situation.spent_s(), 1),
@@ -152,7 +152,7 @@ def spent(context: Context) -> Row:
         "hope": round(
             max(situation.best_at(k, math.inf).all_photographs for k in situation.usable), 3
         ),
-        "scores": context.matches.note(LOOKED_AT),
+        "scores": vars(looked_at) if looked_at else None,
     }
 
 

@@ -11,10 +11,11 @@ from photographs_with_exif import BODY, LENS_50, write_photograph
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records, write_camera_records
-from colmap_affrect.colmap.database import camera_matrix, open_database, read_cameras
+from colmap_affrect.colmap.database import camera_matrix, open_database
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.session.view_graph import ViewGraph
 
 WIDE = {**BODY, "FocalLengthIn35mmFilm": 28}
 LONG = {**BODY, "FocalLengthIn35mmFilm": 80}
@@ -100,7 +101,7 @@ def test_wrong_exif_of_a_shrunk_photograph_is_rescaled_in_the_database(tmp_path:
     assert camera.focal_length == pytest.approx(50 / 35.8 * 1092)
     assert camera.has_prior_focal_length
     record_cameras(
-        read_cameras(path),
+        ViewGraph(path).cameras,
         tmp_path / "cameras.json",
         InitialCameras(tmp_path / "photos", CameraOptions()),
     )
@@ -260,7 +261,7 @@ def test_intrinsics_before_the_import_are_those_of_the_database(
         path = tmp_path / f"{number}.db"
         imported(path, photos, NAMES, **options)
         initial = InitialCameras(photos, CameraOptions(**options))
-        for name, camera in read_cameras(path).items():
+        for name, camera in ViewGraph(path).cameras.items():
             assert_allclose(initial.matrix(name, NAMES), camera_matrix(camera))
 
 
@@ -271,13 +272,13 @@ def test_records_are_kept_and_follow_the_images_that_come_later(
     records_path = tmp_path / "cameras.json"
     initial = InitialCameras(photos, CameraOptions())
     imported(path, photos, NAMES[:1])
-    record_cameras(read_cameras(path), records_path, initial)
+    record_cameras(ViewGraph(path).cameras, records_path, initial)
     (record,) = read_camera_records(records_path).values()
     assert (record.names, record.source, record.size) == (("a.jpg",), "exif", (90, 60))
     given = CameraRecord(("a.jpg",), "given", 70.0, "", (90, 60))
     write_camera_records(records_path, {1: given})
     imported(path, photos, NAMES)
-    record_cameras(read_cameras(path), records_path, initial)
+    record_cameras(ViewGraph(path).cameras, records_path, initial)
     records = read_camera_records(records_path)
     assert [(r.names, r.source) for r in records.values()] == [
         (("a.jpg", "b.jpg"), "given"),
@@ -312,10 +313,10 @@ def test_cameras_of_another_program_are_given_where_they_are_flagged(
         pass
     pycolmap.import_images(path, photos, pycolmap.CameraMode.SINGLE, NAMES[:1], options)
     pycolmap.import_images(path, photos, pycolmap.CameraMode.PER_IMAGE, NAMES[5:])
-    record_cameras(read_cameras(path), records_path)
+    record_cameras(ViewGraph(path).cameras, records_path)
     before = read_camera_records(records_path)
     assert [(r.source, r.focal_px) for r in before.values()] == [("given", 71.5), ("guess", 108)]
     records_path.unlink()
-    record_cameras(read_cameras(path), records_path, InitialCameras(photos, CameraOptions()))
+    record_cameras(ViewGraph(path).cameras, records_path, InitialCameras(photos, CameraOptions()))
     assert [r.source for r in read_camera_records(records_path).values()] == ["given", "guess"]
     assert camera_of(path, "a.jpg").params.tolist() == [71, 72, 44, 31]

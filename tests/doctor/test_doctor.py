@@ -21,6 +21,7 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.doctor import Finding, diagnose
 from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.project.record import MappedFrom
 from colmap_affrect.project.workspace import Workspace
 
 NUM_IMAGES = 3
@@ -152,7 +153,7 @@ def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     target = ["--model-path", str(model), "--output-path", str(tmp_path / "new"), "--format=ply"]
     for inputs in (None, "0" * 64):  # and where mapping would begin anew
         if inputs:
-            Workspace(folders.out).record_made_from(map=inputs)
+            Workspace(folders.out).record_mapped(MappedFrom(inputs))
         for arguments in (["map", "--output-path", out], ["export", *target]):
             assert main([*arguments, "--quiet"]) == 1
             (line,) = capsys.readouterr().err.splitlines()

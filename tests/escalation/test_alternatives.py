@@ -20,13 +20,13 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.escalation import alternatives, climb
 from colmap_affrect.escalation.alternatives import (
     Choice,
-    LookedAt,
     best_score,
     choose_learned,
     forget_others,
     is_to_be_looked_at,
     keep_best,
     look_at_learned,
+    looked_at_before,
     present_score,
     restore_best,
     score,
@@ -36,8 +36,8 @@ from colmap_affrect.escalation.escalate import Escalation, begin, matched_again
 from colmap_affrect.escalation.set_state import SetState
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
+from colmap_affrect.project.match_state import Begun, LookedAt
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import CLIMBING, FINISHED, LEARNING, LOOKED_AT, RESTORING
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.session.context import Context
@@ -68,7 +68,7 @@ def matched(photos: Path, recipe: Recipe, tmp_path_factory: pytest.TempPathFacto
     """All pairs were matched by both kinds; the learned ones have fewer features."""
     workspace = verified(photos, tmp_path_factory.mktemp("matched") / "out", recipe.name)
     escalation, _ = begin(Context(workspace), recipe.escalate)
-    escalation.matches.keep_note(LEARNING, [1, list(escalation.state.pairs)])
+    escalation.matches.keep(learning=Begun(1, tuple(escalation.state.pairs)))
     assert escalation.learn() == len(escalation.state.pairs)
     return workspace
 
@@ -164,14 +164,14 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     assert not choose_learned(escalation, at_once=True)  # more may be tried without them
     assert levels(context) == {0}
     assert choose_learned(escalation, at_once=False)
-    looked_at = LookedAt.of(context)
+    looked_at = looked_at_before(context)
     assert looked_at
     assert (looked_at.score, looked_at.score_without) == pytest.approx((2.4, 1.4))
     assert looked_at.is_chosen
     assert present_score(context) == looked_at.score
-    assert context.matches.note(CLIMBING) == context.matches.note(FINISHED)  # are gone on from
-    assert context.matches.note(RESTORING) is None
-    assert context.workspace.made_from("map") == context.verified_digest()
+    assert context.matches.state.modelled == context.matches.state.listed  # are gone on from
+    assert context.matches.state.follows == ""
+    assert context.workspace.mapped_from() == context.to_map()
     assert levels(context) == {1}
     ids = image_ids(context.workspace.database)
     with open_database(context.workspace.database) as database:
@@ -320,9 +320,9 @@ def test_run_killed_while_it_goes_back_does_so_afterwards(
         patch.setattr(alternatives, where, killed)
         with pytest.raises(KeyboardInterrupt):
             restore_best(escalation)
-    assert escalation.matches.note(RESTORING)
+    assert escalation.matches.state.follows
     take_over_chosen(escalation)
-    assert not escalation.matches.note(RESTORING)
+    assert not escalation.matches.state.follows
     assert read_summaries(workspace.sparse) == summaries
     after = database_content(workspace.database)
     assert {k: v for k, v in after.items() if k != "keypoints"} == before
@@ -342,10 +342,10 @@ def test_what_was_looked_at_is_of_the_listed_pairs_and_of_what_is_said_by_hand(
 ) -> None:
     with_models(monkeypatch, found=UNSURE, there=[UNSURE])
     look_at_learned(escalation_of(context), mapper)
-    assert LookedAt.of(context)
-    assert not LookedAt.of(replace(context, by_hand=ByHand(left_out=(NAMES[0],))))
-    context.matches.keep_note(FINISHED, "another list")
-    assert not LookedAt.of(context)
+    assert looked_at_before(context)
+    assert not looked_at_before(replace(context, by_hand=ByHand(left_out=(NAMES[0],))))
+    context.matches.keep(listed="another list")
+    assert not looked_at_before(context)
 
 
 def test_images_that_are_left_out_need_nothing_and_are_no_lack(
@@ -357,7 +357,7 @@ def test_images_that_are_left_out_need_nothing_and_are_no_lack(
     said = replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
     assert NAMES[0] not in escalation_of(said).state.weights([UNSURE])
     look_at_learned(escalation_of(said), mapper)
-    looked_at = LookedAt.of(said)
+    looked_at = looked_at_before(said)
     assert looked_at
     assert looked_at.is_sure
 
@@ -368,7 +368,7 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     """Images may have got features: what is needed would look different."""
     escalation = escalation_of(context)
     pairs = list(escalation.state.pairs)
-    context.matches.keep_note(LEARNING, None)
+    context.matches.keep(learning=None)
     monkeypatch.setattr(SetState, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
     assert not escalation.plan_learning()  # all have learned matches
     context.matches.remove(pairs=pairs)
@@ -387,11 +387,11 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
 
 def test_matches_of_pairs_that_are_removed_take_learned_ones_along(context: Context) -> None:
     pairs = list(escalation_of(context).state.pairs)
-    context.matches.keep_note(LOOKED_AT, [1])
+    context.matches.keep(looked_at=LookedAt("set", 1.0, True, 0.5))
     context.matches.remove(pairs=pairs[:1])
     assert not context.matches.has(pairs).any()
-    assert context.matches.note(LOOKED_AT) is None
-    assert context.matches.note(LEARNING) is None
+    assert context.matches.state.looked_at is None
+    assert context.matches.state.learning is None
 
 
 @pytest.mark.long
@@ -410,7 +410,7 @@ def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
     with workspace.locked():
         reports = climb.climb(context, mapper, recipe)
         assert reports[-1].num_done == len(escalation_of(context).state.pairs)
-        looked_at = LookedAt.of(context)
+        looked_at = looked_at_before(context)
         assert looked_at
         assert looked_at.score > 1.0
         before = hdf5_content(workspace.matches), database_content(workspace.database)
@@ -464,7 +464,7 @@ def test_models_of_learned_matches_that_were_removed_are_made_again(
     context = Context(copy_of(mapped, tmp_path / "out"))
     assert is_to_be_looked_at(context)
     look_at_learned(escalation_of(context), mapper)
-    looked_at = LookedAt.of(context)
+    looked_at = looked_at_before(context)
     assert looked_at
     forget_others(context)
     assert is_to_be_looked_at(context) == (looked_at.score > present_score(context))

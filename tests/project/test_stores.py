@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import StoreError
+from colmap_affrect.project.match_state import Begun, LookedAt, MatchState
 from colmap_affrect.project.stores import (
     FeatureStore,
     Learned,
@@ -106,18 +107,16 @@ def test_files_do_not_need_the_newest_hdf5(store: FeatureStore) -> None:
     assert store.path.read_bytes()[8] == 0
 
 
-def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) -> None:
-    for name in NAMES:
-        store.write(name, some_features(4), (4, 3))
-    with h5py.File(store.path, "a") as file:
-        del file[NAMES[1]].attrs["complete"]
-        del file[NAMES[3]].attrs["complete"]
-        del file[NAMES[3]]["descriptors"]
-    assert store.names() == list(store.num_keypoints()) == [NAMES[0], NAMES[2]]
-    with pytest.raises(StoreError, match=r"no features of b c\.png; run extract"):
-        store.read(NAMES[1])
-    store.write(NAMES[3], some_features(6), (4, 3))
-    assert len(store.read(NAMES[3])) == 6
+def test_images_in_folders_with_names_of_datasets_are_told_from_these(store: FeatureStore) -> None:
+    names = ["keypoints/descriptors/a.png", "keypoints/b.png", "z.png"]
+    for count, name in enumerate(names, start=3):
+        store.write(name, some_features(count), (4, 3))
+    assert store.num_keypoints() == dict(zip(sorted(names), (4, 3, 5), strict=True))
+    for absent in ("keypoints", "keypoints/descriptors", "keypoints/a.png"):
+        with pytest.raises(StoreError, match=rf"no features of {absent}; run extract"):
+            store.read(absent)
+    store.remove(names[:1])
+    assert store.names() == names[1:]
 
 
 @pytest.mark.parametrize("access", ["read", "write"])
@@ -131,7 +130,7 @@ def test_foreign_file_is_refused_and_left_as_it_is(
 ) -> None:
     with h5py.File(store.path, "w") as file:
         file.attrs.update(attributes)
-        file.create_group("a.png").attrs["complete"] = True
+        file.create_group("a.png").attrs["content"] = ""
     before = store.path.read_bytes()
     with pytest.raises(StoreError, match=rf"{store.path}: .*{found}.*--output-path"):
         store.names() if access == "read" else store.write("b.png", some_features(2), (4, 3))
@@ -206,14 +205,10 @@ def test_read_returns_the_matches_that_were_written(
     assert second.tolist() == [[2, 1], [3, 0]]
 
 
-@pytest.mark.parametrize("gone", ["group", "marker"])
-def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore, gone: str) -> None:
+def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore) -> None:
     matches.write([pair_matches((name, "z.png"), [[0, 0]], 1) for name in ("a.png", "b.png")])
     with h5py.File(matches.path, "a") as file:
-        if gone == "group":
-            del file["b.png/z.png"]
-        else:
-            del file["b.png/z.png"].attrs["complete"]
+        del file["b.png/z.png"]
     assert matches.has([("a.png", "z.png"), ("b.png", "z.png")]).tolist() == [True, False]
     with pytest.raises(StoreError, match=r"no matches of b\.png, z\.png; run match"):
         list(matches.read([("a.png", "z.png"), ("b.png", "z.png")]))
@@ -250,11 +245,11 @@ def test_learned_matches_kept_beside_those_in_use_stay_when_these_change(
     assert matches.learned_levels([names]) == {names: 2}
     assert matches.measured_worths([names]) == {names: (0, 5)}
     assert matches.levels([names], "tried") == {names: 0b11001}
-    matches.choose([learned.matches], {names: (3, 0)}, note=[1, "a"])
+    matches.choose([learned.matches], {names: (3, 0)}, follows="sparse.best")
     (used,) = matches.read([names])
     assert (used.level, used.indices.tolist()) == (2, [[4, 7]])
     assert matches.measured_worths([names]) == {names: (3, 0)}
-    assert matches.note("note") == [1, "a"]
+    assert matches.state == MatchState(follows="sparse.best")
 
 
 def test_pairs_without_learned_matches_beside_those_in_use_have_none(matches: MatchStore) -> None:
@@ -263,3 +258,29 @@ def test_pairs_without_learned_matches_beside_those_in_use_have_none(matches: Ma
     assert matches.learned([names]) == {}
     assert matches.learned_levels([names]) == {names: -1}
     assert matches.measured_worths([names]) == {names: (0, 0)}
+
+
+def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
+    matches: MatchStore,
+) -> None:
+    assert matches.state == MatchState()
+    pairs = (("a.png", "b.png"), ("a.png", "c.png"))
+    matches.write([pair_matches(pair, [[0, 0]], 1) for pair in pairs])
+    stationary = (((40, 30), ((1, 2), (3, 4))),)
+    matches.keep(stationary=stationary, effort="high", listed="digest")
+    looked_at = LookedAt("digest", 2.5, is_sure=True, score_without=0.75)
+    matches.keep(step=Begun(1, pairs), has_stepped=True, looked_at=looked_at, in_vain=("a", True))
+    assert matches.state == MatchState(
+        "digest", ("a", True), stationary, effort="high", looked_at=looked_at,
+        step=Begun(1, pairs), has_stepped=True,
+    )  # fmt: skip
+    matches.remove(pairs=pairs[:1])
+    assert matches.state == MatchState(stationary=stationary, effort="high")
+
+
+def test_state_that_is_none_is_damage(matches: MatchStore) -> None:
+    matches.keep(listed="digest")
+    with h5py.File(matches.path, "a") as file:
+        file.attrs["state"] = '{"step": {"level": "all"}}'
+    with pytest.raises(StoreError, match=r"matches\.h5: damaged .*--overwrite"):
+        _ = matches.state

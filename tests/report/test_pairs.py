@@ -32,6 +32,7 @@ from colmap_affrect.report.pair_choice import pairs_to_check
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pairs import COLORS, draw_matches
 from colmap_affrect.report.sheets import WIDTH_PX, rgb
+from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
 
 NAMES = ("a.png", "b.png", "c.png", "d.png", "e.png", "f.png")
@@ -158,7 +159,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned: bool) -> None:
     stores: Any = Stores(scene, ["match"])
-    reader = PairReader(scene / "database.db", stores)
+    reader = PairReader(ViewGraph(scene / "database.db"), stores)
     names = NAMES[3:1:-1] if turned else NAMES[2:4]
     pair = reader.read(names)
     with open_database(scene / "database.db") as database:
@@ -185,13 +186,13 @@ def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned
 def test_of_the_database_of_another_program_inliers_are_of_one_kind(scene: Path) -> None:
     stores: Any = Stores(scene, [])
     stores.workspace.sparse = scene / "none"
-    reader = PairReader(scene / "database.db", stores)
+    reader = PairReader(ViewGraph(scene / "database.db"), stores)
     pair = reader.read(NAMES[2:4])
     assert set(pair.kinds.tolist()) == {MatchKind.FOREIGN, MatchKind.REJECTED}
     assert "model" not in pair.text
     stores = Stores(scene, ["match"])
     stores.counts[NAMES[3]] += 1  # the database has others than the run
-    pair = PairReader(scene / "database.db", stores).read(NAMES[2:4])
+    pair = PairReader(ViewGraph(scene / "database.db"), stores).read(NAMES[2:4])
     assert set(pair.kinds.tolist()) == {MatchKind.FOREIGN, MatchKind.REJECTED, MatchKind.BY_HAND}
     with pytest.raises(OptionError, match=r"c\.jpg: no such photograph \(did you mean 'c\.png'"):
         reader.read(("c.jpg", NAMES[3]))
@@ -219,7 +220,7 @@ def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
     one, other = (model.find_image_with_name(name) for name in NAMES[:2])
     one.frame.rig_from_world = pycolmap.Rigid3d(other.cam_from_world().matrix())
-    shares = agreements(scene / "database.db", model)
+    shares = agreements(ViewGraph(scene / "database.db"), model)
     for pair, share in shares.items():
         assert share < 0.5 if NAMES[0] in pair else share > 0.95
 

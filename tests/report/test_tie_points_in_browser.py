@@ -22,6 +22,7 @@ from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.report import ModelSummary, Residual
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.run_page import RunContent, write_run_page
+from colmap_affrect.session.view_graph import ViewGraph
 
 pytestmark = [needs_chromium, pytest.mark.long]
 
@@ -105,7 +106,8 @@ def page(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
         "models": (model,),
         "unregistered": dict.fromkeys(names[4:], Missing("not_registered")),
     }
-    content = RunContent(names, {}, tmp_path / "photographs", marks)
+    cameras = ViewGraph(workspace.database).cameras
+    content = RunContent(names, {}, tmp_path / "photographs", marks, cameras=cameras)
     return write_run_page(workspace, type(report)(**values), content)
 
 

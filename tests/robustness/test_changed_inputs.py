@@ -87,7 +87,7 @@ CHANGES: list[tuple[list[str], Callable[[Path], object], str]] = [
     (FAST, output_inside, ""),
     (MASKS, lambda at: repaint(at / "masks" / f"{FIRST}.png"), "1 changed (a.png)"),
     (LISTED, list_changed, "1 pairs are not listed any more, such as a.png and side/č.png"),
-    (GIVEN, source_changed, "cameras are given by other files"),
+    (GIVEN, source_changed, "cameras are given otherwise"),
 ]
 
 
@@ -173,6 +173,39 @@ def test_photograph_that_was_only_touched_is_read_once_more(
     assert stage("extract") == ["extract: 0 done, 3 already there"]
     monkeypatch.setattr("colmap_affrect.project.record.file_sha256", None)
     assert stage("extract") == ["extract: 0 done, 3 already there"]
+
+
+def cameras_of(path: Path) -> set[tuple[object, ...]]:
+    with pycolmap.Database.open(str(path)) as database:
+        cameras = database.read_all_cameras()
+    return {(camera.camera_id, camera.model_name, *camera.params) for camera in cameras}
+
+
+def test_other_cameras_extract_and_match_nothing_anew(tmp_path: Path, stage: Stage) -> None:
+    for name in ("extract", "pairs", "match"):
+        stage(name)
+    out = tmp_path / "out"
+    before = [hdf5_content(out / name) for name in ("features.h5", "matches.h5")]
+    assert len(cameras_of(out / "database.db")) == 3
+    said = stage("extract", "--camera-mode", "single", "--camera-params", "400,400,200,150")
+    assert said[0] == "extract: 0 done, 3 already there, 1 with a warning"
+    log = (out / "run.log").read_text(encoding="utf-8")
+    assert "cameras are given otherwise; all that hangs on them is made again" in log
+    assert cameras_of(out / "database.db") == {(1, "PINHOLE", 400.0, 400.0, 200.0, 150.0)}
+    stage("pairs")
+    assert stage("match") == ["match: 0 done, 3 already there"]
+    assert [hdf5_content(out / name) for name in ("features.h5", "matches.h5")] == before
+
+
+@pytest.mark.long
+def test_run_with_other_cameras_equals_a_fresh_one(tmp_path: Path, call: Call) -> None:
+    write_photographs(tmp_path / "photos")
+    folders = tmp_path / "out", tmp_path / "fresh"
+    for out, mode in zip((folders[0], *folders), ("per-image", "single", "single"), strict=True):
+        given = ["--image-path", tmp_path / "photos", "--output-path", out, *FAST]
+        assert call("run", *given, "--camera-mode", mode).code == 0
+    assert results(folders[0]) == results(folders[1])
+    assert len(cameras_of(folders[0] / "database.db")) == 1
 
 
 def test_other_folder_with_none_of_the_photographs_is_refused(tmp_path: Path, stage: Stage) -> None:

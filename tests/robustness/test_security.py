@@ -57,7 +57,7 @@ def test_features_of_somebody_else_lead_nowhere(tmp_path: Path, call: Call) -> N
     run = ["run", "--image-path", photos, "--output-path", out, *FAST]
     assert call(*run).code == 0
     with h5py.File(tmp_path / "outside.h5", "w") as file:
-        file.create_group("x").attrs["complete"] = True
+        file.create_group("x").attrs["content"] = ""
     with h5py.File(out / "features.h5", "a") as file:
         file["zz.png"] = h5py.ExternalLink(os.fspath(tmp_path / "outside.h5"), "x")
         file["../../escaped.png"] = h5py.SoftLink("/a.png")

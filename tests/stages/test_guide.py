@@ -17,7 +17,6 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.project.stores import STATIONARY
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages import guide as stage
@@ -114,7 +113,8 @@ def test_captions_are_not_found_again(context: Context, monkeypatch: pytest.Monk
     monkeypatch.setattr(stationary, "MAX_SHARE_BESIDE", 1.0)
     everywhere = np.indices((NUM_CELLS, NUM_CELLS)).reshape(2, -1).T
     sizes = set(context.features.image_sizes().values())
-    context.matches.keep_note(STATIONARY, [(size, everywhere.tolist()) for size in sizes])
+    cells = tuple(map(tuple, everywhere.tolist()))
+    context.matches.keep(stationary=tuple((size, cells) for size in sizes))
     assert guide(context, ALWAYS).num_done == 6
     assert guided_counts(context) == {}
 

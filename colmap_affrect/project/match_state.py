@@ -1,0 +1,77 @@
+"""How far matching and escalation of a set have come: one record, kept with the raw matches.
+
+It changes together with matches, all or nothing, so that an interrupted run resumes as it was. The
+rest of what is done tell the matches themselves: a pair is matched when it is there.
+"""
+
+from dataclasses import dataclass
+
+from pydantic import TypeAdapter
+
+from colmap_affrect.options import EffortName
+
+Names = tuple[str, str]  # of a pair of images
+Worth = tuple[int, int]  # inliers; where there are none, how many matches confirm each other
+Size = tuple[int, int]  # width and height in px
+Cell = tuple[int, int]  # column and row
+
+NOTHING_TO_GO_ON_FROM = 1.0
+"""Score of models below which not one relative pose is expected to be right."""
+
+
+@dataclass(frozen=True)
+class Begun:
+    """Pairs that are being matched again: what is needed would look different meanwhile."""
+
+    level: int
+    pairs: tuple[Names, ...]
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """What models of learned matches are worth."""
+
+    of_set: str  # digest of the pairs, and of what is said by hand
+    score: float  # 0 where there are none
+    is_sure: bool  # of all images
+    score_without: float  # of the first models
+    is_chosen: bool = False
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether nothing is left to try with them, or nothing is there to go on from without."""
+        is_better = self.score > self.score_without
+        return is_better and (self.is_sure or self.score_without < NOTHING_TO_GO_ON_FROM)
+
+
+@dataclass(frozen=True)
+class MatchState:
+    """What is known of all pairs together."""
+
+    listed: str = ""
+    """Digest of the list whose pairs have all been matched, and looked at for what never moves."""
+    in_vain: tuple[str, bool] | None = None
+    """Digest of a list, and whether all features tie its pairs no better than some."""
+    stationary: tuple[tuple[Size, tuple[Cell, ...]], ...] = ()
+    """Places where nothing moves, by size of the photographs."""
+    modelled: str = ""
+    """Digest of the list of which there was a model before pairs were matched again."""
+    effort: EffortName | None = None
+    """How much was tried for images to match again."""
+    learning: Begun | None = None
+    """What learned matching is for, whose matches are kept beside those in use."""
+    looked_at: LookedAt | None = None
+    """What models of these matches are worth."""
+    step: Begun | None = None
+    """The step of escalation that has begun and not ended."""
+    has_stepped: bool = False
+    """Whether any step has begun."""
+    follows: str = ""
+    """Folder of better models whose matches these are already, while ``sparse/`` has others."""
+
+    def without_pairs(self) -> "MatchState":
+        """Return what is left where pairs have gone: which ones escalate depends on all others."""
+        return MatchState(stationary=self.stationary, effort=self.effort)
+
+
+STATE_JSON = TypeAdapter(MatchState)
