@@ -7,11 +7,12 @@ Files are read as runs read them, and what their readers say is what is found.
 import dataclasses
 import json
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Literal, TypeVar, get_args
 
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
@@ -24,7 +25,7 @@ from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
-from colmap_affrect.project.report import ModelSummary, installed_versions
+from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
 
@@ -63,7 +64,14 @@ class Diagnosis(Summarized):
     """What was found, the worst first."""
 
     def add(self, severity: Severity, where: Path | str, what: str, advice: str) -> None:
-        """Add what is wrong with a file, folder or part of the installation, and what helps."""
+        """Add a finding.
+
+        Args:
+            severity: of the finding.
+            where: file, folder or part of the installation.
+            what: is wrong with it.
+            advice: what helps.
+        """
         self.findings.append(Finding(severity, str(where), what, advice))
         self.findings.sort(key=lambda found: SEVERITIES.index(found.severity))
 
@@ -81,9 +89,13 @@ class Diagnosis(Summarized):
         for finding in self.findings:
             lines.append(f"{finding.severity:8s} {finding.where}: {finding.what}")
             lines.append(f"         -> {finding.advice}")
-        counts = {severity: self._count(severity) for severity in SEVERITIES[:2]}
-        found = [f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items() if count]
-        return "\n".join([*lines, ", ".join(found) or "no problems found"])
+        totals = []
+        for severity in ("error", "warning"):
+            count = self._count(severity)
+            if count:
+                totals.append(f"{count} {severity}{'s' if count > 1 else ''}")
+        lines.append(", ".join(totals) or "no problems found")
+        return "\n".join(lines)
 
     def to_json(self) -> str:
         """Return the same for programs."""
@@ -110,15 +122,17 @@ def diagnose(path: PathLike | None = None, *, weights_path: PathLike | None = No
     if weights_path is not None and not weights_path.is_dir():
         raise OptionError(f"--weights {weights_path}: no such folder")
     diagnosis = Diagnosis()
-    if path is not None:
-        (_examine_folder if path.is_dir() else examine_database)(diagnosis, path)
+    if path is not None and path.is_dir():
+        _examine_folder(diagnosis, path)
+    elif path is not None:
+        examine_database(diagnosis, path)
     _examine_installation(diagnosis, weights_path)
     return diagnosis
 
 
 def _examine_installation(diagnosis: Diagnosis, weights_path: Path | None) -> None:
-    versions = ", ".join(f"{name} {number}" for name, number in installed_versions().items())
-    diagnosis.checked.append(f"installation: {versions}")
+    versions = [f"{name} {number}" for name, number in installed_versions().items()]
+    diagnosis.checked.append(f"installation: {', '.join(versions)}")
     try:
         from colmap_affrect.features.networks import resolve_device
     except (ImportError, OSError) as error:
@@ -128,20 +142,33 @@ def _examine_installation(diagnosis: Diagnosis, weights_path: Path | None) -> No
         )
         return
     diagnosis.checked.append(f"networks: run on {resolve_device('auto')}")
-    found = {key: path for key in WEIGHT_FILES if (path := find(key, weights_path))}
+    _examine_weights(diagnosis, weights_path)
+
+
+def _examine_weights(diagnosis: Diagnosis, weights_path: Path | None) -> None:
+    found = {}
+    for key in WEIGHT_FILES:
+        path = find(key, weights_path)
+        if path:
+            found[key] = path
     files = ", ".join(sorted(map(str, found.values())))
     diagnosis.checked.append(f"weights: {files or 'none found'}")
     for key, path in found.items():
         if is_published(key, path) is False:
             what = f"not the published file of {key}"
-            advice = remedy(path)
-            diagnosis.add("warning", path, what, f"unless it is your own, {advice}")
+            diagnosis.add("warning", path, what, f"unless it is your own, {remedy(path)}")
 
 
 def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool:
-    """Examine a COLMAP database; return whether it is usable.
+    """Examine a COLMAP database.
 
-    ``advice`` is what to do about problems, where it is not what ``CHECKS`` says.
+    Args:
+        diagnosis: gets what is found.
+        path: the database, which is only read.
+        advice: what to do about problems, where it is not what ``CHECKS`` says.
+
+    Returns:
+        Whether the database is usable.
     """
     try:
         version = refuse_newer(path)
@@ -199,7 +226,7 @@ def _examine_folder(diagnosis: Diagnosis, path: Path) -> None:
             diagnosis.add("warning", path, _without_path(path, error), advice)
             if in_use:
                 return
-        _examine_files(diagnosis, workspace)
+        _OutputFolder(diagnosis, workspace).examine()
 
 
 def _examine_model(diagnosis: Diagnosis, path: Path) -> None:
@@ -215,53 +242,85 @@ def _examine_model(diagnosis: Diagnosis, path: Path) -> None:
     diagnosis.checked.append(f"{path}: a model of {registered} images and {points} points")
 
 
-def _examine_files(diagnosis: Diagnosis, workspace: Workspace) -> None:
-    """Read every file of an output folder, that of one stage after the other."""
-    context = Context(workspace)
-    quoted = shlex.quote(str(workspace.path))
+@dataclass(frozen=True)
+class _OutputFolder:
+    """An output folder whose files are examined."""
 
-    def read(path: Path, reader: Callable[..., Read], *given: Any, advice: str = "") -> Read | None:
+    diagnosis: Diagnosis
+    workspace: Workspace
+
+    def read(self, path: Path, reader: Callable[[], Read], advice: str = "") -> Read | None:
+        """Read a file; what is wrong with it is a finding, and None is returned.
+
+        Args:
+            path: the file.
+            reader: reads it.
+            advice: what helps; by default what the error says.
+        """
         try:
-            return reader(*given)
+            return reader()
         except AffrectError as error:
             what, _, usual = _without_path(path, error).partition("; ")
+            quoted = shlex.quote(str(self.workspace.path))
             restore = f"restore it, or use another --output-path than {quoted}"
-            diagnosis.add("error", path, what, advice or usual or restore)
+            self.diagnosis.add("error", path, what, advice or usual or restore)
             return None
 
-    def is_there(path: Path) -> bool:
+    def examine(self) -> None:
+        """Read every file, that of one stage after the other."""
+        workspace = self.workspace
+        context = Context(workspace)
+        done = self.read(workspace.config, lambda: _stages(self.diagnosis, context)) or []
+        self.read(workspace.cameras, lambda: read_camera_records(workspace.cameras))
+        if done:
+            self._examine_stores(context)
+        if "extract" in done:
+            self._require(workspace.features)
+            self._examine_pairs(context, are_listed="match" in done)
+        if done:
+            self._require(workspace.database)
+        if not workspace.database.exists():
+            return
+        advice = ""
+        if done and not workspace.users_database:
+            advice = f"remove it and {SAME_RUN}: it is made anew"
+        is_usable = examine_database(self.diagnosis, workspace.database, advice)
+        if is_usable and "map" in done:
+            self._examine_models()
+
+    def _require(self, path: Path) -> None:
+        """Find a file that is missing."""
         if not path.exists():
-            diagnosis.add("error", path, "is missing", f"{SAME_RUN} to make it anew")
-        return path.exists()
+            self.diagnosis.add("error", path, "is missing", f"{SAME_RUN} to make it anew")
 
-    done = read(workspace.config, _stages, diagnosis, context) or []
-    read(workspace.cameras, read_camera_records, workspace.cameras)
-    for store in (context.features, context.matches, context.guided) if done else ():
-        read(store.path, store.check_all)
-        diagnosis.checked.append(f"{store.path}: all values")
-    if "extract" in done:
-        is_there(workspace.features)
-        names = read(workspace.path, lambda: list(context.inputs.names()))
-        if names and "match" in done:
+    def _examine_stores(self, context: Context) -> None:
+        """Read all features and matches."""
+        for store in (context.features, context.matches, context.guided):
+            self.read(store.path, store.check_all)
+            self.diagnosis.checked.append(f"{store.path}: all values")
+
+    def _examine_pairs(self, context: Context, *, are_listed: bool) -> None:
+        """Read the names of the images, and the list of their pairs."""
+        names = self.read(self.workspace.path, lambda: list(context.inputs.names()))
+        if names and are_listed:
+            path = self.workspace.pairs
+            quoted = shlex.quote(str(self.workspace.path))
             again = f"run 'colmap-affrect pairs --output-path {quoted} --overwrite'"
-            read(workspace.pairs, read_pairs, workspace.pairs, names, advice=again)
-    if not (is_there(workspace.database) if done else workspace.database.exists()):
-        return
-    remake = f"remove it and {SAME_RUN}: it is made anew"
-    advice = remake if done and not workspace.users_database else ""
-    if examine_database(diagnosis, workspace.database, advice) and "map" in done:
-        found = [read(folder, read_summary, folder) for folder in model_folders(workspace.sparse)]
-        _examine_models(diagnosis, workspace, [model for model in found if model])
+            self.read(path, lambda: read_pairs(path, names), again)
 
-
-def _examine_models(
-    diagnosis: Diagnosis, workspace: Workspace, models: Sequence[ModelSummary]
-) -> None:
-    """Say what models there are, and whether some are gone."""
-    if workspace.lacks_models() and workspace.mapped:
-        diagnosis.add("error", workspace.sparse, "models are gone", f"{SAME_RUN}: maps again")
-    listed = ", ".join(str(len(model.registered_names)) for model in models) or "no"
-    diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
+    def _examine_models(self) -> None:
+        """Say what models there are, and whether some are gone."""
+        workspace = self.workspace
+        counts = list[str]()
+        for folder in model_folders(workspace.sparse):
+            summary = self.read(folder, partial(read_summary, folder))
+            if summary:
+                counts.append(str(len(summary.registered_names)))
+        if workspace.lacks_models() and workspace.mapped:
+            advice = f"{SAME_RUN}: maps again"
+            self.diagnosis.add("error", workspace.sparse, "models are gone", advice)
+        listed = ", ".join(counts) or "no"
+        self.diagnosis.checked.append(f"{workspace.sparse}: models of {listed} images")
 
 
 def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:

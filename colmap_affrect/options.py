@@ -5,7 +5,6 @@ of range, in one line. A part is a class with its options class as attribute ``O
 :class:`Registry` finds it by the name in its options.
 """
 
-import ast
 import difflib
 import hashlib
 import inspect
@@ -14,10 +13,8 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
-from functools import cache
 from html import escape
 from importlib import metadata
-from itertools import pairwise
 from os import PathLike
 from typing import (
     TYPE_CHECKING,
@@ -34,6 +31,7 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from colmap_affrect.docstrings import ATTRIBUTES, below_fields, field_text, with_attributes
 from colmap_affrect.errors import (
     OptionError,
     clipped,
@@ -51,7 +49,6 @@ MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up fro
 MAX_KNOWN = 40  # names in a message
 MAX_VALUE = 200  # characters of a value in a message
 MAX_COMMENT = 96  # width of comments in printed options
-MAX_DOCSTRING = 88  # width of what docstrings say of fields
 CUSTOM = "custom"  # name of options that are no preset
 
 
@@ -66,61 +63,12 @@ Documented = TypeVar("Documented", bound=type)
 def documented(cls: Documented) -> Documented:
     """Add what stands below each field of a dataclass to its docstring, for ``help()``."""
     found: dict[str, str] = {}
-    for each in reversed(cls.__mro__):
-        found |= _below_fields(each)
+    for base in reversed(cls.__mro__):
+        found |= below_fields(base)
     texts = {field.name: found.get(field.name, "") for field in fields(cls)}
-    cls.__doc__ = with_attributes(inspect.cleandoc(cls.__doc__ or "").split(ATTRIBUTES)[0], texts)
+    own, _, _ = inspect.cleandoc(cls.__doc__ or "").partition(ATTRIBUTES)
+    cls.__doc__ = with_attributes(own, texts)
     return cls
-
-
-@cache
-def _below_fields(cls: type) -> dict[str, str]:
-    """Return the strings that stand below the fields of a class, where its source is known."""
-    try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
-    except (OSError, TypeError):
-        return {}
-    (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
-    found = {}
-    for node, below in pairwise(body):
-        if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
-            continue
-        if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
-            found[node.target.id] = inspect.cleandoc(str(below.value.value))
-    return found
-
-
-ATTRIBUTES = "\n\nAttributes:\n"
-
-
-def with_attributes(docstring: str | None, texts: Mapping[str, str]) -> str:
-    """Return a docstring with a section that says what each attribute is."""
-    lines = []
-    for name, text in texts.items():
-        paragraph = f"{name}: {' '.join(text.split())}"
-        filled = textwrap.wrap(paragraph, MAX_DOCSTRING - 8, break_long_words=False)
-        lines.append("    " + "\n        ".join(filled))
-    head = inspect.cleandoc(docstring or "")
-    return head + ATTRIBUTES + "\n".join(lines) if lines else head
-
-
-def _field_text(options: type[BaseModel], name: str) -> str:
-    """Say what a field of options means, which values it takes, and its default."""
-    field = options.model_fields[name]
-    bases = (base.model_fields for base in options.__mro__ if issubclass(base, Options))
-    texts = (base[name].description for base in bases if name in base)
-    text = next(filter(None, texts), "")
-    ends = [limit for item in field.metadata for limit in _limits(item)]
-    values = [repr(value) for value in get_args(field.annotation) if isinstance(value, str)]
-    extent = f" From {ends[0]:g} to {ends[1]:g}." if len(ends) == 2 else ""
-    choice = f" One of {', '.join(values)}." if len(values) > 1 else ""
-    plain = isinstance(field.default, bool | int | float | str | tuple)
-    usual = f" Default: {field.default!r}." if plain else ""
-    return f"{text}{choice}{extent}{usual}"
-
-
-def _limits(item: object) -> list[float]:
-    return [getattr(item, end) for end in ("ge", "le") if hasattr(item, end)]
 
 
 class Summarized:
@@ -148,23 +96,30 @@ class Options(BaseModel):
 
         def __init__(self, /, **values: Any) -> None:
             """Check the values, paths as text too; OptionError names the option."""
-            paths = {k: str(value) for k, value in values.items() if isinstance(value, PathLike)}
+            for name, value in values.items():
+                if isinstance(value, PathLike):
+                    values[name] = str(value)
             try:
-                super().__init__(**(values | paths))
+                super().__init__(**values)
             except ValidationError as error:
                 raise OptionError(self._problem(error.errors()[0])) from None
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         """Add the fields to the docstring, so that ``help()`` shows what each of them means."""
-        texts = {name: _field_text(cls, name) for name in cls.model_fields}
+        texts = {name: field_text(cls, name) for name in cls.model_fields}
         cls.__doc__ = with_attributes(cls.__doc__, texts)
 
     @classmethod
     def given(cls, options: Any, argument: str) -> Self:
-        """Return the options that an argument gives, as they are or as a mapping; None: usual ones.
+        """Return the options that an argument gives.
 
-        Raises OptionError, naming the argument, for anything else and for wrong options.
+        Args:
+            options: of this class, a mapping of their fields, or None for the usual ones.
+            argument: that they came by, for errors.
+
+        Raises:
+            OptionError: for anything else, and for wrong options.
         """
         if isinstance(options, cls):
             return options
@@ -201,7 +156,15 @@ class Options(BaseModel):
 
     @classmethod
     def from_mapping(cls, values: Any, where: str) -> Self:
-        """Build from a mapping that comes from ``where``; OptionError names that and the option."""
+        """Build options from a mapping.
+
+        Args:
+            values: fields by name.
+            where: they come from, for errors.
+
+        Raises:
+            OptionError: names what is wrong, and where.
+        """
         if not isinstance(values, Mapping):
             raise OptionError(f"{where}: expected options, got {values!r}")
         try:
@@ -220,8 +183,10 @@ class Options(BaseModel):
     @classmethod
     def _problem(cls, error: ErrorDetails) -> str:
         """Say in one line what pydantic found."""
-        *outer, last = error["loc"] or ("",)
-        place = ".".join(map(str, outer if isinstance(last, int) else [*outer, last]))
+        location = list(error["loc"] or ("",))
+        if isinstance(location[-1], int):  # the number of an item
+            location.pop()
+        place = ".".join(map(str, location))
         match error["type"]:
             case "extra_forbidden":
                 return f"unknown option '{place}'{suggestion(place, cls.model_fields)}"
@@ -255,13 +220,17 @@ class PresetOptions(Options):
         """Return the options of a preset, ``sparse`` or ``colmap``, and others given."""
         if preset not in PRESETS:
             raise OptionError(f"preset {preset!r} is not one of {', '.join(PRESETS)}")
-        return cls(**{**(cls.COLMAP if preset == "colmap" else {}), **values})
+        of_preset = cls.COLMAP if preset == "colmap" else {}
+        return cls(**{**of_preset, **values})
 
     @property
     def preset_name(self) -> str:
         """Name of the preset that these options are, ``mapper_options`` apart, else ``custom``."""
-        own = {k: value for k, value in self if k in self.OF_NO_PRESET}
-        return next((name for name in PRESETS if self == self.preset(name, **own)), CUSTOM)
+        own = {name: value for name, value in self if name in self.OF_NO_PRESET}
+        for preset in PRESETS:
+            if self == self.preset(preset, **own):
+                return preset
+        return CUSTOM
 
 
 class PartOptions(Options):
@@ -310,9 +279,10 @@ class Registry(Generic[Part]):
         except (Exception, SystemExit) as error:  # of any kind: it is the code of others
             if lacks_memory(error):
                 raise
-            problem = f"cannot be loaded ({type(error).__name__}: {reason(error)})"
-            raise OptionError(f"{where}: {problem}; mend or uninstall that package") from error
-        if problem := self.problem(part, name):
+            why = f"cannot be loaded ({type(error).__name__}: {reason(error)})"
+            raise OptionError(f"{where}: {why}; mend or uninstall that package") from error
+        problem = self.problem(part, name)
+        if problem:
             raise OptionError(f"{where}: {problem}; mend or uninstall that package")
         return part
 
@@ -327,24 +297,34 @@ class Registry(Generic[Part]):
         return f"{self.kind} '{points[0].name}' of {', '.join(map(_package_of, points))}"
 
     def problem(self, part: Any, name: str) -> str:
-        """Say what a class lacks to be a part of this kind; empty if it lacks nothing."""
+        """Say what a class lacks to be a part of this kind; empty if it lacks nothing.
+
+        Args:
+            part: the class.
+            name: by which it is registered.
+        """
         options = getattr(part, "Options", None)
         if not (isinstance(options, type) and issubclass(options, self.options_base)):
             return f"has no class 'Options' with the base {self.options_base.__name__}"
         if options.model_fields["name"].default != name:
             return f"the name in its options is {options.model_fields['name'].default!r}"
-        undeclared = [each for each in options.__class_vars__ if not hasattr(options, each)]
-        if undeclared:
-            return f"{options.__name__} must say what its '{min(undeclared)}' are"
+        for declared in sorted(options.__class_vars__):
+            if not hasattr(options, declared):
+                return f"{options.__name__} must say what its '{declared}' are"
         for method in methods_of(self.protocol):
             if not callable(getattr(part, method, None)):
                 return f"has no method '{method}'"
         return ""
 
     def options(self, given: Any, where: str = "") -> Any:
-        """Return the options of a part: as they are, by its name, or from a mapping with ``name``.
+        """Return the options of a part.
 
-        Raises OptionError for an unknown part or option, naming ``where`` it is given.
+        Args:
+            given: options as they are, the name of a part, or a mapping with ``name``.
+            where: they come from, for errors.
+
+        Raises:
+            OptionError: for an unknown part or option.
         """
         if isinstance(given, PartOptions):
             return given
@@ -372,17 +352,10 @@ class Registry(Generic[Part]):
 
 def _package_of(point: metadata.EntryPoint) -> str:
     """Name the package of an entry point, and where the part is in it."""
-    package = (
-        f"{point.dist.name} {point.dist.version}" if point.dist else "a package without a name"
-    )
+    package = "a package without a name"
+    if point.dist:
+        package = f"{point.dist.name} {point.dist.version}"
     return f"{package} ({point.value})"
-
-
-def require_bools(**given: Any) -> None:
-    """Refuse arguments, by their names, that are neither True nor False."""
-    for argument, value in given.items():
-        if not isinstance(value, bool):
-            raise OptionError(f"{argument}={value!r}: give True or False")
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -398,8 +371,8 @@ def takes_fields_of(options: type[Options]) -> Callable[[Function], Function]:
     def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        texts = inspect.signature(options).parameters.values()
-        keywords = [p.replace(default=_Shown("..."), annotation=p.empty) for p in texts]
+        fields = inspect.signature(options).parameters.values()
+        keywords = [p.replace(default=_Shown("..."), annotation=p.empty) for p in fields]
         shown = signature.replace(parameters=[*own, *keywords])
         function.__signature__ = shown  # type: ignore[attr-defined]
         return function
@@ -422,18 +395,24 @@ def described_toml(options: Options, path: str = "") -> str:
     sections = []
     for name, value in options.to_mapping().items():
         inner = getattr(options, name)
-        at = f"{path}.{name}".lstrip(".")
+        section = f"{path}.{name}".lstrip(".")
         if isinstance(inner, Options):
-            sections.append(f"\n[{at}]\n{described_toml(inner, at)}")
-        elif isinstance(inner, tuple) and inner and isinstance(inner[0], Options):
-            sections += [f"\n[[{at}]]\n{described_toml(item, at)}" for item in inner]
+            sections.append(f"\n[{section}]\n{described_toml(inner, section)}")
+        elif _are_options(inner):
+            for item in inner:
+                sections.append(f"\n[[{section}]]\n{described_toml(item, section)}")
         elif isinstance(value, dict):
             sections.append(tomli_w.dumps({name: value}) if value else "")
         else:
             text = type(options).model_fields[name].description or ""
-            comment = textwrap.wrap(text.replace("``", "'"), MAX_COMMENT)
-            lines += [*(f"# {line}\n" for line in comment), tomli_w.dumps({name: value})]
+            for line in textwrap.wrap(text.replace("``", "'"), MAX_COMMENT):
+                lines.append(f"# {line}\n")
+            lines.append(tomli_w.dumps({name: value}))
     return "".join([*lines, *sections])
+
+
+def _are_options(value: object) -> bool:
+    return isinstance(value, tuple) and bool(value) and isinstance(value[0], Options)
 
 
 def digest_of(values: Any) -> str:
@@ -447,13 +426,17 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in values.items():
         if isinstance(value, Mapping):
             found |= flat(value, f"{prefix}{key}.")
+        elif isinstance(value, tuple):
+            found[f"{prefix}{key}"] = list(value)
         else:
-            found[f"{prefix}{key}"] = list(value) if isinstance(value, tuple) else value
+            found[f"{prefix}{key}"] = value
     return found
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Return what a message adds to an unknown name: the one that was meant, or those there are."""
-    known = list(dict.fromkeys(known))
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f" (did you mean '{close[0]}'?)" if close else f" (known: {such_as(known, MAX_KNOWN)})"
+    names = list(dict.fromkeys(known))
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if close:
+        return f" (did you mean '{close[0]}'?)"
+    return f" (known: {such_as(names, MAX_KNOWN)})"

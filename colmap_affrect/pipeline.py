@@ -27,11 +27,12 @@ from colmap_affrect.mappers.existing import (
 )
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.mend import watched
-from colmap_affrect.options import require_bools, takes_fields_of
+from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import Forecast, GivenProgress, Progress
+from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport, installed_versions, summed
@@ -39,7 +40,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.advice import advice
 from colmap_affrect.report.pairs import draw_pairs_to_check
 from colmap_affrect.report.run_page import RunContent, write_run_page
-from colmap_affrect.report.run_report import RunReport, cameras_of_report
+from colmap_affrect.report.run_report import RunReport, cameras_of_report, lines_of_report
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
@@ -466,6 +467,7 @@ def map_and_report(
         mapping=options.to_mapping(),
         guided={} if copied else guided_counts(context),
         cameras=cameras_of_report(workspace, models, before),
+        lines={} if copied else lines_of_report(context.features, names),
         extended=tuple(before),
         advice=advice(context, missing, models, strongest, again.untried, again.effort),
         by_hand=context.by_hand.texts(),

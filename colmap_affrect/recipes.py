@@ -82,8 +82,23 @@ class Level:
     @property
     def weights(self) -> set[str]:
         """Keys of the files of weights that it reads, with those of its own matcher."""
-        parts = (*self.network_parts, *([self.matching] if self.matching else []))
-        return {key for part in parts for key in part.weights}
+        keys = set[str]()
+        for part in self.network_parts:
+            keys.update(part.weights)
+        if self.matching:
+            keys.update(self.matching.weights)
+        return keys
+
+
+def _base_of(features: FeatureOptions, size_px: int, levels: Sequence[Level]) -> int:
+    """Return the number of the first level with features of images of a size.
+
+    That is the next level, where none of the ``levels`` so far has such features.
+    """
+    for number, level in enumerate(levels):
+        if level.features == features and level.max_image_size_px == size_px:
+            return number
+    return len(levels)
 
 
 class ExtractionOptions(Options):
@@ -107,15 +122,12 @@ class ExtractionOptions(Options):
     @property
     def levels(self) -> tuple[Level, ...]:
         """All levels, that of every image first."""
-        size = self.max_image_size_px
         found = list[Level]()
         for item in (LevelOptions(rectifier=self.rectifier), *self.escalation):
             features = item.features or self.features
-            limit = item.max_image_size_px or size
-            alike = (k for k, level in enumerate(found)
-                     if (level.features, level.max_image_size_px) == (features, limit))  # fmt: skip
-            base = next(alike, len(found))
-            found.append(Level(item.rectifier, features, limit, item.matching, base))
+            size_px = item.max_image_size_px or self.max_image_size_px
+            base = _base_of(features, size_px, found)
+            found.append(Level(item.rectifier, features, size_px, item.matching, base))
         return tuple(found)
 
     @property
@@ -125,9 +137,12 @@ class ExtractionOptions(Options):
 
     def check_depth(self) -> None:
         """Refuse rectifiers that read depth maps where none are given; OptionError says how."""
-        needing = [x.rectifier.name for x in self.levels if x.rectifier.uses_depth]
-        if needing and not self.depth.path:
-            raise OptionError(f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER")
+        if self.depth.path:
+            return
+        for level in self.levels:
+            if level.rectifier.uses_depth:
+                name = level.rectifier.name
+                raise OptionError(f"rectifier {name} needs depth maps: give --depth-path FOLDER")
 
     def matchers(self, matching: MatcherOptions) -> tuple[MatcherOptions, ...]:
         """Return the matcher of each level, ``matching`` where it has none of its own.
@@ -184,8 +199,8 @@ class Recipe(ExtractionOptions):
     @property
     def extraction(self) -> ExtractionOptions:
         """The options that decide the features of an image."""
-        fields = ExtractionOptions.model_fields
-        return ExtractionOptions(**{key: getattr(self, key) for key in fields})
+        values = dict(self)
+        return ExtractionOptions(**{name: values[name] for name in ExtractionOptions.model_fields})
 
     @property
     def required_weights(self) -> tuple[str, ...]:
@@ -208,16 +223,20 @@ class Recipe(ExtractionOptions):
         return found
 
     def mapper_options(self, preset: str, name: str = "", **values: Any) -> MapperOptions:
-        """Return the options of a mapper: of a preset, changed by the recipe, then by ``values``.
+        """Return the options of a mapper.
 
-        ``name`` is by default that of the recipe, or of the preset.
+        Args:
+            preset: that they begin with; the recipe changes it where it is of the same mapper.
+            name: of the mapper, by default that of the recipe, or of the preset.
+            values: options that win over both.
         """
-        own = dict(self.mapping)
-        usual = str(own.pop("name", "incremental" if preset == "colmap" else MAPPERS.default))
+        of_recipe = dict(self.mapping)
+        of_preset = "incremental" if preset == "colmap" else MAPPERS.default
+        usual = str(of_recipe.pop("name", of_preset))
         if name and name != usual:
-            own = {}  # they are those of another mapper
+            of_recipe = {}  # they are those of another mapper
         part = MAPPERS.part(name or usual)
-        options: MapperOptions = part.Options.preset(preset, **{**own, **values})
+        options: MapperOptions = part.Options.preset(preset, **{**of_recipe, **values})
         return options
 
 
@@ -256,6 +275,13 @@ def load_recipe(name: str | PathLike[str], settings: str | Sequence[str] = ()) -
     Raises OptionError for an unknown recipe or option, or a value out of range.
     """
     name = name if isinstance(name, str) else str(as_path(name))
+    values = _read_recipe(name)
+    changed = with_settings(values, [settings] if isinstance(settings, str) else settings)
+    return Recipe.from_mapping({**changed, "name": name}, f"recipe {name}")
+
+
+def _read_recipe(name: str) -> dict[str, Any]:
+    """Return the sections of a recipe by its name, or of a TOML file by its path."""
     is_file = name.endswith(".toml")
     if not is_file and name not in recipe_names():
         raise OptionError(f"unknown recipe '{name}'{suggestion(name, recipe_names())}")
@@ -263,36 +289,48 @@ def load_recipe(name: str | PathLike[str], settings: str | Sequence[str] = ()) -
     if path.exists() and not path.is_file():  # a pipe would be read only once
         raise OptionError(f"recipe {path}: is not a file; give the path of a TOML file")
     try:
-        values = tomllib.loads(read_regular_text(path, "utf-8-sig"))
+        return tomllib.loads(read_regular_text(path, "utf-8-sig"))
     except FileNotFoundError as error:
         raise OptionError(f"recipe {name}: no such file") from error
     except (OSError, ValueError, RecursionError) as error:  # what tomllib raises on odd files
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
-    changed = with_settings(values, [settings] if isinstance(settings, str) else settings)
-    return Recipe.from_mapping({**changed, "name": name}, f"recipe {name}")
 
 
 def with_settings(
     values: Mapping[str, Any], settings: Sequence[str], flag: str = "--set"
 ) -> dict[str, Any]:
-    """Return the sections of a recipe with single options changed; see :func:`load_recipe`."""
+    """Return the sections of a recipe with single options changed.
+
+    Args:
+        values: the sections, which stay as they are.
+        settings: changes, see :func:`load_recipe`.
+        flag: that they came by, for errors.
+
+    Raises:
+        OptionError: a setting is none, or is of what is no section.
+    """
     changed = dict(values)
     for setting in settings:
         key, separator, text = setting.partition("=")
         if not separator or not key.strip():
             raise OptionError(f"{flag} {setting}: expected OPTION=VALUE")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except (ValueError, RecursionError):
-            value = text.strip()
         *sections, option = key.strip().split(".")
         target = changed
         for section in sections:
             inner = target.get(section, {})
-            inner = {"name": inner} if isinstance(inner, str) else inner  # a part by its name alone
+            if isinstance(inner, str):  # a part by its name alone
+                inner = {"name": inner}
             if not isinstance(inner, Mapping):
                 raise OptionError(f"{flag} {setting}: {section} is not a section")
             target[section] = dict(inner)
             target = target[section]
-        target[option] = value
+        target[option] = _value_of(text)
     return changed
+
+
+def _value_of(text: str) -> Any:
+    """Return a TOML value; a text may go without quotes."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        return text.strip()

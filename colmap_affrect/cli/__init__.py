@@ -29,30 +29,39 @@ def main(
     """
     errors.AffrectError.names_flags = True
     try:
-        given = sys.argv[1:] if arguments is None else arguments
-        options = build_parser().parse_args(given or ["--help"])
-        options.words = ("colmap-affrect", *(word for word in given if word != "--overwrite"))
-        with _logging(options):
-            from colmap_affrect.cli import commands  # not for --help
-
-            command = getattr(commands, options.command.replace("-", "_"), commands.stage)
-            begin()
-            return command(options) or 0
+        return _run(sys.argv[1:] if arguments is None else arguments, begin)
     except errors.AffrectError as error:
         return _fail(str(error), error.exit_code)
     except BrokenPipeError:  # who reads what is printed has seen enough, as head has
         return 0
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename:
-            return _fail(str(cannot_write(Path(error.filename), error)))
-        return _fail(
-            f"{error.filename or _place()}: {error.strerror or error}; when that is mended, "
-            "run the same command again: what was done before is kept"
-        )
+        return _fail(_problem(error))
     except Exception as error:
         if not errors.lacks_memory(error):
             raise
         return _fail(f"{errors.MEMORY_HINT}: what was done before is kept")
+
+
+def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
+    """Parse the arguments and run their command."""
+    options = build_parser().parse_args(given or ["--help"])
+    options.words = ("colmap-affrect", *(word for word in given if word != "--overwrite"))
+    with _logging(options):
+        from colmap_affrect.cli import commands  # not for --help
+
+        command = getattr(commands, options.command.replace("-", "_"), commands.stage)
+        begin()
+        return command(options) or 0
+
+
+def _problem(error: OSError) -> str:
+    """Say in one line what the system has refused."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename:
+        return str(cannot_write(Path(error.filename), error))
+    return (
+        f"{error.filename or _place()}: {error.strerror or error}; when that is mended, "
+        "run the same command again: what was done before is kept"
+    )
 
 
 def _place() -> str:
@@ -79,24 +88,19 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     command fails before it has more than its log.
     """
     log_path = Path(os.devnull)
-    new = None
+    new_folder = None
     if options.output_path:
         workspace = Workspace(options.output_path)
-        new = None if workspace.path.exists() else workspace.path
+        if not workspace.path.exists():
+            new_folder = workspace.path
         workspace.require_own(options.image_path or options.dataset_path)
         log_path = workspace.log
     log_path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        shown_on = os.dup(2)
-    except OSError:  # it is closed, and whoever closed it wants to see nothing
-        shown_on = os.open(os.devnull, os.O_WRONLY)
-    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
-    terminal = errors.heedless_stream(shown_on, encoding, closes=True)
+    terminal = _terminal()
     log = _Log(log_path.open("a", encoding="utf-8", errors="backslashreplace"))
     with terminal, closing(log), redirect_stderr(terminal):
         shown = logging.StreamHandler(terminal)
-        level = logging.DEBUG if options.verbose else logging.WARNING
-        shown.setLevel(logging.ERROR if options.quiet else level)
+        shown.setLevel(_shown_level(options))
         shown.setFormatter(_OneLine("%(levelname)s: %(message)s"))
         log.setFormatter(_OneLine("%(asctime)s %(levelname)s %(message)s"))
         logger.addHandler(shown)
@@ -108,14 +112,37 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
             yield
         except Exception as error:
             logger.log(logging.DEBUG, "failed", exc_info=True)
-            left = {file.name for file in new.glob("*")} if new else set()
-            if new and isinstance(error, errors.AffrectError) and left <= {".lock", "run.log"}:
-                remove_own([new])
+            if new_folder and isinstance(error, errors.AffrectError):
+                _remove_unless_used(new_folder)
             raise
         finally:
             os.dup2(terminal.fileno(), 2)
             logger.removeHandler(shown)
             logger.removeHandler(log)
+
+
+def _terminal() -> TextIO:
+    """Return a stream to where file descriptor 2 leads now."""
+    try:
+        shown_on = os.dup(2)
+    except OSError:  # it is closed, and whoever closed it wants to see nothing
+        shown_on = os.open(os.devnull, os.O_WRONLY)
+    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+    return errors.heedless_stream(shown_on, encoding, closes=True)
+
+
+def _shown_level(options: argparse.Namespace) -> int:
+    """Return from which level on messages are shown."""
+    if options.quiet:
+        return logging.ERROR
+    return logging.DEBUG if options.verbose else logging.WARNING
+
+
+def _remove_unless_used(folder: Path) -> None:
+    """Remove an output folder that holds nothing but its log."""
+    names = {file.name for file in folder.glob("*")}
+    if names <= {".lock", "run.log"}:
+        remove_own([folder])
 
 
 class _OneLine(logging.Formatter):

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 
 from colmap_affrect import doctor as examination
 from colmap_affrect import pipeline
@@ -19,6 +20,7 @@ from colmap_affrect.comparison import compare as comparing
 from colmap_affrect.comparison import tables
 from colmap_affrect.comparison.method_run import CompareOptions
 from colmap_affrect.comparison.methods import parse_methods
+from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.errors import AffrectError, ImageError, NoModelError, OptionError, such_as
 from colmap_affrect.evaluation import evaluate as evaluating
 from colmap_affrect.evaluation.evaluate import EvaluateOptions
@@ -37,6 +39,7 @@ from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
+from colmap_affrect.report.line_pictures import report_lines
 from colmap_affrect.report.pairs import draw_pair
 from colmap_affrect.session.run_options import RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
@@ -141,13 +144,17 @@ def compare(options: argparse.Namespace) -> None:
     show(tables.to_json(comparison) if options.json else tables.summary(comparison))
     if not options.json:
         show(f"\npictures: {options.output_path / 'report.html'}")
+    _refuse_failed_methods(comparison, options.output_path / "comparison.json")
+    _refuse_failures((name for method in comparison.methods for name in method.failures), options)
+
+
+def _refuse_failed_methods(comparison: Comparison, where: Path) -> None:
+    """End with an error if a method failed, or none found a model."""
     failed = [method.name for method in comparison.methods if method.failed]
     if failed:
-        where = options.output_path / "comparison.json"
         raise AffrectError(f"failed: {', '.join(failed)}; {where} says why")
     if not any(seed.models for method in comparison.methods for seed in method.seeds):
         raise NoModelError("no method found a model")
-    _refuse_failures((name for method in comparison.methods for name in method.failures), options)
 
 
 def evaluate(options: argparse.Namespace) -> None:
@@ -305,6 +312,12 @@ def inspect(options: argparse.Namespace) -> None:
     show(inspect_image(extractor, options.image, options.output_path, mask))
 
 
+def lines(options: argparse.Namespace) -> None:
+    found = report_lines(options.photographs, options.target_path)
+    show(found.to_json() if options.json else found.summary())
+    _refuse_failures(found.failures, options)
+
+
 def show_pair(options: argparse.Namespace) -> None:
     photographs = given.folder("--image-path", options.image_path)
     show(draw_pair(options.path, tuple(options.pair), photographs, options.picture_path))
@@ -326,35 +339,52 @@ def recipes(options: argparse.Namespace) -> None:
         recipe = load_recipe(name)
         needs = list(recipe.required_weights)
         uses = [key for key in recipe.weights if key not in needs]
-        needs += ["depth"] if recipe.extraction.uses_depth else []
         more = f", and uses {', '.join(uses)} if it can" if uses else ""
+        if recipe.extraction.uses_depth:
+            needs.append("depth")
         show(f"{name:28s} {recipe.summary}")
         show(f"{'':28s} needs {', '.join(needs) or 'nothing'}{more}")
 
 
 def weights(options: argparse.Namespace) -> None:
-    keys: list[str] = []
-    for name in options.keys:  # of a recipe what it needs, of aliked all of that name
-        alike = [key for key in files.WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
-        keys += load_recipe(name).weights if name in recipe_names() else alike or [name]
-    keys = list(dict.fromkeys(keys))
+    keys = _weights_of(options.keys)
     if options.keys and not keys:
         show(f"{', '.join(options.keys)}: no weights are needed")
-        return
-    if options.action == "fetch":
+    elif options.action == "fetch":
         keys = keys or ["affnet", "orinet", "hardnet"]
         fetched = files.fetch(keys, options.weights, progress=given.progress(options))
-        show("\n".join(str(path) for path in fetched.values()))
-        return
-    folder = given.folder("--weights", options.weights)
-    for key in keys or files.WEIGHT_FILES:
-        path = files.find(key, folder)
-        file = files.WEIGHT_FILES[key]
-        if not path:
-            where = f"not found: {files.install_hint([file])}colmap-affrect weights fetch {key}"
-        elif files.is_published(key, path) is False:
-            where = f"{path}, NOT the published file: unless it is your own, {files.remedy(path)}"
-        else:
-            where = str(path)
-        show(f"{key:32s} {file.used_for}, {file.file_name}\n    {where}")
-        show(f"    sha256 {file.sha256 or 'not known'}; licence {file.licence or 'not stated'}")
+        for path in fetched.values():
+            show(str(path))
+    else:
+        folder = given.folder("--weights", options.weights)
+        for key in keys or files.WEIGHT_FILES:
+            _show_weights(key, folder)
+
+
+def _weights_of(names: Iterable[str]) -> list[str]:
+    """Return the keys of files of weights that are named, each once.
+
+    Of a recipe these are those that it needs; ``aliked`` stands for all keys that begin so.
+    """
+    keys: dict[str, None] = {}
+    for name in names:
+        if name in recipe_names():
+            keys |= dict.fromkeys(load_recipe(name).weights)
+            continue
+        alike = [key for key in files.WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
+        keys |= dict.fromkeys(alike or [name])
+    return list(keys)
+
+
+def _show_weights(key: str, folder: Path | None) -> None:
+    """Print what a file of weights is for, and where it is."""
+    path = files.find(key, folder)
+    file = files.WEIGHT_FILES[key]
+    if not path:
+        where = f"not found: {files.install_hint([file])}colmap-affrect weights fetch {key}"
+    elif files.is_published(key, path) is False:
+        where = f"{path}, NOT the published file: unless it is your own, {files.remedy(path)}"
+    else:
+        where = str(path)
+    show(f"{key:32s} {file.used_for}, {file.file_name}\n    {where}")
+    show(f"    sha256 {file.sha256 or 'not known'}; licence {file.licence or 'not stated'}")

@@ -30,7 +30,16 @@ AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 
 def over(known: AnyOptions, options: argparse.Namespace, section: str) -> AnyOptions:
-    """Return options with what is given of a section, as ``cameras.mode`` of ``cameras``."""
+    """Return options with what is given of a section in their place.
+
+    Args:
+        known: options.
+        options: the parsed ones, with destinations such as ``cameras.mode``.
+        section: the first part of these, as ``cameras``.
+
+    Raises:
+        OptionError: names the flags of the section that are given.
+    """
     given = known.to_mapping()
     flags = []
     for flag, settings in FLAGS.items():
@@ -116,7 +125,13 @@ def verification(
 def mapping(
     options: argparse.Namespace, recipe: Recipe | None = None, known: MapperOptions | None = None
 ) -> MapperOptions:
-    """Return the mapper that is given, or what is known."""
+    """Return the mapper that is given, or what is known.
+
+    Args:
+        options: the parsed ones.
+        recipe: of the run; None for the usual one.
+        known: options on record, which hold where none are given; None if there are none.
+    """
     given: dict[str, Any] = _seed(options)
     if options.mapper_options:
         native = with_settings({}, options.mapper_options, "--mapper-options")

@@ -29,6 +29,7 @@ EXAMPLES = (
     "convert --image-path scans --output-path photos",
     "panoramas --image-path panoramas --output-path out",
     "inspect photos/a.jpg --output-path out",
+    "lines photos/a.jpg photos/b.jpg --output-path pictures",
     "show-pair out a.jpg b.jpg",
     "show-pair any.db a.jpg b.jpg --image-path photos --output-path pair.png",
     "recipes on-demand",
@@ -55,9 +56,13 @@ trusted; 130 interrupted (143 by SIGTERM).
 
 def epilog(command: str = "") -> str:
     """Return the examples of a command, or one of each, and what all have in common."""
-    examples = [text for text in EXAMPLES if text.split()[0] == command]
-    if not command:
-        examples = list({text.split()[0]: text for text in reversed(EXAMPLES)}.values())[::-1]
+    if command:
+        examples = [text for text in EXAMPLES if text.split()[0] == command]
+    else:
+        first_ones: dict[str, str] = {}
+        for text in EXAMPLES:
+            first_ones.setdefault(text.split()[0], text)
+        examples = list(first_ones.values())
     return "\n  colmap-affrect ".join(["examples:", *examples]) + "\n" + ENDING
 
 
@@ -69,9 +74,20 @@ class Parser(argparse.ArgumentParser):
         raise OptionError(f"{message}; see {self.prog} --help")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; names of flags may have underscores, and an unknown one is refused."""
-        given = list(sys.argv[1:] if args is None else args)
-        words = self._with_values([_with_hyphens(word) for word in given])
+        """Parse; names of flags may have underscores, and an unknown one is refused.
+
+        Args:
+            args: words of the command line; None for those that this process was given.
+            namespace: gets the values; None for a new one.
+
+        Returns:
+            The namespace, and no words that are left.
+
+        Raises:
+            OptionError: names a flag or a value that is wrong.
+        """
+        given = sys.argv[1:] if args is None else args
+        words = self._with_values(list(map(_with_hyphens, given)))
         if not self._subparsers:
             self._refuse_unknown(self._of_other_commands(words))
         found, unknown = super().parse_known_args(words, namespace)
@@ -81,28 +97,32 @@ class Parser(argparse.ArgumentParser):
     def _with_values(self, words: Sequence[str]) -> list[str]:
         """Join flags and values that begin with a hyphen, as names of photographs may."""
         joined: list[str] = []
-        is_name = re.compile(r"-[^-].*")
         for word in words:
             before = joined[-1] if joined else ""
-            action = self._option_string_actions.get(before)
-            takes_value = action is not None and action.nargs is None and before.startswith("--")
-            if takes_value and is_name.fullmatch(word) and word not in self._option_string_actions:
+            is_name = re.fullmatch(r"-[^-].*", word) and word not in self._option_string_actions
+            if is_name and self._takes_value(before):
                 joined[-1] = f"{before}={word}"
             else:
                 joined.append(word)
         return joined
 
+    def _takes_value(self, word: str) -> bool:
+        """Tell whether a word is a flag that takes the next word as its value."""
+        action = self._option_string_actions.get(word)
+        return action is not None and action.nargs is None and word.startswith("--")
+
     def _refuse_unknown(self, unknown: Sequence[str]) -> None:
         if not unknown:
             return
-        name = next((word for word in unknown if word.startswith("-")), unknown[0])
+        flags = [word for word in unknown if word.startswith("-")]
+        name = flags[0] if flags else unknown[0]
         close = get_close_matches(name.partition("=")[0], self._option_string_actions, n=1)
         meant = f" (did you mean {close[0]}?)" if close else ""
         self.error(f"unknown argument {name}{meant}")
 
     def _of_other_commands(self, words: Sequence[str]) -> list[str]:
         """Return flags of other commands: argparse would take them for the beginning of ours."""
-        flags = {flag for names in FLAGS for flag in names.partition("@")[0].split(",")}
+        flags = {flag for names in FLAGS for flag in _flag(names).split(",")}
         others = {flag for flag in flags if flag.startswith("--")}
         others -= self._option_string_actions.keys()
         return [word for word in words if word.partition("=")[0] in others]
@@ -157,9 +177,13 @@ def _flag(word: str) -> str:
 
 def _short_usage(parser: argparse.ArgumentParser) -> str:
     """Return the usage of a command with many options: what must be given, and nothing else."""
-    required = [action for action in parser._actions if action.required]
-    words = (f"{a.option_strings[0]} {a.metavar}" if a.option_strings else a.dest for a in required)
-    return f"{parser.prog} {' '.join(words)} [options]"
+    words = [parser.prog]
+    for action in parser._actions:
+        if action.required and action.option_strings:
+            words.append(f"{action.option_strings[0]} {action.metavar}")
+        elif action.required:
+            words.append(action.dest)
+    return f"{' '.join(words)} [options]"
 
 
 def _add(parser: argparse._ActionsContainer, word: str) -> list[str]:
@@ -168,7 +192,7 @@ def _add(parser: argparse._ActionsContainer, word: str) -> list[str]:
     required: dict[str, Any] = {"required": True} if word.endswith("!") else {}
     target = parser.add_mutually_exclusive_group() if len(names) > 1 else parser
     return [
-        target.add_argument(*name.partition("@")[0].split(","), **FLAGS[name], **required).dest
+        target.add_argument(*_flag(name).split(","), **FLAGS[name], **required).dest
         for name in names
     ]
 
@@ -235,6 +259,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "inspect": (
         "draw what a recipe does to one image, a sheet for each level: regions, warps, features",
         f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),
+    "lines": (
+        "what the straight lines of photographs say of their cameras: focal length, axis, upright",
+        "photographs --output-path@pictures --max-failures --json"),
     "show-pair": (
         "draw two photographs side by side, with lines between what was matched",
         "path pair --image-path@pair --output-path@pair"),

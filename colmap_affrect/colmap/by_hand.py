@@ -1,4 +1,4 @@
-"""What a person says of a set of photographs: tie points, wrong pairs, photographs to leave out.
+"""Manual input: tie points, wrong pairs, photographs to leave out.
 
 None of it changes ``database.db``: what is mapped is a copy with the tie points as keypoints behind
 the others, and without the verified pairs that are not to be used.
@@ -7,6 +7,7 @@ the others, and without the verified pairs that are not to be used.
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -31,6 +32,8 @@ COLUMNS = {
     "y": ("py", "y"),
 }
 """What a table of tie points may call its columns; x and y beside px and py are those of points."""
+SIZE_COLUMNS = {4: [2], 6: [2, 5]}
+"""Columns of keypoints that hold a radius, or the diagonal of a shape, by the number of columns."""
 Marks = Mapping[str, Mapping[str, Array]]
 """(2,) px from the upper left corner of the image, as COLMAP has them, by point and image name."""
 Indices = Mapping[str, Mapping[str, int]]  # numbers of keypoints, by point and image name
@@ -43,7 +46,7 @@ def unknown_size(_: str) -> None:
 
 
 class ByHand(Options):
-    """What is to be done otherwise than matches alone say."""
+    """Manual input, which is used where matches alone say something else."""
 
     tie_points_path: GivenPath | None = None
     """Table of the same points in several photographs."""
@@ -55,83 +58,137 @@ class ByHand(Options):
     def marks(self, names: Collection[str], size_of: SizeOf = unknown_size) -> Marks:
         """Read the tie points, as :func:`read_marks` does.
 
-        OptionError also where photographs are named that are not there.
+        Args:
+            names: of all photographs.
+            size_of: returns (width, height) of a photograph in px, None where it is not known.
+
+        Raises:
+            OptionError: names the line that cannot be used, or a photograph that is not there.
         """
-        asked = [("--reject-pair", name) for pair in self.rejected for name in pair]
-        for flag, name in [*asked, *(("--leave-out", name) for name in self.left_out)]:
-            require_known(name, names, f"{flag} ")
+        for pair in self.rejected:
+            for name in pair:
+                require_known(name, names, "--reject-pair ")
+        for name in self.left_out:
+            require_known(name, names, "--leave-out ")
         if not self.tie_points_path:
             return {}
         return read_marks(self.tie_points_path, names, size_of)
 
     def allows(self, first: str, second: str) -> bool:
-        """Tell whether a pair may be used."""
-        rejected = {frozenset(pair) for pair in self.rejected}
-        return {first, second} not in rejected and not {first, second} & set(self.left_out)
+        """Tell whether a pair may be used.
+
+        Args:
+            first: name of one photograph.
+            second: name of the other one; the order does not count.
+        """
+        if first in self.left_out or second in self.left_out:
+            return False
+        return (first, second) not in self.rejected and (second, first) not in self.rejected
 
     def texts(self) -> tuple[str, ...]:
         """Return what is said, in a few words each."""
-        table = self.tie_points_path
-        return (
-            *([f"tie points of {table.name}"] if table else []),
-            *(f"pair {first}, {second} rejected" for first, second in self.rejected),
-            *(f"{name} left out" for name in self.left_out),
-        )
+        found = list[str]()
+        if self.tie_points_path:
+            found.append(f"tie points of {self.tie_points_path.name}")
+        for first, second in self.rejected:
+            found.append(f"pair {first}, {second} rejected")
+        for name in self.left_out:
+            found.append(f"{name} left out")
+        return tuple(found)
 
     def digest(self) -> str:
         """Return what differs where this does; empty where nothing is said."""
         if self == ByHand():
             return ""
-        found = hashlib.sha256(repr((sorted(self.rejected), sorted(self.left_out))).encode())
+        names = (sorted(self.rejected), sorted(self.left_out))
+        found = hashlib.sha256(repr(names).encode())
         if self.tie_points_path and self.tie_points_path.is_file():
             found.update(read_regular(self.tie_points_path))
         return found.hexdigest()
 
     def copy_database(self, source: Path, target: Path) -> Indices:
-        """Write the database that is to be mapped; return where the tie points are in it."""
-        found = defaultdict[str, dict[str, int]](dict)
+        """Write the database that is to be mapped.
+
+        Args:
+            source: the database of the run, which stays as it is.
+            target: the new database.
+
+        Returns:
+            The numbers of the keypoints that tie points have become.
+
+        Raises:
+            OptionError: as :meth:`marks`.
+            DatabaseError: as :func:`~colmap_affrect.colmap.database_copy.copy_database`.
+        """
+        found: dict[str, Mapping[str, int]] = {}
 
         def change(database: pycolmap.Database) -> None:
-            images = {image.name: image.image_id for image in database.read_all_images()}
-            names = {image_id: name for name, image_id in images.items()}
-            places = defaultdict[str, list[Array]](list)
-            cameras = cameras_of_images(database)
-            sizes = {name: (cameras[i].width, cameras[i].height) for name, i in images.items()}
-            for point, marks in self.marks(images, sizes.get).items():
-                for name, place in marks.items():
-                    if name not in self.left_out:
-                        count = database.num_keypoints_for_image(images[name])
-                        found[point][name] = count + len(places[name])
-                        places[name].append(place)
-            for name, marked in places.items():
-                _append_keypoints(database, images[name], np.array(marked))
-            for pair_id in database.read_two_view_geometry_num_inliers()[0]:
-                ids = pycolmap.pair_id_to_image_pair(pair_id)
-                if not self.allows(*(names[i] for i in ids)):
-                    database.delete_two_view_geometry(*ids)
+            found.update(self._add_tie_points(database))
+            self._delete_geometries(database)
 
         copy_database(source, target, change=change)
         return found
+
+    def _add_tie_points(self, database: pycolmap.Database) -> Indices:
+        """Add the tie points behind the keypoints of their images; return their numbers."""
+        cameras = cameras_of_images(database)
+        image_ids = {}
+        sizes = {}
+        for image in database.read_all_images():
+            camera = cameras[image.image_id]
+            image_ids[image.name] = image.image_id
+            sizes[image.name] = (camera.width, camera.height)
+        indices = defaultdict[str, dict[str, int]](dict)
+        added = defaultdict[str, list[Array]](list)
+        for point, marks in self.marks(image_ids, sizes.get).items():
+            for name, mark in marks.items():
+                if name in self.left_out:
+                    continue
+                num_keypoints = database.num_keypoints_for_image(image_ids[name])
+                indices[point][name] = num_keypoints + len(added[name])
+                added[name].append(mark)
+        for name, positions in added.items():
+            _append_keypoints(database, image_ids[name], np.array(positions))
+        return indices
+
+    def _delete_geometries(self, database: pycolmap.Database) -> None:
+        """Delete the two-view geometries of pairs that may not be used."""
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        pair_ids, _ = database.read_two_view_geometry_num_inliers()
+        for pair_id in pair_ids:
+            image_id1, image_id2 = pycolmap.pair_id_to_image_pair(pair_id)
+            if not self.allows(names[image_id1], names[image_id2]):
+                database.delete_two_view_geometry(image_id1, image_id2)
 
 
 NOTHING = ByHand()
 
 
 def require_known(name: str, names: Collection[str], option: str = "") -> None:
-    """Refuse the name of a photograph that is not there; OptionError says which may be meant."""
+    """Refuse the name of a photograph that is not there.
+
+    Args:
+        name: of a photograph.
+        names: of all photographs.
+        option: that the name came by, with a space behind, for the error.
+
+    Raises:
+        OptionError: says which photograph may be meant.
+    """
     if name not in names:
         raise OptionError(f"{option}{name}: no such photograph{suggestion(name, names)}")
 
 
-def _append_keypoints(database: pycolmap.Database, image_id: int, places: Array) -> None:
-    """Add (N, 2) places behind the keypoints that an image has, as disks of three pixels."""
+def _append_keypoints(database: pycolmap.Database, image_id: int, positions: Array) -> None:
+    """Add (N, 2) positions behind the keypoints of an image, as disks of three pixels."""
     if not database.exists_keypoints(image_id):
-        database.write_keypoints(image_id, places.astype(np.float32))
+        database.write_keypoints(image_id, positions.astype(np.float32))
         return
     known = database.read_keypoints(image_id)
-    new = np.zeros((len(places), known.shape[1]), np.float32)
-    new[:, :2] = places
-    new[:, {4: [2], 6: [2, 5]}.get(known.shape[1], [])] = SIGMA_PX
+    num_columns = known.shape[1]
+    new = np.zeros((len(positions), num_columns), np.float32)
+    new[:, :2] = positions
+    new[:, SIZE_COLUMNS.get(num_columns, [])] = SIGMA_PX
     database.update_keypoints(image_id, np.concatenate([known, new]))
 
 
@@ -174,33 +231,56 @@ def read_marks(path: Path, names: Collection[str], size_of: SizeOf = unknown_siz
         OptionError: names the line that cannot be used.
     """
     where = f"--tie-points {path}"
-    stems = defaultdict[str, list[str]](list)
-    for name in names:
-        for key in {name, Path(name).name, Path(name).stem}:
-            stems[key].append(name)
-    stems |= {name: [name] for name in names}  # a whole name is that of no other
+    full_names = _full_names(names)
+    headers = [*chain(*COLUMNS.values()), "z"]
     marks = defaultdict[str, dict[str, Array]](dict)
-    known = [column for alike in COLUMNS.values() for column in alike]
-    for place, row in read_table(path, where, [*known, "z"], key="", usual=tuple(COLUMNS)):
-        cells = [next((row[key] for key in keys if key in row), "") for keys in COLUMNS.values()]
-        point, image, *numbers = cells
-        if not point or not image:
+    for place, row in read_table(path, where, headers, key="", usual=tuple(COLUMNS)):
+        point = _cell(row, "point")
+        photograph = _cell(row, "photograph")
+        if not point or not photograph:
             raise OptionError(f"{place}: must name a point and a photograph")
-        if len(found := stems.get(image, [])) != 1:
-            raise OptionError(f"{place}: no such photograph, {image}{suggestion(image, names)}")
-        try:
-            mark = np.array([float(number) for number in numbers])
-        except ValueError as error:
-            raise OptionError(f"{place}: x and y must be numbers of px") from error
-        require_inside(place, mark, found[0], size_of(found[0]))
-        marks[point][found[0]] = mark
-    if not any(len(images) > 1 for images in marks.values()):
+        meant = full_names.get(photograph, [])
+        if len(meant) != 1:
+            hint = suggestion(photograph, names)
+            raise OptionError(f"{place}: no such photograph, {photograph}{hint}")
+        name = meant[0]
+        mark = _read_mark(place, row)
+        require_inside(place, mark, name, size_of(name))
+        marks[point][name] = mark
+    if max(map(len, marks.values()), default=0) < 2:
         raise OptionError(f"{where}: no point is marked in two photographs")
     return marks
 
 
+def _full_names(names: Collection[str]) -> Mapping[str, list[str]]:
+    """Return the photographs that may be meant by a name, also without folder and ending."""
+    found = defaultdict[str, list[str]](list)
+    for name in names:
+        for short in {name, Path(name).name, Path(name).stem}:
+            found[short].append(name)
+    for name in names:  # a whole name is that of no other
+        found[name] = [name]
+    return found
+
+
+def _cell(row: Mapping[str, str], column: str) -> str:
+    """Return the cell of a column, whichever of its names the table has; empty without one."""
+    for header in COLUMNS[column]:
+        if header in row:
+            return row[header]
+    return ""
+
+
+def _read_mark(place: str, row: Mapping[str, str]) -> Array:
+    """Return the (2,) px of a row; OptionError names its line unless they are numbers."""
+    try:
+        return np.array([float(_cell(row, "x")), float(_cell(row, "y"))])
+    except ValueError as error:
+        raise OptionError(f"{place}: x and y must be numbers of px") from error
+
+
 def triangulated(model: pycolmap.Reconstruction, marks: Mapping[int, Array]) -> Array | None:
-    """Return the (3,) place that marks of registered images, by their ids, have in common.
+    """Return the (3,) position that marks of registered images, by their ids, have in common.
 
     None where their rays do not meet in front of the cameras.
     """

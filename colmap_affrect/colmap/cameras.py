@@ -1,6 +1,6 @@
-"""Cameras: what the user gives by options, table or model, and who knows each focal length.
+"""Cameras: what the user gives by options, table or model, and the source of each focal length.
 
-COLMAP's database only has a flag that somebody does; ``cameras.json`` beside it says who.
+COLMAP's database only has a flag that it is known; ``cameras.json`` beside it says its source.
 """
 
 from collections import defaultdict
@@ -46,9 +46,13 @@ class CameraRecord:
     uncropped_px: float = 0.0  # what EXIF says of a crop, if it was not scaled; else 0
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
-        """Return the entry of ``report.json``, with the focal length that a model ended with."""
+        """Return the entry of ``report.json``.
+
+        Args:
+            camera_id: of the camera in the database.
+            model: has the focal length that it ended with; None if there is no model.
+        """
         longer = max(self.size)
-        used = next((name for name in self.names if model and name in model.focals_px), None)
         return {
             "id": camera_id,
             "num_images": len(self.names),
@@ -56,10 +60,17 @@ class CameraRecord:
             "source": self.source,
             "focal_px": self.focal_px,
             "focal_longer_sides": self.focal_px / longer if longer else None,
-            "refined_px": model.focals_px[used] if model and used else None,
+            "refined_px": self._refined_px(model) if model else None,
             "why": self.why,
             "lens_mm": self.lens_mm,
         }
+
+    def _refined_px(self, model: ModelSummary) -> float | None:
+        """Return the focal length that a model ended with, None if it has no image of this one."""
+        for name in self.names:
+            if name in model.focals_px:
+                return model.focals_px[name]
+        return None
 
     @property
     def is_fixed(self) -> bool:
@@ -80,19 +91,20 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Replace the file as a whole."""
-    replace_text(path, _RECORDS.dump_json(dict(sorted(records.items())), indent=1).decode())
+    ordered = dict(sorted(records.items()))
+    replace_text(path, _RECORDS.dump_json(ordered, indent=1).decode())
 
 
 @cache
 def known_model(name: str) -> str:
     """Refuse what is no camera model of COLMAP with a focal length."""
-    models = [
-        model
-        for model, number in pycolmap.CameraModelId.__members__.items()
-        if (like := camera_like(number.value)) and len(like.focal_length_idxs())
-    ]
     if name == "EQUIRECTANGULAR":
         raise ValueError(f"{name}: {CHECKS['camera-panorama']['advice']}")
+    models = []
+    for model, number in pycolmap.CameraModelId.__members__.items():
+        like = camera_like(number.value)
+        if like and len(like.focal_length_idxs()):
+            models.append(model)
     if name not in models:
         raise ValueError(f"{name} is not one of {', '.join(models)}")
     return name
@@ -154,15 +166,21 @@ class GivenCamera(Options):
             )
         if (self.cx is None) != (self.cy is None):
             raise ValueError("give both cx and cy, or none")
+        if self.params:
+            self._check_params()
+        return self
+
+    def _check_params(self) -> None:
+        """Refuse parameters that are not those of the camera model."""
         like = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1)
-        if len(self.params) not in (0, len(like.params)):
+        if len(self.params) != len(like.params):
             raise ValueError(
                 f"params: {self.model} needs {len(like.params)} values ({like.params_info}), not "
                 f"{len(self.params)}"
             )
-        if self.params and any(self.params[index] <= 0.0 for index in like.focal_length_idxs()):
+        focals_px = [self.params[index] for index in like.focal_length_idxs()]
+        if min(focals_px) <= 0.0:
             raise ValueError(f"params: a focal length of {self.params[0]:g} px cannot be")
-        return self
 
 
 def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
@@ -215,12 +233,7 @@ def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
         given = GivenCamera.from_mapping(says, place)
         if given.name in found:
             raise OptionError(f"{place}: {given.name} is there twice")
-        if cells.keys() <= {"name", "camera"}:
-            given = given.changed(params=others.params)
-        if not (given.params or given.focal_px or given.focal_mm):
-            given = given.changed(focal_px=others.focal_px)
-        if not given.params and given.cx is None:
-            given = given.changed(cx=others.cx, cy=others.cy)
+        given = _completed(given, cells, others)
         found[given.name] = given
         first = labels.setdefault(given.camera, given)
         if given.camera and given.said != first.said:
@@ -231,15 +244,28 @@ def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
     return found
 
 
+def _completed(given: GivenCamera, cells: Mapping[str, str], others: GivenCamera) -> GivenCamera:
+    """Return the camera of a row of a table; what its cells do not say is as in ``others``."""
+    if cells.keys() <= {"name", "camera"}:
+        given = given.changed(params=others.params)
+    if not (given.params or given.focal_px or given.focal_mm):
+        given = given.changed(focal_px=others.focal_px)
+    if not given.params and given.cx is None:
+        given = given.changed(cx=others.cx, cy=others.cy)
+    return given
+
+
 def with_shared_cameras(records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:
     """Return records in which images of one size share a camera where nothing is known of it."""
-    groups: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for key, record in sorted(records.items()):
+    groups = defaultdict[tuple[int, int], list[int]](list)
+    for camera_id, record in sorted(records.items()):
         if record.source == "guess" and not record.given:
-            groups[record.size].append(key)
+            groups[record.size].append(camera_id)
     shared = dict(records)
-    for keys in groups.values():
-        same = [shared.pop(key) for key in keys]
-        names = sorted(name for record in same for name in record.names)
-        shared[keys[0]] = replace(same[0], names=tuple(names))
+    for camera_ids in groups.values():
+        first = records[camera_ids[0]]
+        names = list[str]()
+        for camera_id in camera_ids:
+            names.extend(shared.pop(camera_id).names)
+        shared[camera_ids[0]] = replace(first, names=tuple(sorted(names)))
     return shared

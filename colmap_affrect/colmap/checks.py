@@ -77,16 +77,24 @@ MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations 
 
 
 def refuse_unusable(path: Path, kinds: Collection[str] = FATAL, *, warns: bool = False) -> None:
-    """Refuse a damaged database, or one with some ``kinds`` of problems; DatabaseError.
+    """Refuse a damaged database, or one with some kinds of problems.
 
-    With ``warns`` other problems that make results wrong are said in a warning.
+    Args:
+        path: the database, which is only read.
+        kinds: of problems that are refused, as ``checks.toml`` names them.
+        warns: whether other problems that make results wrong are said in a warning.
+
+    Raises:
+        DatabaseError: names the first of these problems, and what to do about it.
     """
     _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         what = CHECKS[kind]["what"]
         advice = CHECKS[kind]["advice"].format(path=path)
         raise DatabaseError(f"{path}: {what} ({such_as(problems[kind])}); {advice}")
-    for kind in sorted(WARNED & problems.keys()) if warns else ():
+    if not warns:
+        return
+    for kind in sorted(WARNED & problems.keys()):
         check = CHECKS[kind]
         items = such_as(problems[kind])
         logger.warning("%s: %s (%s); %s", path, check["what"], items, check["advice"])
@@ -125,18 +133,14 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
         if params is None or not np.isfinite(params).all() or (params[0, focals] <= 0.0).any():
             found["bad-camera"].append(label)
-        if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
+        shorter = min(camera.width, camera.height)
+        longer = max(camera.width, camera.height)
+        if shorter <= 0 or longer > MAX_SIDE_PX:
             found["bad-camera"].append(f"{label}: {camera.width} x {camera.height} px")
 
 
 def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
-    for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
-        name = (raw or b"").decode("utf-8", "replace")
-        if not name or "\0" in name or name.encode() != raw:
-            found["bad-name"].append(f"image {image_id}: {name!r}")
-    for name, count in Counter(tables.names.values()).items():
-        if count > 1:
-            found["bad-name"].append(f"{name}, {count} times")
+    _check_image_names(connection, tables, found)
     for image_id, name in tables.names.items():
         if tables.camera_ids[image_id] not in tables.cameras:
             found["no-parent"].append(name)
@@ -144,23 +148,42 @@ def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problem
             found["no-frame"].append(name)
 
 
+def _check_image_names(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
+    for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
+        name = (raw or b"").decode("utf-8", "replace")
+        if not name or "\0" in name or name.encode() != raw:
+            found["bad-name"].append(f"image {image_id}: {name!r}")
+    for name, count in Counter(tables.names.values()).items():
+        if count > 1:
+            found["bad-name"].append(f"{name}, {count} times")
+
+
 def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
-    for table, columns in MATRICES.items():
-        for name in columns.keys() & columns_of(connection, table):
-            for row, blob in rows_of(connection, f"rowid {name}", table):
-                if blob and _array(blob, 1, columns[name], np.dtype("<f8")) is None:
-                    found["matrix-data"].append(f"{name} of row {row} of {table}")
-    for row, *blobs in rows_of(connection, "pair_id camera1 camera2", "two_view_geometries"):
-        if any(blob and not _is_camera(blob) for blob in blobs):
-            found["matrix-data"].append(f"camera1 or camera2 of pair_id {row}")
+    for table in MATRICES:
+        _check_sizes(connection, table, found)
+    rows = rows_of(connection, "pair_id camera1 camera2", "two_view_geometries")
+    for pair_id, camera1, camera2 in rows:
+        if not (_is_camera_or_none(camera1) and _is_camera_or_none(camera2)):
+            found["matrix-data"].append(f"camera1 or camera2 of pair_id {pair_id}")
     if {"qvec", "tvec"} <= columns_of(connection, "two_view_geometries"):
         query = "SELECT pair_id FROM two_view_geometries WHERE (qvec IS NULL) != (tvec IS NULL)"
-        for (row,) in connection.execute(query):
-            found["matrix-data"].append(f"qvec and tvec of pair_id {row}")
+        for (pair_id,) in connection.execute(query):
+            found["matrix-data"].append(f"qvec and tvec of pair_id {pair_id}")
 
 
-def _is_camera(blob: Any) -> bool:
-    """Return whether COLMAP can read a camera that it has packed into a column."""
+def _check_sizes(connection: sqlite3.Connection, table: str, found: Problems) -> None:
+    """Find matrices and vectors of a table that hold another number of values than they must."""
+    sizes = MATRICES[table]
+    for name in sizes.keys() & columns_of(connection, table):
+        for row, blob in rows_of(connection, f"rowid {name}", table):
+            if blob and _array(blob, 1, sizes[name], np.dtype("<f8")) is None:
+                found["matrix-data"].append(f"{name} of row {row} of {table}")
+
+
+def _is_camera_or_none(blob: Any) -> bool:
+    """Return whether COLMAP can read a camera that it has packed into a column, if there is one."""
+    if not blob:
+        return True
     if not isinstance(blob, bytes) or len(blob) < PACKED_CAMERA.size:
         return False
     _, model, *_, count = PACKED_CAMERA.unpack_from(blob)
@@ -170,8 +193,8 @@ def _is_camera(blob: Any) -> bool:
 
 
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
-    rows = rows_of(connection, "image_id rows cols data", "keypoints")
     extents: dict[str, float] = {}
+    rows = rows_of(connection, "image_id rows cols data", "keypoints")
     for image_id, count, width, blob in rows:
         name = tables.names.get(image_id)
         if not name:
@@ -182,15 +205,20 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
         keypoints = _array(blob, count, width, np.dtype("<f4"))
         if keypoints is None:
             found["keypoint-data"].append(name)
-        elif count:
-            camera = tables.cameras.get(tables.camera_ids[image_id])
-            size = (camera.width, camera.height) if camera else None
-            for kind in keypoint_problems(keypoints, size):
-                found[kind].append(name)
-            if size and count >= MIN_IN_A_CORNER:
-                extents[name] = extent(keypoints, size)
+            continue
+        size = _size_of(tables, image_id)
+        for kind in keypoint_problems(keypoints, size):
+            found[kind].append(name)
+        if size and count >= MIN_IN_A_CORNER:
+            extents[name] = extent(keypoints, size)
     if are_in_a_corner(extents.values()):
         found["keypoints-in-a-corner"] += sorted(extents)
+
+
+def _size_of(tables: Tables, image_id: int) -> tuple[int, int] | None:
+    """Return (width, height) of an image in px, None where its camera is missing."""
+    camera = tables.cameras.get(tables.camera_ids[image_id])
+    return (camera.width, camera.height) if camera else None
 
 
 def _check_descriptors(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
@@ -225,45 +253,68 @@ def keypoint_problems(keypoints: Floats, size: tuple[int, int] | None) -> list[s
     found = list[str]()
     if not finite.all():
         found.append("keypoints-not-finite")
-    is_larger = size is None or max(size) > MAX_NORMALISED
-    if is_larger and len(points) >= MIN_NORMALISED and np.abs(points).max() <= MAX_NORMALISED:
+    if (size is None or max(size) > MAX_NORMALISED) and _are_normalised(points):
         found.append("keypoints-normalised")
-    if size and len(points):
-        margin = MAX_OUTSIDE * max(size) + MAX_OUTSIDE_PX
-        beyond = np.maximum(-points, points - np.array(size, np.float32))
-        if beyond.max() > margin:
-            found.append("keypoints-outside")
-    if len(points) >= MIN_AT_ONE_PLACE:  # what more than half have is the median
-        median = np.partition(points, len(points) // 2, axis=0)[len(points) // 2]
-        num_there = int((points == median).all(axis=1).sum())
-        if num_there >= max(MIN_AT_ONE_PLACE, len(keypoints) // 2 + 1):
-            found.append("keypoints-at-one-place")
+    if size and _are_outside(points, size):
+        found.append("keypoints-outside")
+    if _are_at_one_place(points, len(keypoints)):
+        found.append("keypoints-at-one-place")
     return found
+
+
+def _are_normalised(points: Floats) -> bool:
+    """Tell whether (N, 2) keypoints are not in px, but in sides of their image."""
+    return len(points) >= MIN_NORMALISED and bool(np.abs(points).max() <= MAX_NORMALISED)
+
+
+def _are_outside(points: Floats, size: tuple[int, int]) -> bool:
+    """Tell whether some of (N, 2) keypoints are clearly outside of an image of (width, height)."""
+    if not len(points):
+        return False
+    margin_px = MAX_OUTSIDE * max(size) + MAX_OUTSIDE_PX
+    beyond_px = np.maximum(-points, points - np.array(size, np.float32))
+    return bool(beyond_px.max() > margin_px)
+
+
+def _are_at_one_place(points: Floats, num_keypoints: int) -> bool:
+    """Tell whether more than half of the keypoints of an image are at the same of (N, 2) points."""
+    if len(points) < MIN_AT_ONE_PLACE:
+        return False
+    middle = len(points) // 2
+    median = np.partition(points, middle, axis=0)[middle]  # what more than half have is the median
+    num_there = int((points == median).all(axis=1).sum())
+    return num_there >= max(MIN_AT_ONE_PLACE, num_keypoints // 2 + 1)
 
 
 def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:
     """Return the (rows, columns) array that is stored in a table, None if it is another size."""
-    blob = b"" if blob is None else blob
-    if (
-        not isinstance(blob, bytes)
-        or min(rows, columns) < 0
-        or len(blob) != rows * columns * dtype.itemsize
-    ):
+    data = b"" if blob is None else blob
+    if not isinstance(data, bytes) or rows < 0 or columns < 0:
         return None
-    return np.frombuffer(blob, dtype).reshape(rows, columns)
+    if len(data) != rows * columns * dtype.itemsize:
+        return None
+    return np.frombuffer(data, dtype).reshape(rows, columns)
 
 
 def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
         for pair_id, rows, columns, blob in rows_of(connection, "pair_id rows cols data", table):
-            images = divmod(pair_id, MAX_NUM_IMAGES)
-            names = (tables.names.get(image, f"image {image}") for image in images)
-            label = f"{' - '.join(names)} ({what})"
-            indices = _array(blob, rows, columns, np.dtype("<u4"))
-            is_known = images[0] != images[1] and tables.names.keys() >= set(images)
-            if not is_known or indices is None or (rows and columns != 2):
-                found["match-data"].append(label)
-            elif rows:
-                counts = [tables.keypoints.get(image, (0, 0))[0] for image in images]
-                if (indices.max(axis=0) >= counts).any():
-                    found["match-data"].append(label)
+            image_ids = divmod(pair_id, MAX_NUM_IMAGES)
+            matches = _array(blob, rows, columns, np.dtype("<u4"))
+            if not _are_matches(matches, image_ids, tables):
+                names = [tables.names.get(key, f"image {key}") for key in image_ids]
+                found["match-data"].append(f"{names[0]} - {names[1]} ({what})")
+
+
+def _are_matches(matches: NDArray[Any] | None, image_ids: tuple[int, int], tables: Tables) -> bool:
+    """Tell whether matches are (M, 2) numbers of keypoints of two images of a database."""
+    if matches is None or image_ids[0] == image_ids[1]:
+        return False
+    if not tables.names.keys() >= set(image_ids):
+        return False
+    if not len(matches):
+        return True
+    if matches.shape[1] != 2:
+        return False
+    num_keypoints = [tables.keypoints.get(image_id, (0, 0))[0] for image_id in image_ids]
+    return bool((matches.max(axis=0) < num_keypoints).all())

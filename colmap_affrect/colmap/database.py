@@ -46,7 +46,8 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         with closing(database):
             yield database
     except RuntimeError as error:
-        if fault := damage_of(path):
+        fault = damage_of(path)
+        if fault:
             raise DatabaseError(f"{path}: {fault}; {_mend(path)}") from error
         raise cannot_write(path, error) from error
 
@@ -61,7 +62,13 @@ def _mend(path: Path) -> str:
 def write_frame(
     database: pycolmap.Database, image: pycolmap.Image, rigs: dict[pycolmap.sensor_t, int]
 ) -> None:
-    """Give an image a frame of the rig of its camera, which is made unless it is in ``rigs``."""
+    """Give an image a frame of the rig of its camera.
+
+    Args:
+        database: gets the frame, and a rig where the camera has none.
+        image: a row of the database.
+        rigs: ids of rigs by their reference sensors; gets those that are made.
+    """
     sensor = image.data_id.sensor_id
     if sensor not in rigs:
         rig = pycolmap.Rig()
@@ -90,7 +97,19 @@ def image_ids(path: Path) -> dict[str, int]:
 def nearest_positions(
     path: Path, num_neighbors: int, max_distance_m: float
 ) -> list[tuple[str, str]]:
-    """Return the pairs of images near to each other by pose priors; heights of GPS are rough."""
+    """Return the pairs of images near to each other by pose priors; heights of GPS are rough.
+
+    Args:
+        path: the database.
+        num_neighbors: of each image, at most.
+        max_distance_m: between the positions of a pair, without heights.
+
+    Returns:
+        Pairs of image names, sorted.
+
+    Raises:
+        DatabaseError: fewer than two images have a position.
+    """
     options = pycolmap.SpatialPairingOptions(
         max_num_neighbors=num_neighbors, max_distance=max_distance_m, ignore_z=True
     )
@@ -104,31 +123,33 @@ def spatial_pairs(path: Path, options: pycolmap.SpatialPairingOptions) -> list[t
     """
     positions, wrong = read_positions(path)
     if wrong:
-        listed = [f"{name} ({why})" for name, why in sorted(wrong.items())]
-        logger.warning("%s: positions that do not count: %s", path, such_as(listed))
+        reasons = [f"{name} ({why})" for name, why in sorted(wrong.items())]
+        logger.warning("%s: positions that do not count: %s", path, such_as(reasons))
     if len(positions) < 2:
         raise DatabaseError(
             f"{path}: {len(positions)} images have a position (GPS in EXIF, or pose priors); "
             "choose pairs in another way"
         )
     pairs = generated_pairs(path, pycolmap.SpatialPairGenerator, options)
-    return [pair for pair in pairs if not wrong.keys() & set(pair)]
+    return [pair for pair in pairs if wrong.keys().isdisjoint(pair)]
 
 
 def read_positions(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
     """Return the (3,) positions of the pose priors by image, and why others are none on earth."""
     with open_database(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
+        priors = database.read_all_pose_priors()
     positions = dict[str, Array]()
     wrong = dict[str, str]()
     for prior in priors:
         name = names.get(prior.corr_data_id.id)
-        position = np.array(prior.position).ravel()
-        if name is None:
+        if name is None or not prior.has_position():
             continue
-        is_on_earth = prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84
-        if is_on_earth and (why := why_not_on_earth(position)):
+        position = np.array(prior.position).ravel()
+        why = ""
+        if prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84:
+            why = why_not_on_earth(position)
+        if why:
             wrong[name] = why
         else:
             positions[name] = position
@@ -138,20 +159,33 @@ def read_positions(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
 def generated_pairs(
     path: Path, kind: Callable[[Any, pycolmap.Database], pycolmap.PairGenerator], options: object
 ) -> list[tuple[str, str]]:
-    """Return the pairs of image names that a generator of pycolmap makes, sorted."""
+    """Return the pairs of images that a generator of pycolmap makes.
+
+    Args:
+        path: the database.
+        kind: the class of the generator.
+        options: of pycolmap, for this class.
+
+    Returns:
+        Pairs of image names, the names of each and the pairs sorted.
+    """
+    pairs = set[tuple[str, str]]()
     with open_database(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        found = kind(options, database).all_pairs()
-    return sorted({(min(names[i], names[j]), max(names[i], names[j])) for i, j in found})
+        for image_id1, image_id2 in kind(options, database).all_pairs():
+            first, second = sorted((names[image_id1], names[image_id2]))
+            pairs.add((first, second))
+    return sorted(pairs)
 
 
 def num_matched_pairs(path: Path) -> int:
     """Return the number of pairs that have raw matches or a two-view geometry with inliers."""
+    matched = set[int]()
     with open_database(path) as database:
-        found = (database.read_num_matches(), database.read_two_view_geometry_num_inliers())
-    return len(
-        {pair for pairs, counts in found for pair, n in zip(pairs, counts, strict=True) if n}
-    )
+        geometries = database.read_two_view_geometry_num_inliers()
+        for pair_ids, counts in (database.read_num_matches(), geometries):
+            matched.update(np.asarray(pair_ids)[np.asarray(counts) > 0].tolist())
+    return len(matched)
 
 
 def unverified_pairs(path: Path) -> Indices:
@@ -181,7 +215,7 @@ def lack_matches(database: pycolmap.Database, image_ids: NDArray[np.integer]) ->
 
 
 def colmap_keypoints(lafs: Floats) -> Singles:
-    """Turn (N, 2, 3) frames into COLMAP's 6 columns x, y, a11, a12, a21, a22.
+    """Turn (N, 2, 3) local affine frames into COLMAP's 6 columns x, y, a11, a12, a21, a22.
 
     The centre moves to COLMAP's corner origin; the shape maps the unit circle to one sigma.
     """
@@ -191,18 +225,32 @@ def colmap_keypoints(lafs: Floats) -> Singles:
 
 
 def has_keypoints(database: pycolmap.Database, image_id: int, count: int) -> bool:
-    """Tell whether an image has so many keypoints, also none, on record."""
-    return (
-        database.exists_keypoints(image_id) and database.num_keypoints_for_image(image_id) == count
-    )
+    """Tell whether an image has a number of keypoints on record.
+
+    Args:
+        database: is only read.
+        image_id: of the image.
+        count: the number; 0 is for an image that features were extracted of without finding any.
+    """
+    if not database.exists_keypoints(image_id):
+        return False
+    return database.num_keypoints_for_image(image_id) == count
 
 
 def write_keypoints(
     database: pycolmap.Database, image_id: int, lafs: Floats, level_ends: Sequence[int] = ()
 ) -> None:
-    """Write the (N, 2, 3) frames of an image.
+    """Write the keypoints of an image.
 
-    Fewer that it has, as many as one of ``level_ends``, are replaced; DatabaseError for others.
+    Args:
+        database: gets them.
+        image_id: of the image.
+        lafs: (N, 2, 3) local affine frames, in pixel-centre px.
+        level_ends: numbers of keypoints that are replaced where the image has so many already:
+            those of the levels before.
+
+    Raises:
+        DatabaseError: the image has others, or the keypoints are not finite.
     """
     if has_keypoints(database, image_id, len(lafs)):
         return
@@ -216,8 +264,10 @@ def write_keypoints(
     keypoints = colmap_keypoints(lafs)
     if not np.isfinite(keypoints).all():
         raise DatabaseError(f"image {image_id}: keypoints are not finite")
-    write = database.update_keypoints if exists else database.write_keypoints
-    write(image_id, keypoints)
+    if exists:
+        database.update_keypoints(image_id, keypoints)
+    else:
+        database.write_keypoints(image_id, keypoints)
 
 
 DESCRIPTOR_SIZE = 128
@@ -250,17 +300,26 @@ def read_descriptors(
 
 
 def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: Floats) -> None:
-    """Write (N, 128) unit descriptors as uint8 rows of length 512, as COLMAP's SIFT has them.
+    """Write the descriptors of an image as uint8 rows of length 512, as COLMAP's SIFT has them.
 
     Signed ones are shifted to positive values first, which makes all angles smaller and hardly
-    changes their order. DatabaseError for another size than 128.
+    changes their order.
+
+    Args:
+        database: gets them.
+        image_id: of the image.
+        descriptors: (N, 128), of unit length.
+
+    Raises:
+        DatabaseError: the descriptors have another size than 128.
     """
     if descriptors.shape[1] != DESCRIPTOR_SIZE:
         raise DatabaseError(
             f"descriptors have {descriptors.shape[1]} elements; COLMAP's matchers take those with "
             f"{DESCRIPTOR_SIZE} only, leave out --database-descriptors"
         )
-    shift = SIGNED_SHIFT if descriptors.min(initial=0.0) < 0.0 else 0.0
+    is_signed = descriptors.min(initial=0.0) < 0.0
+    shift = SIGNED_SHIFT if is_signed else 0.0
     positive = np.maximum(descriptors.astype(np.float64) + shift, 0.0)
     lengths = np.linalg.norm(positive, axis=1, keepdims=True)
     scaled = DESCRIPTOR_NORM * positive / np.maximum(lengths, np.finfo(np.float64).tiny)
@@ -272,14 +331,16 @@ def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: F
 def fill_descriptors(path: Path, features: FeatureStore) -> None:
     """Write the descriptors of all images into a database as COLMAP's matchers take them."""
     ids = image_ids(path)
-    counts = {name: count for name, count in features.num_keypoints().items() if name in ids}
+    counts = features.num_keypoints()
+    names = [name for name in counts if name in ids]
     with open_database(path) as database:
-        written = {name: database.num_descriptors_for_image(ids[name]) for name in counts}
-        if any(written[name] not in (0, count) for name, count in counts.items()):
-            database.clear_descriptors()  # from before an escalation; COLMAP cannot replace them
-            written = dict.fromkeys(counts, 0)
-        for name, count in counts.items():
-            if count and not written[name]:
+        num_written = {name: database.num_descriptors_for_image(ids[name]) for name in names}
+        are_stale = [num_written[name] not in (0, counts[name]) for name in names]
+        if any(are_stale):  # from before an escalation; COLMAP cannot replace single ones
+            database.clear_descriptors()
+            num_written = dict.fromkeys(names, 0)
+        for name in names:
+            if counts[name] and not num_written[name]:
                 write_descriptors(database, ids[name], features.read(name).descriptors)
 
 
@@ -299,21 +360,20 @@ def cameras_of_images(database: pycolmap.Database) -> dict[int, pycolmap.Camera]
 def write_matches(
     database: pycolmap.Database, image_id1: int, image_id2: int, indices: NDArray[np.integer]
 ) -> None:
-    """Write (M, 2) raw matches of one pair; every index is checked first.
+    """Write the raw matches of a pair; every index is checked first.
 
     Different ones are replaced, and their two-view geometry is deleted.
+
+    Args:
+        database: has the keypoints, and gets the matches.
+        image_id1: of one image.
+        image_id2: of the other image.
+        indices: (M, 2) numbers of keypoints of the two.
+
+    Raises:
+        DatabaseError: these cannot be matches of the two images.
     """
-    if image_id1 == image_id2:
-        raise DatabaseError(f"image {image_id1} cannot be matched with itself")
-    if indices.ndim != 2 or indices.shape[1] != 2 or not np.issubdtype(indices.dtype, np.integer):
-        raise DatabaseError(f"matches must be (M, 2) integers, not {indices.dtype}{indices.shape}")
-    counts = [database.num_keypoints_for_image(i) for i in (image_id1, image_id2)]
-    if indices.size and (indices.min() < 0 or (indices.max(axis=0) >= counts).any()):
-        raise DatabaseError(
-            f"matches of images {image_id1}, {image_id2} point at keypoints that do not exist "
-            f"(largest {indices.max(axis=0).tolist()}, keypoints {counts}); match "
-            "them again"
-        )
+    _check_indices(database, (image_id1, image_id2), indices)
     if database.exists_matches(image_id1, image_id2):
         if np.array_equal(database.read_matches(image_id1, image_id2), indices):
             return
@@ -321,3 +381,26 @@ def write_matches(
         if database.exists_two_view_geometry(image_id1, image_id2):
             database.delete_two_view_geometry(image_id1, image_id2)
     database.write_matches(image_id1, image_id2, indices.astype(np.uint32))
+
+
+def _check_indices(
+    database: pycolmap.Database, image_ids: tuple[int, int], indices: NDArray[np.integer]
+) -> None:
+    """Refuse matches that are not (M, 2) numbers of keypoints of two images."""
+    image_id1, image_id2 = image_ids
+    if image_id1 == image_id2:
+        raise DatabaseError(f"image {image_id1} cannot be matched with itself")
+    if indices.ndim != 2 or indices.shape[1] != 2 or not np.issubdtype(indices.dtype, np.integer):
+        raise DatabaseError(f"matches must be (M, 2) integers, not {indices.dtype}{indices.shape}")
+    if not indices.size:
+        return
+    counts = [
+        database.num_keypoints_for_image(image_id1),
+        database.num_keypoints_for_image(image_id2),
+    ]
+    largest = indices.max(axis=0)
+    if indices.min() < 0 or (largest >= counts).any():
+        raise DatabaseError(
+            f"matches of images {image_id1}, {image_id2} point at keypoints that do not exist "
+            f"(largest {largest.tolist()}, keypoints {counts}); match them again"
+        )

@@ -19,7 +19,7 @@ from colmap_affrect.colmap.checks import (
     refuse_unusable,
 )
 from colmap_affrect.colmap.database import open_database, write_frame
-from colmap_affrect.colmap.tables import columns_of, open_read_only
+from colmap_affrect.colmap.tables import columns_of, open_read_only, rows_of
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import temporary_folder
@@ -68,11 +68,19 @@ def copy_database(
 ) -> None:
     """Copy a database as it is now, including its write-ahead log.
 
-    The copy, which appears as a whole, has the schema of the installed pycolmap, and what
-    ``change`` does to it. COLMAP leaves positions of before 3.10 behind. DatabaseError when the
-    target exists, for what is no intact database or one of a newer COLMAP, and for ``refused``
-    kinds of problems: databases of anybody are checked before COLMAP sees the copy. What is no
-    table of COLMAP stays behind.
+    The copy, which appears as a whole, has the schema of the installed pycolmap. COLMAP leaves
+    positions of before 3.10 behind. What is no table of COLMAP stays behind.
+
+    Args:
+        source: the database, which is only read.
+        target: the new database.
+        refused: kinds of problems that are refused: databases of anybody are checked before COLMAP
+            sees the copy.
+        change: changes the copy before it appears.
+
+    Raises:
+        DatabaseError: the target exists; the source is no intact database, one of a newer COLMAP,
+            or has some of these problems.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
@@ -146,24 +154,30 @@ def _make_table(original: sqlite3.Connection, copy: sqlite3.Connection, table: s
         return
     columns = []
     for _, name, said, _, _, is_key in original.execute(f"PRAGMA table_info({table})"):
-        if str(name).isidentifier():
-            kind = str(said).upper() if str(said).upper() in TYPES else "BLOB"
-            key = " PRIMARY KEY" if is_key and kind == "INTEGER" else ""
-            columns.append(f'"{name}" {kind}{key}')
+        if not str(name).isidentifier():
+            continue
+        kind = str(said).upper()
+        if kind not in TYPES:
+            kind = "BLOB"
+        key = " PRIMARY KEY" if is_key and kind == "INTEGER" else ""
+        columns.append(f'"{name}" {kind}{key}')
     copy.execute(f"CREATE TABLE {table} ({', '.join(columns)})")
 
 
 def _copy_rows(original: sqlite3.Connection, copy: sqlite3.Connection, table: str) -> None:
-    """Copy the columns that both tables have."""
+    """Copy the columns that both tables have.
+
+    SQLite takes names of tables and columns in no other way than in the text of a statement.
+    """
     common = {*_columns(original, table)} & {*_columns(copy, table)}
     if not common:
         return
-    names = sorted(common)
-    listed = ", ".join(f'"{name}"' for name in names)
-    marks = ", ".join("?" * len(names))
-    # The table is one of ours, and the names of its columns are identifiers.
-    rows = original.execute(f"SELECT {listed} FROM {table}")  # noqa: S608
-    copy.executemany(f"INSERT INTO {table} ({listed}) VALUES ({marks})", rows)  # noqa: S608
+    columns = sorted(common)
+    quoted = '"' + '", "'.join(columns) + '"'
+    marks = ", ".join("?" * len(columns))
+    select = f"SELECT {quoted} FROM {table}"  # noqa: S608 - a table of COPIED, identifiers
+    insert = f"INSERT INTO {table} ({quoted}) VALUES ({marks})"  # noqa: S608 - the same
+    copy.executemany(insert, original.execute(select))
 
 
 def copy_without_features(source: Path, target: Path) -> None:
@@ -208,14 +222,18 @@ def read_names(source: Path) -> list[str]:
 def read_sizes(source: Path) -> dict[str, tuple[int, int]]:
     """Return (width, height) in px of the images of a database, which is only read."""
     query = "SELECT name, width, height FROM images JOIN cameras USING (camera_id)"
+    sizes = {}
     with open_read_only(source) as connection:
-        return {str(name): (width, height) for name, width, height in connection.execute(query)}
+        for name, width, height in connection.execute(query):
+            sizes[str(name)] = (width, height)
+    return sizes
 
 
 def has_matches(source: Path) -> bool:
     """Tell whether any pair of a database, which is only read, has matches or a geometry."""
     with open_read_only(source) as connection:
-        rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
-        tables = {"matches", "two_view_geometries", "inlier_matches"} & {name for (name,) in rows}
-        queries = [f"SELECT EXISTS (SELECT 1 FROM {name} WHERE rows > 0)" for name in tables]  # noqa: S608
-        return any(connection.execute(query).fetchone()[0] for query in queries)
+        for table in ("matches", "two_view_geometries", "inlier_matches"):
+            for (count,) in rows_of(connection, "rows", table):
+                if isinstance(count, int) and count > 0:
+                    return True
+    return False

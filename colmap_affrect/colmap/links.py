@@ -3,7 +3,7 @@
 import sqlite3
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from colmap_affrect.colmap.tables import (
     MAX_NUM_IMAGES,
@@ -49,7 +49,7 @@ class _Member(NamedTuple):
     rig_id: int
     sensor: _Sensor
     is_reference: bool
-    is_placed: bool  # it is known where the sensor is in the rig
+    has_pose: bool  # sensor_from_rig is known; that of the reference is the identity
 
 
 class _Datum(NamedTuple):
@@ -64,7 +64,13 @@ class _Datum(NamedTuple):
 
 
 def check_links(connection: sqlite3.Connection, tables: Tables, found: Found) -> None:
-    """Add what is wrong with ids, rigs and frames to the problems by kind."""
+    """Find what is wrong with ids, rigs and frames.
+
+    Args:
+        connection: to the database.
+        tables: what the database holds.
+        found: gets the problems, by kind.
+    """
     _check_ids(connection, found)
     _check_foreign_keys(connection, found)
     members = _members(connection)
@@ -77,6 +83,11 @@ def _twice(values: Iterable[Value]) -> list[Value]:
     return [value for value, count in Counter(values).items() if count > 1]
 
 
+def _is_id(value: Any, highest: int = MAX_ID) -> bool:
+    """Tell whether COLMAP can have a value as an id."""
+    return isinstance(value, int) and 0 <= value <= highest
+
+
 def _check_ids(connection: sqlite3.Connection, found: Found) -> None:
     for table, column in IDS.items():
         if column not in columns_of(connection, table):
@@ -84,7 +95,7 @@ def _check_ids(connection: sqlite3.Connection, found: Found) -> None:
         highest = MAX_PAIR_ID if column == "pair_id" else MAX_ID
         ids = [value for (value,) in rows_of(connection, column, table)]
         for value in ids:
-            if not isinstance(value, int) or not 0 <= value <= highest:
+            if not _is_id(value, highest):
                 found["bad-id"].append(f"{column} {value!r} of {table}")
         for value in _twice(ids):
             found["bad-id"].append(f"{column} {value!r} of {table}, twice")
@@ -95,15 +106,16 @@ def _check_priors(connection: sqlite3.Connection, found: Found) -> None:
     priors = rows_of(connection, "corr_sensor_type corr_sensor_id corr_data_id", "pose_priors")
     known = [row for row in priors if row[1]]  # databases of old have no such columns
     for kind, number, data_id in known:
-        if not all(isinstance(value, int) and 0 <= value <= MAX_ID for value in (number, data_id)):
+        if not (_is_id(number) and _is_id(data_id)):
             found["bad-id"].append(f"pose prior of {data_id!r} of {_Sensor(kind, number)}")
     for kind, number, data_id in _twice(known):
         found["bad-id"].append(f"pose prior of {data_id!r} of {_Sensor(kind, number)}, twice")
 
 
 def _check_foreign_keys(connection: sqlite3.Connection, found: Found) -> None:
-    tables = ("rig_sensors", "frames", "frame_data")
-    for table in [name for name in tables if columns_of(connection, name)]:
+    for table in ("rig_sensors", "frames", "frame_data"):
+        if not columns_of(connection, table):
+            continue
         for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
             found["no-parent"].append(f"row {row} of {table}, {parent}")
 
@@ -122,7 +134,7 @@ def _members(connection: sqlite3.Connection) -> list[_Member]:
 
 
 def _check_rigs(members: Sequence[_Member], tables: Tables, found: Found) -> None:
-    """Find sensors that do not exist, are there twice, or are nobody knows where."""
+    """Find sensors that do not exist, are there twice, or have no known pose in their rig."""
     for member in members:
         sensor = member.sensor
         label = f"{member.sensor} of rig {member.rig_id}"
@@ -130,31 +142,51 @@ def _check_rigs(members: Sequence[_Member], tables: Tables, found: Found) -> Non
             found["bad-rig"].append(label)
         elif sensor.kind == SENSOR_CAMERA and sensor.number not in tables.cameras:
             found["no-parent"].append(label)
-        elif not member.is_placed:
+        elif not member.has_pose:
             found["rig-without-pose"].append(label)
-    in_same_part = _twice((member.sensor, member.is_reference) for member in members)
-    in_same_rig = _twice((member.sensor, member.rig_id) for member in members)
-    for sensor in sorted({sensor for sensor, _ in [*in_same_part, *in_same_rig]}):
+    for sensor in _sensors_there_twice(members):
         found["bad-rig"].append(f"{sensor}, twice")
+
+
+def _sensors_there_twice(members: Sequence[_Member]) -> list[_Sensor]:
+    """Return sensors that are twice in a rig, the reference of two rigs, or other ones of two."""
+    in_same_role = _twice((member.sensor, member.is_reference) for member in members)
+    in_same_rig = _twice((member.sensor, member.rig_id) for member in members)
+    return sorted({sensor for sensor, _ in [*in_same_role, *in_same_rig]})
+
+
+def _data(connection: sqlite3.Connection) -> list[_Datum]:
+    """Return what all frames hold."""
+    data = []
+    rows = rows_of(connection, "frame_id data_id sensor_type sensor_id", "frame_data")
+    for frame_id, data_id, kind, number in rows:
+        sensor = _Sensor(int(kind), int(number))
+        data.append(_Datum(int(frame_id), int(data_id), sensor))
+    return data
 
 
 def _check_frames(
     connection: sqlite3.Connection, members: Sequence[_Member], tables: Tables, found: Found
 ) -> None:
     """Find frames that hold what is not of their rig, or not of their images."""
-    frames = rows_of(connection, "frame_id rig_id", "frames")
-    rig_ids = {int(frame_id): int(rig_id) for frame_id, rig_id in frames}
+    rig_ids = {}
+    for frame_id, rig_id in rows_of(connection, "frame_id rig_id", "frames"):
+        rig_ids[int(frame_id)] = int(rig_id)
+    known_rigs = {member.rig_id for member in members if member.is_reference}
     of_rigs = {(member.rig_id, member.sensor) for member in members}
-    known = {member.rig_id for member in members if member.is_reference}
-    rows = rows_of(connection, "frame_id data_id sensor_type sensor_id", "frame_data")
-    data = [_Datum(int(row[0]), int(row[1]), _Sensor(int(row[2]), int(row[3]))) for row in rows]
+    data = _data(connection)
     for datum in data:
-        if why := _fault(datum, tables):
-            found["bad-frame"].append(f"{datum}, {why}")
-            continue
+        why = _fault(datum, tables)
         rig_id = rig_ids.get(datum.frame_id)
-        if rig_id in known and (rig_id, datum.sensor) not in of_rigs:
+        if why:
+            found["bad-frame"].append(f"{datum}, {why}")
+        elif rig_id in known_rigs and (rig_id, datum.sensor) not in of_rigs:
             found["bad-frame"].append(f"{datum}, which is not in its rig {rig_id}")
+    _check_each_once(data, found)
+
+
+def _check_each_once(data: Sequence[_Datum], found: Found) -> None:
+    """Find what is in two frames, and sensors that are twice in a frame."""
     for kind, data_id in _twice((datum.sensor.kind, datum.data_id) for datum in data):
         found["bad-frame"].append(f"{data_id} of {SENSOR_NAMES.get(kind, kind)}, twice")
     for frame_id, sensor in _twice((datum.frame_id, datum.sensor) for datum in data):

@@ -29,7 +29,7 @@ Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
 Poses = dict[str, Pose]  # poses by image name
 
 MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
-FAR = 1e12  # coordinates beyond it are no places: nothing can be computed of them
+FAR = 1e12  # coordinates beyond it are no positions: nothing can be computed with them
 QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds
 SUMMARY = "summary.json"  # beside a model of ours; has the digests of its files as ``model``
 
@@ -51,7 +51,9 @@ class _Reader:
 
     def take(self, codes: str) -> tuple[Any, ...]:
         """Read values by their codes of :mod:`struct`."""
-        return struct.unpack_from(f"<{codes}", self.data, self.skip(struct.calcsize(f"<{codes}")))
+        layout = f"<{codes}"
+        start = self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self.data, start)
 
     def text(self) -> str:
         """Read a text that ends with a 0."""
@@ -80,27 +82,31 @@ def _camera(reader: _Reader) -> None:
 
 
 def _rig(reader: _Reader) -> None:
-    for number in range(reader.take("II")[1]):
-        reader.take("iI")  # the first sensor is the reference, which has no pose
-        if number and reader.take("B")[0]:
+    _, num_sensors = reader.take("II")
+    for number in range(num_sensors):
+        reader.take("iI")
+        is_reference = number == 0  # which has no pose
+        if not is_reference and reader.take("B")[0]:
             reader.take("7d")
 
 
 def _frame(reader: _Reader) -> None:
     reader.take("II7d")
-    for _ in range(reader.take("I")[0]):
+    (num_data,) = reader.take("I")
+    for _ in range(num_data):
         reader.take("iIQ")
 
 
 def _image(reader: _Reader) -> str:
     reader.take("I7dI")
     name = reader.text()
-    reader.skip(24 * reader.take("Q")[0])  # keypoints: x, y, and which point they see
+    (num_keypoints,) = reader.take("Q")
+    reader.skip(24 * num_keypoints)  # x, y, and which point they see
     return name
 
 
 def _point(reader: _Reader) -> None:
-    *_, length = reader.take("Q3d3BdQ")  # id, place, colour, error, length of the track
+    *_, length = reader.take("Q3d3BdQ")  # id, position, colour, error, length of the track
     reader.skip(8 * length)
 
 
@@ -118,9 +124,10 @@ def _read_records(path: Path) -> list[Any]:
     """Read all records of a file; StoreError unless they end where it ends."""
     with errors.damage(path, _mend(path.parent)):
         reader = _Reader(read_regular(path))
-        record = RECORDS[path.name]
+        read_record = RECORDS[path.name]
         try:
-            records = [record(reader) for _ in range(reader.take("Q")[0])]
+            (num_records,) = reader.take("Q")
+            records = [read_record(reader) for _ in range(num_records)]
         except EOFError:
             raise ValueError("it ends within a record") from None
         if reader.position < len(reader.data):
@@ -137,23 +144,31 @@ def _mend(folder: Path) -> str:
 
 def registered_names(model_path: Path) -> list[str]:
     """Return the sorted names of the images of a model; StoreError unless its files are whole."""
-    return sorted({name: _read_records(model_path / name) for name in RECORDS}["images.bin"])
+    records = {name: _read_records(model_path / name) for name in RECORDS}
+    return sorted(records["images.bin"])
 
 
 def require_intact(folder: Path) -> None:
     """Refuse a model of ours that is not as it was written, or a binary one that is damaged."""
     known = kept_digests(folder)
+    if known:
+        _require_digests(folder, known)
+    elif _is_binary(folder):
+        for name in RECORDS:
+            if name in OLD_RECORDS or (folder / name).exists():
+                _read_records(folder / name)
+
+
+def _require_digests(folder: Path, known: Mapping[str, str]) -> None:
+    """Refuse a model whose files have not the digests of when they were written."""
     now = file_digests(folder)
-    for name in RECORDS if not known and _is_binary(folder) else ():
-        if name in OLD_RECORDS or (folder / name).exists():
-            _read_records(folder / name)
-    changed = [name for name in RECORDS if known and known.get(name) != now.get(name)]
-    if changed:
-        raise errors.StoreError(
-            f"{folder / changed[0]}: is not as it was written (see {SUMMARY} in its folder); if "
-            f"you have edited the model, copy it to a folder of its own without {SUMMARY} and use "
-            f"that; else {_mend(folder)}"
-        )
+    for name in RECORDS:
+        if known.get(name) != now.get(name):
+            raise errors.StoreError(
+                f"{folder / name}: is not as it was written (see {SUMMARY} in its folder); if you "
+                f"have edited the model, copy it to a folder of its own without {SUMMARY} and use "
+                f"that; else {_mend(folder)}"
+            )
 
 
 def _is_binary(folder: Path) -> bool:
@@ -202,7 +217,7 @@ def model_folder(folder: Path) -> Path:
 
 def has_model(folder: Path) -> bool:
     """Return whether a folder holds files of a model."""
-    return any((folder / f"images{ending}").exists() for ending in (".bin", ".txt"))
+    return (folder / "images.bin").exists() or (folder / "images.txt").exists()
 
 
 def read_given_model(
@@ -235,13 +250,21 @@ def read_given_model(
             model = pycolmap.Reconstruction(folder)
     else:
         model = _read_text(folder, option, wanted)
-    seen = sum(image.num_points3D for image in model.images.values())
-    if seen != sum(point.track.length() for point in model.points3D.values()):
-        why = "damaged (its images and points are not of one model)"
-        raise errors.StoreError(f"{option}{folder}: {why}; {_mend(folder)}")
-    if fault := "" if is_ours else why_unusable(model, needs_poses=needs_poses):
+    fault = _mixed_up(model)
+    if not fault and not is_ours:
+        fault = why_unusable(model, needs_poses=needs_poses)
+    if fault:
         raise errors.StoreError(f"{option}{folder}: {fault}; {_mend(folder)}")
     return model
+
+
+def _mixed_up(model: pycolmap.Reconstruction) -> str:
+    """Say that images and points do not belong together; empty where they do."""
+    num_seen = sum(image.num_points3D for image in model.images.values())
+    num_seeing = sum(point.track.length() for point in model.points3D.values())
+    if num_seen == num_seeing:
+        return ""
+    return "damaged (its images and points are not of one model)"
 
 
 def _read_text(folder: Path, option: str, wanted: str) -> pycolmap.Reconstruction:
@@ -256,23 +279,42 @@ def _read_text(folder: Path, option: str, wanted: str) -> pycolmap.Reconstructio
 
 def why_unusable(model: pycolmap.Reconstruction, *, needs_poses: bool = True) -> str:
     """Return why nothing can be computed with a model, empty where there is no reason."""
+    fault = _faulty_images(model) or _faulty_cameras(model)
+    if not fault and needs_poses:
+        fault = _faulty_poses(model) or _faulty_points(model)
+    return fault
+
+
+def _faulty_images(model: pycolmap.Reconstruction) -> str:
     names = Counter(image.name for image in model.images.values())
-    if twice := sorted(name for name, count in names.items() if count > 1):
-        return (
-            f"two of its images are called {twice[0]} (text models cannot hold names with blanks: "
-            "use a binary one, or rename the photographs)"
-        )
+    for name, count in sorted(names.items()):
+        if count > 1:
+            return (
+                f"two of its images are called {name} (text models cannot hold names with blanks: "
+                "use a binary one, or rename the photographs)"
+            )
+    return ""
+
+
+def _faulty_cameras(model: pycolmap.Reconstruction) -> str:
     for camera_id, camera in sorted(model.cameras.items()):
         if not _is_usable(camera):
             return f"camera {camera_id} has no size, or no finite and positive focal length"
-    if not needs_poses:
-        return ""
-    registered = [model.image(image_id) for image_id in model.reg_image_ids()]
+    return ""
+
+
+def _faulty_poses(model: pycolmap.Reconstruction) -> str:
+    registered = model.reg_image_ids()
     if not registered:
         return "the model has no images with poses"
-    for image in registered:
+    for image_id in registered:
+        image = model.image(image_id)
         if not _is_pose(image.cam_from_world()):
             return f"the pose of {image.name} is not finite, or no rotation"
+    return ""
+
+
+def _faulty_points(model: pycolmap.Reconstruction) -> str:
     for point_id, point in model.points3D.items():
         if not (np.abs(point.xyz) < FAR).all():
             return f"point {point_id} is at no finite place"
@@ -296,11 +338,13 @@ def refuse_panoramas(model: pycolmap.Reconstruction, what: str) -> None:
 
 def _is_usable(camera: pycolmap.Camera) -> bool:
     """Return whether a camera has a size, finite parameters and a focal length, if it has one."""
+    shorter = min(camera.width, camera.height)
+    longer = max(camera.width, camera.height)
+    if shorter <= 0 or longer > MAX_SIDE_PX:
+        return False
     params = np.asarray(camera.params, np.float64)
-    sides = (camera.width, camera.height)
-    has_size = all(0 < side <= MAX_SIDE_PX for side in sides)
     focals = params[list(camera.focal_length_idxs())]
-    return bool(has_size and (np.abs(params) < FAR).all() and (focals > 0.0).all())
+    return bool((np.abs(params) < FAR).all() and (focals > 0.0).all())
 
 
 def _is_pose(pose: pycolmap.Rigid3d) -> bool:
@@ -315,19 +359,26 @@ def num_long_tracks(model: pycolmap.Reconstruction, same_view: Mapping[int, int]
     ``same_view``: of images that show the view of another one, the id of that.
     """
     found = Counter[int]()
-    for images in _long_tracks(model):
-        if len({same_view.get(image_id, image_id) for image_id in images}) > 2:
-            found.update(images)
+    for image_ids in _long_tracks(model):
+        views = {same_view.get(image_id, image_id) for image_id in image_ids}
+        if len(views) > 2:
+            found.update(image_ids)
     return found
 
 
 def all_see_long_tracks(
     model: pycolmap.Reconstruction, image_ids: Iterable[int], least: int
 ) -> bool:
-    """Return whether each of some images sees so many points of three images or more."""
+    """Return whether each of some images sees enough points of three images or more.
+
+    Args:
+        model: any model.
+        image_ids: of the images.
+        least: number of such points that each of them must see.
+    """
     missing = dict.fromkeys(image_ids, least)
-    for images in _long_tracks(model):
-        for image_id in images & missing.keys():
+    for track in _long_tracks(model):
+        for image_id in track & missing.keys():
             missing[image_id] -= 1
             if missing[image_id] <= 0:
                 del missing[image_id]
@@ -362,9 +413,12 @@ def read_poses(model_path: Path) -> Poses:
 
 def model_poses(model: pycolmap.Reconstruction) -> Poses:
     """Return the poses of the registered images of a model."""
-    images = [model.image(image_id) for image_id in model.reg_image_ids()]
-    matrices = {image.name: image.cam_from_world().matrix() for image in images}
-    return {name: (matrix[:, :3], matrix[:, 3]) for name, matrix in matrices.items()}
+    poses: Poses = {}
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        matrix = image.cam_from_world().matrix()
+        poses[image.name] = (matrix[:, :3], matrix[:, 3])
+    return poses
 
 
 def relative_pose(pose1: Pose, pose2: Pose) -> Pose:

@@ -27,10 +27,22 @@ def flat_values(options: Any) -> dict[str, Any]:
 
 
 def differences(options: Any, default: Any, named: Collection[str] = ()) -> dict[str, Plain]:
-    """Return what is ``named``, or differs from options of the same class, by dotted key."""
-    others = _plain_values(default)
-    values = _plain_values(options)
-    return {key: value for key, value in values.items() if key in named or value != others[key]}
+    """Return the plain values of pycolmap's options that are not the usual ones.
+
+    Args:
+        options: of pycolmap.
+        default: options of the same class.
+        named: dotted keys that are returned in any case.
+
+    Returns:
+        Values by dotted key.
+    """
+    usual = _plain_values(default)
+    found = {}
+    for key, value in _plain_values(options).items():
+        if key in named or value != usual[key]:
+            found[key] = value
+    return found
 
 
 def set_values(options: Any, values: Mapping[str, Any]) -> None:
@@ -43,37 +55,54 @@ def set_values(options: Any, values: Mapping[str, Any]) -> None:
 def resolve(
     options: Any, given: Mapping[str, Any], flag: str, owned: Mapping[str, str] = OWNED
 ) -> dict[str, Plain]:
-    """Set values, which may be text, in ``options``; return them by full dotted key.
+    """Set single values of pycolmap's options.
 
-    Of keys sections may be left out where a name exists once. OptionError, which begins with
-    ``flag``, names a key that is unknown, ambiguous, or ``owned``, or has a wrong value.
+    Args:
+        options: of pycolmap, which are changed.
+        given: values, which may be text, by key; sections may be left out of a key where its name
+            exists once.
+        flag: that errors begin with.
+        owned: what to do instead, by the names of options that cannot be changed so.
+
+    Returns:
+        The values that were set, by full dotted key.
+
+    Raises:
+        OptionError: names a key that is unknown, ambiguous or ``owned``, or has a wrong value.
     """
     known = flat_values(options)
-    plain = _plain_values(options)
     keys = {_full_key(text, known, flag): text for text in given}
+    plain = _plain_values(options)
     for key, text in keys.items():
         where = f"{flag} {text}"
-        value = given[text]
-        if reason := owned.get(_name(key)):
-            raise OptionError(f"{where}: cannot be changed here; {reason}")
         kind = type(known[key])
+        name = _name(key)
+        if name in owned:
+            raise OptionError(f"{where}: cannot be changed here; {owned[name]}")
         if key not in plain:
             raise OptionError(f"{where}: cannot be given, it is of type {kind.__name__}")
         try:
-            parsed = _parsed(value, known[key])
-            if _name(key) == "num_threads" and parsed > MAX_NUM_THREADS:
-                raise OptionError(
-                    f"{where}={value}: at most {MAX_NUM_THREADS}, or -1 for all cores"
-                )
+            parsed = _parsed(given[text], known[key])
+            _check_num_threads(name, parsed, where)
             set_values(options, {key: parsed})
         except OptionError:
             raise
         except (TypeError, ValueError, RuntimeError) as error:
-            names = getattr(kind, "__members__", ("true", "false") if kind is bool else ())
-            expected = f"one of {', '.join(names)}" if names else kind.__name__
-            raise OptionError(f"{where}={value}: expected {expected}") from error
+            expected = _expected(kind)
+            raise OptionError(f"{where}={given[text]}: expected {expected}") from error
     taken = _plain_values(options)
     return {key: taken[key] for key in keys}
+
+
+def _check_num_threads(name: str, value: Any, where: str) -> None:
+    if name == "num_threads" and value > MAX_NUM_THREADS:
+        raise OptionError(f"{where}={value}: at most {MAX_NUM_THREADS}, or -1 for all cores")
+
+
+def _expected(kind: type) -> str:
+    """Say which values an option of a type takes."""
+    names = getattr(kind, "__members__", ("true", "false") if kind is bool else ())
+    return f"one of {', '.join(names)}" if names else kind.__name__
 
 
 def _parsed(value: Any, example: Any) -> Any:
@@ -108,7 +137,9 @@ def _name(key: str) -> str:
 
 
 def _full_key(text: str, known: Mapping[str, Any], flag: str) -> str:
-    found = [text] if text in known else [key for key in known if _name(key) == text]
+    if text in known:
+        return text
+    found = [key for key in known if _name(key) == text]
     if len(found) > 1:
         raise OptionError(f"{flag} {text}: exists in several sections; give {' or '.join(found)}")
     if not found:

@@ -26,9 +26,11 @@ def native_writes(path: Path) -> Iterator[None]:
 
 def why_not_written(path: Path, error: Exception) -> Exception:
     """Return the error for a file that pycolmap has not written: the disk is full, or its own."""
-    parent = next(folder for folder in path.absolute().parents if folder.is_dir())
+    folder = path.absolute().parent
+    while not folder.is_dir():
+        folder = folder.parent
     try:
-        require_space(parent / "rest", SPARE_BYTES, path)
+        require_space(folder / "rest", SPARE_BYTES, path)
     except Exception as full:  # noqa: BLE001 - it is returned
         return full
     return cannot_write(path, RuntimeError(reason(error)))

@@ -1,6 +1,7 @@
 """Databases of COLMAP 3.8, which COLMAP up to 3.13 reads; they hold no rigs and frames."""
 
 import sqlite3
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -63,22 +64,42 @@ def _write(source: Path, target: Path, features: FeatureStore | None) -> int:
             fill_descriptors(new, features)
         require_space(target, new.stat().st_size)
         with open_database(new) as database:
-            for camera in database.read_all_cameras():
-                if int(camera.model) > LAST_MODEL:
-                    raise DatabaseError(
-                        f"{source}: camera {camera.camera_id} is of model {camera.model.name}, "
-                        "which COLMAP 3.8 does not know; extract with another --camera-model"
-                    )
-            priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
+            _refuse_new_models(database, source)
+            positions = _positions(database)
         try:
-            with closing(sqlite3.connect(old)) as connection:
-                connection.execute("ATTACH ? AS new", (str(new),))
-                connection.executescript(FILL.read_text(encoding="utf-8"))
-                connection.executemany(
-                    "UPDATE images SET prior_tx = ?, prior_ty = ?, prior_tz = ? WHERE image_id = ?",
-                    [(*prior.position.tolist(), prior.corr_data_id.id) for prior in priors],
-                )
-                connection.commit()
-                return int(connection.execute("SELECT COUNT(*) FROM descriptors").fetchone()[0])
+            return _fill(old, new, positions)
         except sqlite3.Error as error:
             raise cannot_write(target, error) from error
+
+
+def _refuse_new_models(database: pycolmap.Database, source: Path) -> None:
+    """Refuse cameras of models that COLMAP 3.8 does not have."""
+    for camera in database.read_all_cameras():
+        if int(camera.model) > LAST_MODEL:
+            raise DatabaseError(
+                f"{source}: camera {camera.camera_id} is of model {camera.model.name}, which "
+                "COLMAP 3.8 does not know; extract with another --camera-model"
+            )
+
+
+def _positions(database: pycolmap.Database) -> list[tuple[float, float, float, int]]:
+    """Return the positions of the pose priors, each with the id of its image."""
+    positions = []
+    for prior in database.read_all_pose_priors():
+        if prior.has_position():
+            x, y, z = prior.position.tolist()
+            positions.append((x, y, z, prior.corr_data_id.id))
+    return positions
+
+
+def _fill(old: Path, new: Path, positions: Sequence[tuple[float, float, float, int]]) -> int:
+    """Write a database of COLMAP 3.8; return how many images have descriptors."""
+    with closing(sqlite3.connect(old)) as connection:
+        connection.execute("ATTACH ? AS new", (str(new),))
+        connection.executescript(FILL.read_text(encoding="utf-8"))
+        connection.executemany(
+            "UPDATE images SET prior_tx = ?, prior_ty = ?, prior_tz = ? WHERE image_id = ?",
+            positions,
+        )
+        connection.commit()
+        return int(connection.execute("SELECT COUNT(*) FROM descriptors").fetchone()[0])

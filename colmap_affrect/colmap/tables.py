@@ -2,10 +2,9 @@
 
 import hashlib
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,24 +30,15 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
 
     Without a write-ahead log or a journal as immutable: SQLite makes no files beside it then.
     """
-    wal, journal, index = (Path(f"{path}{end}") for end in ("-wal", "-journal", "-shm"))
-    for file in (path, wal, journal, index):
-        try:
-            require_regular(file)
-        except NotAFileError as error:
-            raise OptionError(f"{file}: {error}; give a COLMAP database") from error
-    if not path.is_file():
-        raise OptionError(f"{path}: no such file; give a COLMAP database")
+    wal = Path(f"{path}-wal")
+    journal = Path(f"{path}-journal")
+    _require_regular_files((path, wal, journal, Path(f"{path}-shm")))
     mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
     address = f"{resolved(path).as_uri()}?{mode}"
     try:
         with closing(sqlite3.connect(address, uri=True)) as connection:
             connection.execute("PRAGMA trusted_schema = OFF")  # no code of the file
-            rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-            if missing := TABLES - {name for (name,) in rows}:
-                raise DatabaseError(
-                    f"{path}: not a COLMAP database (it has no table {min(missing)})"
-                )
+            _require_tables(connection, path)
             yield connection
     except DAMAGED as error:
         if journal.exists() and read_regular(journal)[:8] == HOT_JOURNAL:
@@ -58,6 +48,25 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
                 f"may write, e.g. sqlite3 {path.name} .tables"
             ) from error
         raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error
+
+
+def _require_regular_files(paths: Sequence[Path]) -> None:
+    """Refuse a database, the first of some paths, that is missing, and what is no regular file."""
+    for path in paths:
+        try:
+            require_regular(path)
+        except NotAFileError as error:
+            raise OptionError(f"{path}: {error}; give a COLMAP database") from error
+    if not paths[0].is_file():
+        raise OptionError(f"{paths[0]}: no such file; give a COLMAP database")
+
+
+def _require_tables(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse a database of another program."""
+    rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+    missing = TABLES - {name for (name,) in rows}
+    if missing:
+        raise DatabaseError(f"{path}: not a COLMAP database (it has no table {min(missing)})")
 
 
 class Camera(NamedTuple):
@@ -84,64 +93,78 @@ class Tables:
 
     def summary(self) -> str:
         """Return the numbers of what there is."""
-        features = sum(rows for rows, _ in self.keypoints.values())
-        images = len(self.names)
-        cameras = len(self.cameras)
+        num_images = len(self.names)
+        num_cameras = len(self.cameras)
+        num_keypoints = sum(rows for rows, _ in self.keypoints.values())
+        images = "image" if num_images == 1 else "images"
+        cameras = "camera" if num_cameras == 1 else "cameras"
         return (
-            f"{images} image{'s' * (images != 1)}, {cameras} camera{'s' * (cameras != 1)}, "
-            f"{features} keypoints, {self.num_matched} matched and {self.num_verified} verified "
-            "pairs"
+            f"{num_images} {images}, {num_cameras} {cameras}, {num_keypoints} keypoints, "
+            f"{self.num_matched} matched and {self.num_verified} verified pairs"
         )
 
 
 def read_tables(connection: sqlite3.Connection) -> Tables:
     """Read all tables but the data of keypoints, descriptors and matches."""
-    rows = partial(rows_of, connection)
-    images = list(rows("image_id name camera_id", "images"))
-    cameras = rows("camera_id width height model params", "cameras")
+    images = list(rows_of(connection, "image_id name camera_id", "images"))
+    cameras = {}
+    rows = rows_of(connection, "camera_id width height model params", "cameras")
+    for camera_id, width, height, model, params in rows:
+        cameras[int(camera_id)] = Camera(int(width), int(height), int(model), params)
+    frame_images = set[int]()
+    for image_id, kind in rows_of(connection, "data_id sensor_type", "frame_data"):
+        if kind == SENSOR_CAMERA:
+            frame_images.add(int(image_id))
+    num_frames = len(list(rows_of(connection, "frame_id", "frames")))
+    sizes = rows_of(connection, "image_id rows cols", "keypoints")
     return Tables(
-        cameras={
-            int(key): Camera(int(width), int(height), int(model), params)
-            for key, width, height, model, params in cameras
-        },
-        names={int(key): str(name) for key, name, _ in images},
-        camera_ids={int(key): int(camera_id) for key, _, camera_id in images},
-        frame_images={
-            int(key)
-            for key, kind in rows("data_id sensor_type", "frame_data")
-            if kind == SENSOR_CAMERA
-        },
-        num_frames=sum(1 for _ in rows("frame_id", "frames")),
-        keypoints={
-            int(key): (int(count), int(columns))
-            for key, count, columns in rows("image_id rows cols", "keypoints")
-        },
-        num_matched=sum(int(count) > 0 for (count,) in rows("rows", "matches")),
-        num_verified=sum(int(count) > 0 for (count,) in rows("rows", "two_view_geometries")),
+        cameras=cameras,
+        names={int(image_id): str(name) for image_id, name, _ in images},
+        camera_ids={int(image_id): int(camera_id) for image_id, _, camera_id in images},
+        frame_images=frame_images,
+        num_frames=num_frames,
+        keypoints={int(image_id): (int(rows), int(columns)) for image_id, rows, columns in sizes},
+        num_matched=_num_with_rows(connection, "matches"),
+        num_verified=_num_with_rows(connection, "two_view_geometries"),
     )
 
 
-def rows_of(connection: sqlite3.Connection, columns: str, table: str) -> Iterable[tuple[Any, ...]]:
-    """Return columns of a table, row by row; nothing if there is no such table.
+def _num_with_rows(connection: sqlite3.Connection, table: str) -> int:
+    """Return how many pairs of a table of matches have some."""
+    return sum(int(count) > 0 for (count,) in rows_of(connection, "rows", table))
 
-    Names of columns have spaces between; those that the table lacks are 0.
+
+def rows_of(connection: sqlite3.Connection, columns: str, table: str) -> Iterable[tuple[Any, ...]]:
+    """Return columns of a table, row by row.
+
+    Args:
+        connection: to the database.
+        columns: names with spaces between; those that the table lacks are 0.
+        table: of COLMAP.
+
+    Returns:
+        The rows; nothing if there is no such table.
     """
     known = columns_of(connection, table)
     if not known:
         return ()
-    present = ", ".join(name if name in known | {"rowid"} else "0" for name in columns.split())
-    # All names are those of COLMAP's tables, written down in this package.
-    return connection.execute(f"SELECT {present} FROM {table}")  # noqa: S608
+    known.add("rowid")
+    present = ", ".join(name if name in known else "0" for name in columns.split())
+    return connection.execute(f"SELECT {present} FROM {table}")  # noqa: S608 - names that this package has written down
 
 
 def rows_digest(path: Path) -> str:
     """Return a SHA-256 of all rows but descriptors; DatabaseError where they cannot be read."""
+    tables = ", ".join(f"'{table}'" for table in DIGESTED)
+    queries = [
+        "* FROM pragma_user_version",
+        f"sql FROM sqlite_master WHERE tbl_name IN ({tables}) ORDER BY name",
+    ]
+    for table in DIGESTED:
+        queries.append(f"* FROM {table}")
     digest = hashlib.sha256()
     with open_read_only(path) as connection:
         connection.text_factory = bytes
-        names = ", ".join(f"'{table}'" for table in DIGESTED)
-        made = f"sql FROM sqlite_master WHERE tbl_name IN ({names}) ORDER BY name"
-        queries = ["* FROM pragma_user_version", made, *(f"* FROM {name}" for name in DIGESTED)]
         for query in queries:
             for row in connection.execute(f"SELECT {query}"):
                 for value in row:

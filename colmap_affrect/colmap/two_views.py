@@ -4,6 +4,7 @@ All points are in COLMAP's pixels: (0, 0) is the corner of the image.
 """
 
 import math
+from typing import TypeGuard
 
 import cv2
 import numpy as np
@@ -40,26 +41,54 @@ MIN_TRANSLATION = 1e-9  # of a decomposed homography, in units of the distance o
 def pair_model(
     geometry: pycolmap.TwoViewGeometry, cameras: Cameras, keypoints: Keypoints
 ) -> PairModel | None:
-    """Return what keypoints, twice (M, 2 or more), can be tested with; None of a watermark.
+    """Return what the keypoints of a pair can be tested with.
 
     The epipolar geometry of calibrated pairs holds in pixels without distortion.
+
+    Args:
+        geometry: of the pair.
+        cameras: of the two images.
+        keypoints: (M, 2 or more) of each image, in COLMAP's px; those of a row match.
+
+    Returns:
+        The model; None of a watermark, and of a geometry without matrices.
     """
-    points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
+    points = _positions(keypoints)
     if geometry.config in PLANAR and geometry.H is not None:
-        return HomographyModel(np.asarray(geometry.H, np.float64), (points1, points2))
+        return HomographyModel(np.asarray(geometry.H, np.float64), points)
     if geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
         return None
+    return _epipolar_model(geometry, cameras, points)
+
+
+def _epipolar_model(
+    geometry: pycolmap.TwoViewGeometry, cameras: Cameras, points: tuple[Array, Array]
+) -> EpipolarModel | None:
+    """Return the epipolar geometry of a pair, by its essential matrix where it is calibrated."""
+    is_calibrated = geometry.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
     essential = geometry.E
     fundamental = geometry.F
-    is_calibrated = geometry.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
-    if is_calibrated and essential is not None and np.any(essential):
-        matrices = [camera.calibration_matrix() for camera in cameras]
-        fundamental = np.linalg.inv(matrices[1]).T @ essential @ np.linalg.inv(matrices[0])
-        points1, points2 = map(undistorted, cameras, (points1, points2))
-    if fundamental is None or not np.any(fundamental):
+    if is_calibrated and _is_given(essential):
+        matrix1 = cameras[0].calibration_matrix()
+        matrix2 = cameras[1].calibration_matrix()
+        fundamental = np.linalg.inv(matrix2).T @ essential @ np.linalg.inv(matrix1)
+        points = (undistorted(cameras[0], points[0]), undistorted(cameras[1], points[1]))
+    if not _is_given(fundamental):
         return None
     sample_size = 5 if geometry.config == CALIBRATED else 7
-    return EpipolarModel(np.asarray(fundamental, np.float64), (points1, points2), sample_size)
+    return EpipolarModel(np.asarray(fundamental, np.float64), points, sample_size)
+
+
+def _is_given(matrix: Array | None) -> TypeGuard[Array]:
+    """Tell whether a geometry has a matrix; one of zeros is none."""
+    return matrix is not None and bool(np.any(matrix))
+
+
+def _positions(keypoints: Keypoints) -> tuple[Array, Array]:
+    """Return the (M, 2) positions of the keypoints of two images."""
+    points1 = np.asarray(keypoints[0][:, :2], np.float64)
+    points2 = np.asarray(keypoints[1][:, :2], np.float64)
+    return points1, points2
 
 
 def undistorted(camera: pycolmap.Camera, points: Array) -> Array:
@@ -73,21 +102,22 @@ def undistorted(camera: pycolmap.Camera, points: Array) -> Array:
 
 def decomposed_homography(homography: Array, cameras: Cameras) -> list[Pose]:
     """Return the relative poses, |t| = 1, that a homography of px allows; none of a rotation."""
-    matrix1, matrix2 = (np.asarray(c.calibration_matrix(), np.float64) for c in cameras)
+    matrix1 = np.asarray(cameras[0].calibration_matrix(), np.float64)
+    matrix2 = np.asarray(cameras[1].calibration_matrix(), np.float64)
     normalized = np.linalg.inv(matrix2) @ homography @ matrix1
     _, rotations, translations, _ = cv2.decomposeHomographyMat(normalized, np.eye(3))
-    lengths = [float(np.linalg.norm(translation)) for translation in translations]
-    return [
-        (np.asarray(rotation, np.float64), np.asarray(translation, np.float64).ravel() / length)
-        for rotation, translation, length in zip(rotations, translations, lengths, strict=True)
-        if length > MIN_TRANSLATION
-    ]
+    poses = []
+    for turn, translation in zip(rotations, translations, strict=True):
+        length = float(np.linalg.norm(translation))
+        if length > MIN_TRANSLATION:
+            direction = np.asarray(translation, np.float64).ravel() / length
+            poses.append((np.asarray(turn, np.float64), direction))
+    return poses
 
 
 def homography_matrix(geometry: pycolmap.TwoViewGeometry) -> Array | None:
     """Return the (3, 3) homography of a geometry, None where there is none."""
-    has_one = geometry.H is not None and np.any(geometry.H)
-    return np.asarray(geometry.H, np.float64) if has_one else None
+    return np.asarray(geometry.H, np.float64) if _is_given(geometry.H) else None
 
 
 def significance(
@@ -95,8 +125,15 @@ def significance(
 ) -> float:
     """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
 
-    It is infinite for a watermark, which cannot be tested. ``keypoints`` are those of the raw
-    matches: twice (M, 2, 4 or 6); of 2 columns positions count alone.
+    Args:
+        geometry: of the pair.
+        cameras: of the two images.
+        keypoints: of the raw matches, (M, 2, 4 or 6) of each image as in the database; those of a
+            row match. Of 2 columns positions count alone.
+        max_error_px: largest error of an inlier.
+
+    Returns:
+        The logarithm; infinite for a watermark, which cannot be tested.
     """
     with np.errstate(all="ignore"):  # points that a camera cannot undistort are no inliers
         model = pair_model(geometry, cameras, keypoints)
@@ -107,7 +144,8 @@ def significance(
         hits = model.errors(*random_matches(len(rows))) <= max_error_px
         chance = max(float(hits.mean()), 1.0 / len(hits))
         alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
-        first, second = map(_telling_shapes, keypoints)
+        first = _telling_shapes(keypoints[0])
+        second = _telling_shapes(keypoints[1])
         if math.isinf(alarms) or first is None or second is None:
             return -alarms
         return _frame_evidence(model, inliers, (first, second)) - alarms
@@ -130,13 +168,13 @@ def _telling_shapes(keypoints: Floats) -> Array | None:
 
 def _frame_evidence(model: PairModel, inliers: Indices, shapes: tuple[Array, Array]) -> float:
     """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
-    cosines = model.cosines(inliers, inliers, shapes)
-    first, second = random_matches(len(inliers))
-    by_chance = model.cosines(inliers[first], inliers[second], shapes)
     limit = math.cos(math.radians(MAX_FRAME_ANGLE_DEG))
     signs = (1.0, -1.0) if model.has_sign else (1.0,)
-    chance = max(float((by_chance * sign >= limit).mean()) for sign in signs)
-    chance = min(max(chance, CHANCE_OF_AGREEMENT), MAX_CHANCE)
+    first, second = random_matches(len(inliers))
+    by_chance = model.cosines(inliers[first], inliers[second], shapes)
+    larger = max([float((by_chance * sign >= limit).mean()) for sign in signs])
+    chance = min(max(larger, CHANCE_OF_AGREEMENT), MAX_CHANCE)
+    cosines = model.cosines(inliers, inliers, shapes)
     sign = common_sign(cosines) if model.has_sign else 1.0
     num_agreeing = int(np.count_nonzero(cosines * sign >= limit))
     # The better of two signs: chance has two tries.

@@ -1,9 +1,9 @@
 """Geometric verification of raw matches by pycolmap, and its significance."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.two_views import significance
+from colmap_affrect.colmap.two_views import Cameras, Keypoints, significance
 from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.geometry.parallax import text_line_matches
@@ -22,7 +22,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 T = TypeVar("T", int, str)
 Names = tuple[str, str]
-Frames = tuple[Floats, Floats]  # (N, 2, 3) of each image of a pair, in pixel-centre px
+Frames = tuple[Floats, Floats]  # (N, 2, 3) LAFs of each image of a pair, in pixel-centre px
 Matches = NDArray[np.integer]  # (M, 2), rows of the features of each image of a pair
 
 PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many
@@ -96,41 +96,76 @@ def estimate_geometry(
     options: VerificationOptions,
     extracted_px: int | None = None,
 ) -> pycolmap.TwoViewGeometry:
-    """Return the two-view geometry of (M, 2) raw matches; an empty one if it is rejected.
+    """Return the two-view geometry of raw matches; an empty one if it is rejected.
 
-    The side of the smaller id comes first. ``extracted_px`` is the longest side that photographs
-    were shrunk to before extraction, if any. Matches of writing are left out where they are many.
+    Matches of writing are left out where they are many.
+
+    Args:
+        sides: the two images, that of the smaller id first.
+        matches: (M, 2) numbers of keypoints.
+        options: of verification.
+        extracted_px: longest side that photographs were shrunk to before extraction, if any.
     """
     cameras = (sides[0].camera, sides[1].camera)
-    matched = (sides[0].keypoints[matches[:, 0]], sides[1].keypoints[matches[:, 1]])
-    rows = np.stack([np.arange(len(matches), dtype=np.uint32)] * 2, axis=1)
     chosen = options.changed(max_error_px=max_error_px(cameras, options, extracted_px))
-    points1, points2 = (keypoints[:, :2].astype(np.float64) for keypoints in matched)
-    geometry = pycolmap.estimate_two_view_geometry(
-        cameras[0], points1, cameras[1], points2, rows, two_view_options(chosen)
-    )
-    min_num_inliers = max(options.min_num_inliers, options.min_inlier_ratio * len(matches))
-    # Of a geometry that it rejects the estimator returns the inliers all the same.
-    if geometry.config in REJECTED or len(geometry.inlier_matches) < min_num_inliers:
+    matched = (sides[0].keypoints[matches[:, 0]], sides[1].keypoints[matches[:, 1]])
+    geometry = _significant_geometry(cameras, matched, chosen)
+    if geometry is None:
         return pycolmap.TwoViewGeometry()
-
-    def is_chance(found: pycolmap.TwoViewGeometry) -> bool:
-        of_chance = significance(found, cameras, matched, chosen.max_error_px)
-        return of_chance < options.min_significance
-
-    if options.min_significance and is_chance(geometry):
-        geometry = _planar_geometry(geometry, (points1, points2), chosen)
-        if len(geometry.inlier_matches) < min_num_inliers or is_chance(geometry):
-            return pycolmap.TwoViewGeometry()
     inliers = np.asarray(geometry.inlier_matches)[:, 0]
     if options.min_significance:
-        sizes = [(camera.width, camera.height) for camera in cameras]
-        written = text_line_matches(points1[inliers], points2[inliers], (sizes[0], sizes[1]))
+        points = (_positions(matched[0])[inliers], _positions(matched[1])[inliers])
+        written = text_line_matches(*points, (_size(cameras[0]), _size(cameras[1])))
         if written.mean() > MAX_WRITTEN_SHARE:
             scene = np.delete(matches, inliers[written], axis=0)
             return estimate_geometry(sides, scene, options, extracted_px)
     geometry.inlier_matches = matches.astype(np.uint32)[inliers]
     return geometry
+
+
+def _significant_geometry(
+    cameras: Cameras, keypoints: Keypoints, options: VerificationOptions
+) -> pycolmap.TwoViewGeometry | None:
+    """Return the two-view geometry of keypoints, of which those of a row match.
+
+    Its inliers are rows, twice. None where there are too few of them, or chance made them.
+    """
+    num_matches = len(keypoints[0])
+    rows = _twice(np.arange(num_matches, dtype=np.uint32))
+    points = (_positions(keypoints[0]), _positions(keypoints[1]))
+    geometry = pycolmap.estimate_two_view_geometry(
+        cameras[0], points[0], cameras[1], points[1], rows, two_view_options(options)
+    )
+    min_num_inliers = max(options.min_num_inliers, options.min_inlier_ratio * num_matches)
+    # Of a geometry that it rejects the estimator returns the inliers all the same.
+    if geometry.config in REJECTED or len(geometry.inlier_matches) < min_num_inliers:
+        return None
+
+    def is_chance(found: pycolmap.TwoViewGeometry) -> bool:
+        of_chance = significance(found, cameras, keypoints, options.max_error_px)
+        return of_chance < options.min_significance
+
+    if not options.min_significance or not is_chance(geometry):
+        return geometry
+    planar = _planar_geometry(geometry, points, options)
+    if len(planar.inlier_matches) < min_num_inliers or is_chance(planar):
+        return None
+    return planar
+
+
+def _positions(keypoints: Floats) -> Array:
+    """Return the (N, 2) positions of (N, 2, 4 or 6) keypoints."""
+    return keypoints[:, :2].astype(np.float64)
+
+
+def _size(camera: pycolmap.Camera) -> tuple[int, int]:
+    """Return (width, height) of the images of a camera in px."""
+    return camera.width, camera.height
+
+
+def _twice(rows: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return (N,) rows as (N, 2) matches of each with itself."""
+    return np.stack([rows, rows], axis=1)
 
 
 def _planar_geometry(
@@ -152,18 +187,24 @@ def _planar_geometry(
     planar.H = found["H"]
     with np.errstate(all="ignore"):  # points on the horizon are no inliers
         inliers = np.flatnonzero(homography_errors(planar.H, *points) <= options.max_error_px)
-    planar.inlier_matches = np.stack([inliers.astype(np.uint32)] * 2, axis=1)
+    planar.inlier_matches = _twice(inliers.astype(np.uint32))
     return planar
 
 
 def max_error_px(
     cameras: Sequence[pycolmap.Camera], options: VerificationOptions, extracted_px: int | None
 ) -> float:
-    """Return the threshold of a pair in px of the stored images, the mean of its two."""
+    """Return the largest error of an inlier of a pair, in px of the stored images.
+
+    Args:
+        cameras: of the two images; the mean of their thresholds counts.
+        options: of verification.
+        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+    """
     if not (options.scale_max_error and extracted_px):
         return options.max_error_px
-    sides = [max(camera.width, camera.height) / extracted_px for camera in cameras]
-    return options.max_error_px * float(np.mean(np.maximum(sides, 1.0)))
+    scales = [max(camera.width, camera.height) / extracted_px for camera in cameras]
+    return options.max_error_px * float(np.mean(np.maximum(scales, 1.0)))
 
 
 ExtractedPx = int | Mapping[tuple[int, int], int] | None
@@ -175,8 +216,21 @@ def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
     return extracted_px.get(ids) if isinstance(extracted_px, Mapping) else extracted_px
 
 
-_Task = tuple[tuple[int, int], tuple[Side, Side], Matches]  # ids, images, raw matches
-_Done = tuple[tuple[int, int], pycolmap.TwoViewGeometry]
+@dataclass(frozen=True)
+class _Task:
+    """A pair to verify."""
+
+    image_ids: tuple[int, int]
+    sides: tuple[Side, Side]
+    matches: Matches  # raw
+
+
+@dataclass(frozen=True)
+class _Done:
+    """A pair that is verified, or rejected."""
+
+    image_ids: tuple[int, int]
+    geometry: pycolmap.TwoViewGeometry
 
 
 def verify(
@@ -230,21 +284,26 @@ def verify_pairs(
         keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
         return Side(cameras[image_id], keypoints)
 
-    def estimate(task: _Task) -> _Done:
-        ids, sides, matches = task
-        return ids, estimate_geometry(sides, matches, options, of_pair(extracted_px, ids))
+    def tasks() -> Iterator[_Task]:
+        for image_id1, image_id2 in pairs:
+            sides = (side(image_id1), side(image_id2))
+            matches = _each_once(database.read_matches(image_id1, image_id2))
+            yield _Task((image_id1, image_id2), sides, matches)
 
-    tasks = (
-        ((one, two), (side(one), side(two)), _each_once(database.read_matches(one, two)))
-        for one, two in map(tuple, pairs)
-    )
-    found = map_ordered(estimate, tasks, available_cores())
-    while batch := list(islice(found, PAIRS_PER_WRITE)):
+    def estimate(task: _Task) -> _Done:
+        size_px = of_pair(extracted_px, task.image_ids)
+        geometry = estimate_geometry(task.sides, task.matches, options, size_px)
+        return _Done(task.image_ids, geometry)
+
+    found = map_ordered(estimate, tasks(), available_cores())
+    batch = list(islice(found, PAIRS_PER_WRITE))
+    while batch:
         with pycolmap.DatabaseTransaction(database):
-            for ids, geometry in batch:
-                database.write_two_view_geometry(*ids, geometry)
+            for done in batch:
+                database.write_two_view_geometry(*done.image_ids, done.geometry)
         if advance:
             advance(len(batch))
+        batch = list(islice(found, PAIRS_PER_WRITE))
 
 
 def _each_once(matches: Matches) -> Matches:
@@ -277,33 +336,53 @@ class PairVerifier:
         self._extracted_px = extracted_px
 
     def inliers(self, names: Names, frames: Frames, indices: Matches) -> Indices:
-        """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected."""
+        """Return the matches that the two-view geometry of a pair explains.
+
+        Args:
+            names: of the two images, in any order.
+            frames: (N, 2, 3) local affine frames of each, in pixel-centre px.
+            indices: (M, 2) raw matches, in the order of ``names``.
+
+        Returns:
+            (K, 2) of these matches; none if the geometry is rejected.
+        """
         geometry = self.geometry(names, frames, indices)
         found = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
         return found if self._ids[names[0]] < self._ids[names[1]] else found[:, ::-1]
 
     def geometry(self, names: Names, frames: Frames, indices: Matches) -> pycolmap.TwoViewGeometry:
-        """Return the geometry of the same from the image with the lower id; empty if rejected."""
-        ids = self._ids[names[0]], self._ids[names[1]]
-        first, second = (
-            Side(self._cameras[name], colmap_database.colmap_keypoints(lafs))
-            for name, lafs in zip(names, frames, strict=True)
-        )
+        """Return the two-view geometry of a pair, from the image with the lower id.
+
+        Args:
+            names: of the two images, in any order.
+            frames: (N, 2, 3) local affine frames of each, in pixel-centre px.
+            indices: (M, 2) raw matches, in the order of ``names``.
+
+        Returns:
+            The geometry; an empty one if it is rejected.
+        """
+        ids = (self._ids[names[0]], self._ids[names[1]])
+        sides = (self._side(names[0], frames[0]), self._side(names[1], frames[1]))
         if ids[0] > ids[1]:
-            ids, first, second, indices = ids[::-1], second, first, indices[:, ::-1]
+            ids = (ids[1], ids[0])
+            sides = (sides[1], sides[0])
+            indices = indices[:, ::-1]
         size_px = of_pair(self._extracted_px, ids)
-        return estimate_geometry((first, second), indices, self._options, size_px)
+        return estimate_geometry(sides, indices, self._options, size_px)
+
+    def _side(self, name: str, lafs: Floats) -> Side:
+        return Side(self._cameras[name], colmap_database.colmap_keypoints(lafs))
 
 
 def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:
     """Return the number of inliers of each verified pair of image ids."""
     with colmap_database.open_database(path) as database:
         pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    return {
-        pycolmap.pair_id_to_image_pair(pair_id): int(count)
-        for pair_id, count in zip(pair_ids, counts, strict=True)
-        if count >= min_num_inliers
-    }
+    found = {}
+    for pair_id, count in zip(pair_ids, counts, strict=True):
+        if count >= min_num_inliers:
+            found[pycolmap.pair_id_to_image_pair(pair_id)] = int(count)
+    return found
 
 
 def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
@@ -318,20 +397,23 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     """Return, smaller image first, the pairs that alone tie two parts of two images or more."""
     graph: networkx.Graph[T] = networkx.Graph()
     graph.add_edges_from(pairs)
-    return [(min(p), max(p)) for p in networkx.bridges(graph) if min(map(graph.degree, p)) > 1]
+    found = []
+    for first, second in networkx.bridges(graph):
+        if graph.degree(first) > 1 and graph.degree(second) > 1:
+            found.append((min(first, second), max(first, second)))
+    return found
 
 
 def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
     """Return how many features of each image, of (M, 2) by pair, are in tracks of three or more."""
-    images = sorted({image for pair in matches for image in pair})
+    images = sorted(set(chain.from_iterable(matches)))
     number = {image: index for index, image in enumerate(images)}
-    ends: list[Indices] = [
-        (number[pair[side]] << 32) + indices[:, side]
-        for side in (0, 1)
-        for pair, indices in matches.items()
-    ]
+    ends = [np.zeros(0, np.int64)]  # features of first images, then of second ones
+    for side in (0, 1):
+        for pair, indices in matches.items():
+            ends.append((number[pair[side]] << 32) + indices[:, side])
     features, index, num_matches = np.unique(
-        np.concatenate([np.zeros(0, np.int64), *ends]), return_inverse=True, return_counts=True
+        np.concatenate(ends), return_inverse=True, return_counts=True
     )
     first, second = index.reshape(2, -1)
     is_shared = num_matches > 1
@@ -349,4 +431,5 @@ def weakly_connected_images(
 
     Mappers register images by features that two others have triangulated already.
     """
-    return {name for name, count in num_in_tracks(matches).items() if count < min_num_features}
+    counts = num_in_tracks(matches)
+    return {name for name, count in counts.items() if count < min_num_features}

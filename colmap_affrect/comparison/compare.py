@@ -20,9 +20,10 @@ from colmap_affrect.comparison.worker import run_alone
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.options import digest_of, require_bools, takes_fields_of
+from colmap_affrect.options import digest_of, takes_fields_of
 from colmap_affrect.pairs.lists import Pair, PairOptions, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import GivenProgress, Progress, show
+from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.record import content_of

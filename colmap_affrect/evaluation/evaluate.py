@@ -29,9 +29,10 @@ from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
-from colmap_affrect.options import Options, digest_of, require_bools, takes_fields_of
+from colmap_affrect.options import Options, digest_of, takes_fields_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import GivenProgress, Progress, Stopwatch
+from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.paths import PathLike, as_path, resolved

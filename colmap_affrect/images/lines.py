@@ -7,7 +7,9 @@ import numpy as np
 
 from colmap_affrect.data import GrayImage, Mask
 from colmap_affrect.geometry.arrays import Bools, Floats
-from colmap_affrect.geometry.lines import Segments
+from colmap_affrect.geometry.conventions import colmap_from_pixel
+from colmap_affrect.geometry.lines import Lines, measure_lines
+from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.images.reading import shrink_to
 
 MAX_SIZE_PX = 1024  # longest side that photographs are shrunk to: lines stay, and grain goes
@@ -16,12 +18,22 @@ BORDER = 0.025  # longer sides; segments along the image's border and closer are
 ALONG = 0.05  # rad, of a segment that runs along the border
 
 
+def lines_of(image: GrayImage, mask: Mask | None = None) -> Lines:
+    """Return the straight lines of a photograph and what they say of its camera.
+
+    Args:
+        image: (H, W) gray values.
+        mask: (H', W') where segments may be; None: everywhere.
+    """
+    return measure_lines(segments_of(image, mask))
+
+
 def segments_of(image: GrayImage, mask: Mask | None = None) -> Segments:
     """Find the straight segments of a photograph, without frames at its border.
 
     Args:
         image: (H, W) gray values.
-        mask: (H, W) where segments may be; None: everywhere.
+        mask: (H', W') where segments may be; None: everywhere.
 
     Returns:
         The longest segments.
@@ -57,6 +69,6 @@ def _in_mask(ends: Floats, mask: Mask, size: tuple[int, int]) -> Bools:
     """Return which (N, 4) segments have their middle where the mask allows."""
     middles = (ends[:, :2] + ends[:, 2:]) / 2.0
     scale = np.array([mask.shape[1], mask.shape[0]]) / size
-    places = np.floor((middles + 0.5) * scale).astype(np.int64)
+    places = np.floor(colmap_from_pixel(middles) * scale).astype(np.int64)
     places = np.clip(places, 0, [mask.shape[1] - 1, mask.shape[0] - 1])
     return mask[places[:, 1], places[:, 0]]

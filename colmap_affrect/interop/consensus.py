@@ -15,7 +15,16 @@ FAR_BEYOND = 10.0  # times how far three places spread is the fourth, if these a
 
 
 def residuals(new_from_old: pycolmap.Sim3d, before: Array, after: Array) -> Array:
-    """Return how far (N, 3) places are from where they should be, (N,)."""
+    """Return how far points are from where a similarity moves them.
+
+    Args:
+        new_from_old: the similarity.
+        before: (N, 3) points that it moves.
+        after: (N, 3) points where they should be.
+
+    Returns:
+        (N,) distances, in the unit of ``after``.
+    """
     moved = np.array([new_from_old * point for point in before])
     return np.asarray(np.linalg.norm(moved - after, axis=1))
 
@@ -58,6 +67,6 @@ def agreeing(before: Array, after: Array, floor: float) -> Bools:
 def _triples(count: int) -> list[list[int]]:
     """Return triples of different numbers below ``count``: all, or as many by chance."""
     if math.comb(count, 3) <= MAX_NUM_TRIPLES:
-        return [list(triple) for triple in itertools.combinations(range(count), 3)]
+        return list(map(list, itertools.combinations(range(count), 3)))
     rng = np.random.default_rng(0)
     return [rng.choice(count, 3, replace=False).tolist() for _ in range(MAX_NUM_TRIPLES)]

@@ -5,7 +5,7 @@ import io
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
 from colmap_affrect.images.orientation import forget_orientation
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.interop.camera_models import with_camera_model
-from colmap_affrect.interop.finished_models import read_finished_model
+from colmap_affrect.interop.finished_models import read_finished_model, stand_upright
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.argument_types import checks_arguments
@@ -37,6 +37,8 @@ logger = logging.getLogger(__name__)
 USUAL = ("ply", "text", "cameras")  # formats that need no photographs
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
+UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright
+MEAN_DISTANCE_IN_CUBES = 1.32  # of cameras from the middle, as instant-ngp's converter has it
 FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL and nerfstudio
 
 
@@ -47,10 +49,11 @@ class Source:
     path: Path  # folder of the model
     model: pycolmap.Reconstruction  # its content
     image_path: Path | None  # folder of the photographs; None if it is not known
+    is_upright: bool = False  # whether z is known to point up
 
     def images(self) -> list[pycolmap.Image]:
         """Return the registered images by name."""
-        images = (self.model.image(image_id) for image_id in self.model.reg_image_ids())
+        images = map(self.model.image, self.model.reg_image_ids())
         return sorted(images, key=lambda image: str(image.name))
 
 
@@ -66,7 +69,8 @@ def export(
 ) -> dict[str, Path]:
     """Write a COLMAP model in some formats.
 
-    The output folder is made if missing; nothing in it is overwritten.
+    The output folder is made if missing; nothing in it is overwritten. Where straight lines of
+    several photographs agree on what is upright, models of runs are turned so that z is up.
 
     Args:
         model_path: folder of a model, or the output folder of a run, whose largest model it is.
@@ -75,7 +79,7 @@ def export(
             ``USUAL``, without text where COLMAP could not read it back.
         image_path: the photographs to undistort, by default those of the run.
         camera_model: of ``text`` and ``cameras``, fitted to the cameras; empty: their own.
-        note: is told how well that fits.
+        note: is told how well that fits, and whether the model was turned.
 
     Returns:
         What was written, by format.
@@ -87,22 +91,38 @@ def export(
     output_path = as_path(output_path, "output_path")
     image_path = as_path_or_none(image_path, "image_path")
     formats = _checked_formats(formats)
-    if image_path is not None and not image_path.is_dir():
-        raise OptionError(f"--image-path {image_path}: no such folder")
-    photographs = image_path or Workspace(resolved(model_path).parent.parent).photographs()
-    source = Source(model_path, read_finished_model(model_path), photographs)
+    source = _source(model_path, image_path)
+    upright = stand_upright(model_path, source.model)
+    if upright:
+        source = replace(source, is_upright=True)
+        note(f"upright     {upright}: z is up")
     if not formats:
         formats = _usual(source)
     if camera_model:
         _change_cameras(source.model, camera_model, formats, note)
-    chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
-    names = dict.fromkeys(made for _, made in chosen.values())
-    targets = [output_path / name for name in names]
-    images = [image.name for image in source.images()]
-    with new_results(*targets, names=images) as made:
+    return _write(source, output_path, formats)
+
+
+def _source(model_path: Path, image_path: Path | None) -> Source:
+    """Read what is exported; the photographs are by default those of the run."""
+    if image_path is not None and not image_path.is_dir():
+        raise OptionError(f"--image-path {image_path}: no such folder")
+    photographs = image_path or Workspace(resolved(model_path).parent.parent).photographs()
+    return Source(model_path, read_finished_model(model_path), photographs)
+
+
+def _write(source: Source, output_path: Path, formats: Sequence[str]) -> dict[str, Path]:
+    """Write formats into a folder, all or none; return what was written by format."""
+    chosen = [name for name in FORMATS if name in formats]  # in the order in which they are made
+    targets = dict.fromkeys(output_path / FORMATS[name].leaves for name in chosen)
+    photographs = [image.name for image in source.images()]
+    written = {}
+    with new_results(*targets, names=photographs) as made:
         folder = made[0].parent
-        written = {name: write(source, folder) for name, (write, _) in chosen.items()}
-    return {name: output_path / path.relative_to(folder) for name, path in written.items()}
+        for name in chosen:
+            path = FORMATS[name].write(source, folder)
+            written[name] = output_path / path.relative_to(folder)
+    return written
 
 
 def _checked_formats(given: str | Sequence[str]) -> list[str]:
@@ -119,11 +139,13 @@ def _change_cameras(
     if not {"text", "cameras"}.intersection(formats):
         raise OptionError("--camera-model: changes 'text' and 'cameras'; give one of these formats")
     refuse_panoramas(model, "--camera-model")
-    before = {key: camera.model_name for key, camera in model.cameras.items()}
-    differences_px = with_camera_model(model, name)
-    for old in sorted({before[key] for key in differences_px}):
-        largest = max(px for key, px in differences_px.items() if before[key] == old)
-        note(f"cameras: {name} in the place of {old}, at most {largest:.3f} px apart")
+    before = {camera_id: camera.model_name for camera_id, camera in model.cameras.items()}
+    largest_px: dict[str, float] = {}  # by the model that cameras had
+    for camera_id, difference_px in with_camera_model(model, name).items():
+        old = before[camera_id]
+        largest_px[old] = max(difference_px, largest_px.get(old, 0.0))
+    for old, difference_px in sorted(largest_px.items()):
+        note(f"cameras: {name} in the place of {old}, at most {difference_px:.3f} px apart")
 
 
 def _points(source: Source, folder: Path) -> Path:
@@ -135,7 +157,8 @@ def _points(source: Source, folder: Path) -> Path:
 
 def _text(source: Source, folder: Path) -> Path:
     path = folder / "text"
-    if why := _why_no_text(source):
+    why = _why_no_text(source)
+    if why:
         raise OptionError(
             f"text: {why}; rename the photographs and run again, or leave that format out and use "
             "the binary model as it is"
@@ -179,28 +202,33 @@ def _not_in_text(name: str) -> str:
 def _undistorted(source: Source, folder: Path) -> Path:
     """Write undistorted photographs with their model, ready for COLMAP's patch_match_stereo."""
     path = folder / DENSE
-    photographs = source.image_path
     refuse_panoramas(source.model, "undistorted photographs")
-    if photographs is None:
+    if source.image_path is None:
         raise OptionError("--image-path: give the folder of the photographs, to undistort them")
+    _check_photographs(source, source.image_path)
+    given = folder.parent / "model"  # a run may remove that of its folder meanwhile
+    if not given.exists():
+        write_model(source.model, given)
+    undistort(path, given, source.image_path)
+    for image in source.images():
+        picture = path / "images" / image.name
+        if not picture.is_file():
+            raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
+        forget_orientation(picture)  # COLMAP takes over EXIF, by which others would turn it
+    return path
+
+
+def _check_photographs(source: Source, image_path: Path) -> None:
+    """Refuse names that lead out of the folder, and photographs that are missing, or others."""
     for image in source.images():
         if leads_outside(image.name):
             raise OptionError(
                 f"{source.path}: the image name {image.name} leads out of the folder of the "
                 "photographs; rename it, no undistorted picture can be written for it"
             )
-        if not (photographs / image.name).is_file():
-            raise ImageError(f"{photographs / image.name}: no such photograph; give --image-path")
-        _require_size(photographs / image.name, source.model.cameras[image.camera_id])
-    given = folder.parent / "model"  # a run may remove that of its folder meanwhile
-    if not given.exists():
-        write_model(source.model, given)
-    undistort(path, given, photographs)
-    for image in source.images():
-        if not (picture := path / "images" / image.name).is_file():
-            raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
-        forget_orientation(picture)  # COLMAP takes over EXIF, by which others would turn it
-    return path
+        if not (image_path / image.name).is_file():
+            raise ImageError(f"{image_path / image.name}: no such photograph; give --image-path")
+        _require_size(image_path / image.name, source.model.cameras[image.camera_id])
 
 
 def _require_size(path: Path, camera: pycolmap.Camera) -> None:
@@ -218,31 +246,39 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
     try:
-        flat = Source(path, read_given_model(path / "sparse"), None)
+        flat = Source(path, read_given_model(path / "sparse"), None, source.is_upright)
     except (OptionError, StoreError) as error:  # which COLMAP does not say when it writes
         raise why_not_written(path / "sparse", error) from error
-    frames = []
-    for image in flat.images():
-        camera = flat.model.cameras[image.camera_id]
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().inverse().matrix()
-        pose[:3, :3] = pose[:3, :3] @ FLIP_Y_Z
-        frames.append({
-            "file_path": f"images/{image.name}",
-            "transform_matrix": pose.tolist(),
-            "fl_x": camera.focal_length_x, "fl_y": camera.focal_length_y,
-            "cx": camera.principal_point_x, "cy": camera.principal_point_y,
-            "w": camera.width, "h": camera.height,
-        })  # fmt: skip
     with native_writes(path):
         flat.model.export_PLY(path / "points3D.ply")
         (path / "sparse" / "0").mkdir(exist_ok=True)  # where Gaussian splatting looks
         flat.model.write(path / "sparse" / "0")
     content = {
-        "camera_model": "OPENCV", "ply_file_path": "points3D.ply", **_place(flat), "frames": frames,
-    }  # fmt: skip
+        "camera_model": "OPENCV",
+        "ply_file_path": "points3D.ply",
+        **_place(flat),
+        "frames": [_nerfstudio_frame(flat, image) for image in flat.images()],
+    }
     replace_text(path / "transforms.json", json.dumps(content, indent=1) + "\n")
     return path / "transforms.json"
+
+
+def _nerfstudio_frame(flat: Source, image: pycolmap.Image) -> dict[str, Any]:
+    """Return the entry of an undistorted photograph: its camera, and its pose world_from_cam."""
+    camera = flat.model.cameras[image.camera_id]
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().inverse().matrix()
+    pose[:3, :3] = pose[:3, :3] @ FLIP_Y_Z
+    return {
+        "file_path": f"images/{image.name}",
+        "transform_matrix": pose.tolist(),
+        "fl_x": camera.focal_length_x,
+        "fl_y": camera.focal_length_y,
+        "cx": camera.principal_point_x,
+        "cy": camera.principal_point_y,
+        "w": camera.width,
+        "h": camera.height,
+    }
 
 
 def _mvsnet(source: Source, folder: Path) -> Path:
@@ -258,30 +294,20 @@ def _place(source: Source) -> dict[str, Any]:
     Cameras are then 1.32 from the middle on average, as its own converter has them.
     """
     poses = np.array([image.cam_from_world().inverse().matrix() for image in source.images()])
+    centers = poses[:, :, 3]
     points = [point.xyz for point in source.model.points3D.values()]
-    middle = np.median(points or poses[:, :, 3], axis=0)
-    half = np.linalg.norm(poses[:, :, 3] - middle, axis=1).mean() / 2.64 or 1.0
+    middle = np.median(points or centers, axis=0)
+    mean_distance = np.linalg.norm(centers - middle, axis=1).mean()
+    half = mean_distance / (2.0 * MEAN_DISTANCE_IN_CUBES) or 1.0
     box = [(middle - half).tolist(), (middle + half).tolist()]
-    up = -poses[:, :, 1].mean(axis=0)
+    up = UP if source.is_upright else -poses[:, :, 1].mean(axis=0)
     return {"aabb_scale": 32, "aabb": box, "up": (up / np.linalg.norm(up)).tolist()}
 
 
 def _cameras(source: Source, folder: Path) -> Path:
     """Write a table of photographs: their cameras, and poses world_from_cam (docs/formats.md)."""
     path = folder / "cameras.csv"
-    rows: list[dict[str, Any]] = []
-    for image in source.images():
-        camera = source.model.cameras[image.camera_id]
-        center = image.projection_center()
-        qx, qy, qz, qw = image.cam_from_world().rotation.inverse().quat.tolist()
-        rows.append({
-            "name": _no_formula(image.name), **dict(zip("xyz", center, strict=True)),
-            "qw": qw, "qx": qx, "qy": qy, "qz": qz,
-            "num_points": image.num_points3D, "camera": image.camera_id,
-            "camera_model": camera.model.name, "width": camera.width, "height": camera.height,
-            "focal_px": camera.mean_focal_length(),
-            "params": " ".join(f"{value:.9g}" for value in camera.params),
-        })  # fmt: skip
+    rows = [_row(source, image) for image in source.images()]
     table = io.StringIO()
     writer = csv.DictWriter(table, rows[0] if rows else ["name"], lineterminator="\n")
     writer.writeheader()
@@ -290,17 +316,50 @@ def _cameras(source: Source, folder: Path) -> Path:
     return path
 
 
+def _row(source: Source, image: pycolmap.Image) -> dict[str, Any]:
+    """Return the row of a photograph by columns."""
+    camera = source.model.cameras[image.camera_id]
+    x, y, z = image.projection_center()
+    qx, qy, qz, qw = image.cam_from_world().rotation.inverse().quat.tolist()
+    return {
+        "name": _no_formula(image.name),
+        "x": x,
+        "y": y,
+        "z": z,
+        "qw": qw,
+        "qx": qx,
+        "qy": qy,
+        "qz": qz,
+        "num_points": image.num_points3D,
+        "camera": image.camera_id,
+        "camera_model": camera.model.name,
+        "width": camera.width,
+        "height": camera.height,
+        "focal_px": camera.mean_focal_length(),
+        "params": " ".join(f"{value:.9g}" for value in camera.params),
+    }
+
+
 def _no_formula(text: str) -> str:
     """Put an apostrophe before a text that a spreadsheet would compute."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
-FORMATS: dict[str, tuple[Callable[[Source, Path], Path], str]] = {
-    "ply": (_points, "points3D.ply"),
-    "text": (_text, "text"),
-    "undistorted": (_undistorted, DENSE),
-    "nerfstudio": (_nerfstudio, DENSE),  # comes after ``undistorted``, whose folder it uses
-    "mvsnet": (_mvsnet, DENSE),
-    "cameras": (_cameras, "cameras.csv"),
+@dataclass(frozen=True)
+class Format:
+    """A format that models are exported to."""
+
+    write: Callable[[Source, Path], Path]  # writes it into a folder, returns what it has written
+    leaves: str  # what it leaves in the folder
+
+
+FORMATS = {
+    "ply": Format(_points, "points3D.ply"),
+    "text": Format(_text, "text"),
+    "undistorted": Format(_undistorted, DENSE),
+    "nerfstudio": Format(_nerfstudio, DENSE),  # uses the folder of ``undistorted``, if it is there
+    "mvsnet": Format(_mvsnet, DENSE),
+    "cameras": Format(_cameras, "cameras.csv"),
 }
-"""What writes each format into a folder, and what it leaves there."""
+
+"""Formats by their names, in the order in which they are written."""

@@ -9,7 +9,6 @@ Links and data in other files are not followed, and arrays are checked.
 """
 
 import logging
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,7 +30,6 @@ from colmap_affrect.colmap.checks import (
 from colmap_affrect.colmap.database import (
     DESCRIPTOR_NORM,
     DESCRIPTOR_SIZE,
-    colmap_keypoints,
     open_database,
     read_descriptors,
     write_descriptors,
@@ -45,13 +43,18 @@ from colmap_affrect.errors import (
     StoreError,
     such_as,
 )
-from colmap_affrect.geometry.arrays import Indices, Singles
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.geometry.conventions import (
     MEASUREMENT_SIGMAS,
-    colmap_from_pixel,
     pixel_from_colmap,
 )
 from colmap_affrect.images.photographs import CameraOptions, list_images, refuse_colliding_keys
+from colmap_affrect.interop.given_features import (
+    given_descriptors,
+    keypoint_rows,
+    keys_of,
+    require_size,
+)
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.given_matches import (
     GivenMatches,
@@ -98,12 +101,14 @@ class InterchangeReport(Summarized):
     def summary(self) -> str:
         """Return a line of numbers, and one for each note."""
         verified = "" if self.num_verified is None else f", {self.num_verified} verified"
-        counts = (
+        lines = [
             f"{self.action}: {self.num_images} images, {self.num_keypoints} keypoints, "
             f"{self.num_pairs} pairs{verified}, {self.num_matches} matches"
-        )
-        notes = [f"note: {what}: {such_as(of)}" for what, of in self.left_out.items() if of]
-        return "\n".join([counts, *notes])
+        ]
+        for what, names in self.left_out.items():
+            if names:
+                lines.append(f"note: {what}: {such_as(names)}")
+        return "\n".join(lines)
 
 
 @dataclass(frozen=True)
@@ -191,11 +196,12 @@ def _import(
         new_results(database_path, names=names) as (new,),
         opened(features_path) as features,
     ):
-        keys = _keys_of(features, names, image_path)
+        keys = keys_of(features, names, image_path)
         refuse_colliding_keys(list(keys))
         with _matches(wanted, features, keys) as found:
             rejected = import_images(new, image_path, names, cameras)
-            if lost := sorted(keys.keys() & set(rejected)):
+            lost = sorted(keys.keys() & set(rejected))
+            if lost:
                 raise ImageError(
                     f"{image_path}: COLMAP does not take (damaged, or of another size than camera "
                     f"mode {cameras.mode} allows): {such_as(lost)}"
@@ -203,42 +209,17 @@ def _import(
             unkept = _fill(new, features, keys, progress)
             _fill_matches(new, found, wanted, progress)
         counts, num_verified = _verified(new, wanted, progress)
-        problems = check_database(new)[1]
-    left_out = {
-        "images without features are there without keypoints": sorted(
-            set(names) - set(rejected) - keys.keys()
-        ),
+        _, problems = check_database(new)
+    without = sorted(set(names) - set(rejected) - keys.keys())
+    left_out: dict[str, Sequence[str]] = {
+        "images without features are there without keypoints": without,
         "images that COLMAP does not take are left out": rejected,
-        **{CHECKS[kind]["what"]: problems.get(kind, []) for kind in sorted(WARNED)},
-        "descriptors are not kept, a database takes those of 128 values": unkept,
     }
+    for kind in sorted(WARNED):
+        left_out[CHECKS[kind]["what"]] = problems.get(kind, [])
+    left_out["descriptors are not kept, a database takes those of 128 values"] = unkept
     num_images = len(names) - len(rejected)
     return InterchangeReport("imported", num_images, *counts, num_verified, left_out)
-
-
-def _keys_of(features: GivenFile, names: Sequence[str], image_path: Path) -> dict[str, str]:
-    """Return the key of the features of each image.
-
-    Some programs leave out the folders of images.
-    """
-    full_names = defaultdict[str, list[str]](list)
-    for name in names:
-        full_names[PurePosixPath(name).name].append(name)
-    known = set(names)
-    found = dict[str, str]()
-    unknown = []
-    for key in features.groups_with("keypoints"):
-        alike = [key] if key in known else full_names.get(key, [])
-        if len(alike) == 1:
-            found[alike[0]] = key
-        else:
-            unknown.append(key)
-    if unknown:
-        raise StoreError(
-            f"{features.path}: has features of images that are not in {image_path}: "
-            f"{such_as(unknown)}"
-        )
-    return found
 
 
 @contextmanager
@@ -264,7 +245,7 @@ def _matches(
 
     def read(name: str) -> Arrays:
         points = features.read(f"{keys[name]}/keypoints", (None, 2))
-        return points, _descriptors(features, keys[name], len(points))
+        return points, given_descriptors(features, keys[name], len(points))
 
     def matched_pairs(_: Mapping[str, int]) -> Iterator[tuple[Pair, Indices]]:
         try:
@@ -274,17 +255,6 @@ def _matches(
             raise StoreError(f"{features.path}: {error}") from error
 
     yield GivenMatches(features.path, tuple(pairs), matched_pairs)
-
-
-def _descriptors(features: GivenFile, key: str, count: int) -> NDArray[Any]:
-    """Return the (N, D) descriptors of an image; hloc has them as (D, N)."""
-    shape = features.shapes[f"{key}/descriptors"]
-    if len(shape) != 2 or count not in shape:
-        raise StoreError(
-            f"{features.path}: {key}/descriptors has shape {shape}, expected (D, {count})"
-        )
-    values = features.read(f"{key}/descriptors", shape)
-    return values.T if shape[1] == count else values
 
 
 def _fill(
@@ -310,7 +280,7 @@ def _keep_descriptors(
     if f"{key}/descriptors" not in features.shapes:
         return True
     count = database.num_keypoints_for_image(image_id)
-    values = _descriptors(features, key, count)
+    values = given_descriptors(features, key, count)
     if not count:
         return True
     if values.shape[1] != DESCRIPTOR_SIZE or not np.isfinite(values).all():
@@ -333,12 +303,12 @@ def _verified(
 ) -> tuple[tuple[int, int, int], int | None]:
     """Verify, if that is wanted; return numbers of keypoints, pairs, matches; verified pairs."""
     with open_database(path) as database:
-        num_pairs = len(database.read_num_matches()[0])
-        counts = database.num_keypoints(), num_pairs, database.num_matches()
+        pair_ids, _ = database.read_num_matches()
+        counts = (database.num_keypoints(), len(pair_ids), database.num_matches())
     options = wanted.verification
     if options is None:
         return counts, None
-    with progress.stage("verify", num_pairs, "pairs") as advance:
+    with progress.stage("verify", len(pair_ids), "pairs") as advance:
         verify(path, options, advance=advance)
     return counts, len(verified_pairs(path, options.min_num_inliers))
 
@@ -350,38 +320,12 @@ def _write_keypoints(
     name = image.name
     camera = database.read_camera(image.camera_id)
     expected = (camera.width, camera.height)
-    if f"{key}/image_size" in source.shapes:
-        size = tuple(source.read(f"{key}/image_size", (2,)).tolist())
-        if f"{key}/tile_idx" in source.shapes:  # deep-image-matching has (height, width)
-            size = size[::-1]
-        if size != expected:
-            turned = " (turned by its EXIF orientation?)" if size == expected[::-1] else ""
-            raise StoreError(
-                f"{source.path}: {name} was {size[0]:g} x {size[1]:g} px for the features{turned}, "
-                f"and the photograph is {expected[0]} x {expected[1]} px; use the same photographs"
-            )
-    keypoints = _keypoint_rows(source, key)
+    require_size(source, key, name, expected)
+    keypoints = keypoint_rows(source, key)
     for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints, expected)):
         check = CHECKS[kind]
         raise StoreError(f"{source.path}: {check['what']}: {name}; {check['advice']}")
     database.write_keypoints(image.image_id, keypoints)
-
-
-def _keypoint_rows(source: GivenFile, name: str) -> Singles:
-    """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
-    lafs, scales, oris = (f"{name}/{dataset}" for dataset in ("lafs", "scales", "oris"))
-    with np.errstate(all="ignore"):  # what is not finite, or float32 cannot hold, is refused later
-        points = source.read(f"{name}/keypoints", (None, 2)).astype(np.float32)
-        centers = np.asarray(colmap_from_pixel(points))
-        count = len(points)
-        if lafs in source.shapes:
-            frames = source.read(lafs, (count, 2, 3)).astype(np.float64)
-            return np.column_stack([centers, colmap_keypoints(frames)[:, 2:]])
-        if not {scales, oris} <= source.shapes.keys():
-            return centers
-        sigmas = source.read(scales, (count,)).astype(np.float32)
-        angles = np.deg2rad(source.read(oris, (count,)).astype(np.float32))
-        return np.column_stack([centers, sigmas, angles])
 
 
 @checks_arguments
@@ -395,8 +339,20 @@ def export_h5(
     """Write features and raw matches of a COLMAP database, which stays as it is, for hloc.
 
     Features keep their indices. Descriptors are of unit length. Scores, which a database does not
-    have, are 1. Of several matches of a keypoint of the first image one is kept. Raises OptionError
-    when a file exists, StoreError for names that hloc's layout cannot hold.
+    have, are 1. Of several matches of a keypoint of the first image one is kept.
+
+    Args:
+        database_path: the database.
+        features_path: HDF5 file to make, of features.
+        matches_path: HDF5 file to make, of matches.
+        progress: where to show progress.
+
+    Returns:
+        Counts, and the names of what was left out.
+
+    Raises:
+        OptionError: when a file exists.
+        StoreError: for names that hloc's layout cannot hold.
     """
     database_path = as_path(database_path, "database_path")
     features_path = as_path(features_path, "features_path")
@@ -409,26 +365,27 @@ def export_h5(
         known = [image for image in images if database.exists_keypoints(image.image_id)]
         names = [image.name for image in known]
         _check_names(names)
-        pairs = list(map(pycolmap.pair_id_to_image_pair, database.read_num_matches()[0]))
+        pair_ids, _ = database.read_num_matches()
         features = ((i.name, _feature_datasets(database, i, database_path)) for i in known)
-        matches = _match_groups(database, known, pairs)
+        matches = _match_groups(database, known, pair_ids)
         with new_results(features_path, matches_path, names=names) as made:
             with progress.stage("features", len(names), "images") as advance:
                 _write_file(made[0], features_path, features, advance)
-            with progress.stage("matches", len(pairs), "pairs") as advance:
+            with progress.stage("matches", len(pair_ids), "pairs") as advance:
                 _write_file(made[1], matches_path, matches, advance)
-        counts = database.num_keypoints(), len(pairs), database.num_matches()
+        counts = (database.num_keypoints(), len(pair_ids), database.num_matches())
     without = [image.name for image in images if image.name not in names]
     left_out = {"images without keypoints are left out": without}
     return InterchangeReport("exported", len(names), *counts, None, left_out)
 
 
 def _match_groups(
-    database: pycolmap.Database, images: Sequence[pycolmap.Image], pairs: Sequence[tuple[int, int]]
+    database: pycolmap.Database, images: Sequence[pycolmap.Image], pair_ids: Sequence[int]
 ) -> Iterator[tuple[str, Datasets]]:
-    """Yield key and datasets of each pair of image ids."""
+    """Yield key and datasets of each pair."""
     names = {image.image_id: image.name for image in images}
-    for id1, id2 in pairs:
+    for pair_id in pair_ids:
+        id1, id2 = pycolmap.pair_id_to_image_pair(pair_id)
         indices = np.asarray(database.read_matches(id1, id2), np.int64)
         _, one_each = np.unique(indices[:, 0], return_index=True)
         scores = np.ones(len(one_each), np.float32)
@@ -462,17 +419,19 @@ def _feature_datasets(database: pycolmap.Database, image: pycolmap.Image, path: 
 
 def _check_names(names: Sequence[str]) -> None:
     """Refuse image names that the keys of files cannot hold or tell apart."""
-    unsafe = [
-        name
-        for name in names
-        if leads_outside(name) or PurePosixPath(name).as_posix() != name or "\0" in name
-    ]
+    unsafe = [name for name in names if not _is_plain(name)]
     if unsafe:
         raise StoreError(f"names that are no plain relative paths: {such_as(unsafe)}")
     refuse_colliding_keys(names)
     folders = {str(parent) for name in names for parent in PurePosixPath(name).parents}
-    if both := sorted(folders.intersection(names)):
+    both = sorted(folders.intersection(names))
+    if both:
         raise StoreError(f"{both[0]}: is an image and the folder of another; rename it")
+
+
+def _is_plain(name: str) -> bool:
+    """Tell whether a name is a relative path in its shortest form."""
+    return not leads_outside(name) and PurePosixPath(name).as_posix() == name and "\0" not in name
 
 
 def _write_file(

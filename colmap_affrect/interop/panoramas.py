@@ -42,7 +42,14 @@ class _Functions:
     def incremental_mapping(
         self, database_path: Path, image_path: Path, output_path: Path, options: Any
     ) -> Any:
-        """Map, and count the views."""
+        """Map, and count the views.
+
+        Args:
+            database_path: the database of the views.
+            image_path: folder of the views.
+            output_path: folder of the models.
+            options: of pycolmap.
+        """
         num_views = len(image_ids(database_path))
         with self.progress.stage("map", num_views, "views") as advance:
             return ours.incremental_mapping(

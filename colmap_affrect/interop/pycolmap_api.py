@@ -5,10 +5,13 @@ database has no place for is kept in a folder beside it, ``x.affrect`` for ``x.d
 functions go on where an earlier call stopped.
 """
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
@@ -55,15 +58,17 @@ Token = pycolmap.CancellationToken | None
 Callback = Callable[[], None] | None
 Reports = tuple[StageReport, ...]
 
-Choose = Callable[[Context, Sequence[str], Any], Iterable[Pair]]
-"""Takes the names of the images that can be matched, and pycolmap's pairing options."""
 
-ARGUMENTS = """
+@dataclass(frozen=True)
+class _Images:
+    """Images that pairs are chosen of."""
 
-    Arguments are those of pycolmap. ``matching_options``, by default those of the recipe, and
-    ``verification_options`` may be ours, too. ``random_seed`` is that of verification,
-    ``weights_path`` a folder with weights of networks.
-"""
+    context: Context
+    names: Sequence[str]  # of those that can be matched
+
+
+Choose = Callable[[_Images, Any], Iterable[Pair]]
+"""Takes pycolmap's pairing options, too."""
 
 
 def extract_features(  # noqa: PLR0913 (arguments are those of pycolmap)
@@ -82,16 +87,31 @@ def extract_features(  # noqa: PLR0913 (arguments are those of pycolmap)
     weights_path: PathLike | None = None,
     progress: GivenProgress = None,
 ) -> StageReport:
-    """Extract rectified features of photographs into a COLMAP database, which may be new.
+    """Extract rectified features of photographs into a COLMAP database.
 
     Images that have features already are passed over. One that cannot be read is named in the
-    report, and warned of (UserWarning). Raises AffrectError for anything that the caller can mend.
-    A cancelled token stops by InterruptedError; what is done is kept. Other arguments are those of
-    pycolmap, but ``extraction_options`` are a recipe by name or path, or our options; of
-    pycolmap's, the image size and where the work is done.
+    report, and warned of (UserWarning).
 
-    ``from_database``: begin ``database_path`` with the images, cameras, rigs, frames and pose
-    priors of this one, which stays as it is. ``weights_path``: folder with weights of networks.
+    Args:
+        database_path: the database, which may be new.
+        image_path: folder of the photographs.
+        image_names: of some of them; by default all.
+        camera_mode: as in pycolmap.
+        reader_options: what pycolmap's say of cameras and masks.
+        extraction_options: a recipe by name or path, or our options; of pycolmap's, the image size
+            and where the work is done.
+        device: that networks run on.
+        cancellation_token: stops by InterruptedError; what is done is kept.
+        from_database: begin the database with the images, cameras, rigs, frames and pose priors
+            of this one, which stays as it is.
+        weights_path: folder with weights of networks.
+        progress: True, False, or None for where somebody looks at it.
+
+    Returns:
+        How many images were extracted, and why others were not.
+
+    Raises:
+        AffrectError: for anything that the caller can mend.
     """
     cameras, masks = translate.reader_options(reader_options, camera_mode)
     original = as_path_or_none(from_database, "from_database")
@@ -124,44 +144,59 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
             weights_path: PathLike | None = None,
             progress: GivenProgress = None,
         ) -> Reports:
+            """Arguments are those of pycolmap, and a few more.
+
+            Args:
+                database_path: the database.
+                matching_options: those of pycolmap or ours; by default those of the recipe.
+                pairing_options: those of pycolmap.
+                verification_options: those of pycolmap or ours.
+                device: that networks run on.
+                cancellation_token: stops by InterruptedError; what is done is kept.
+                random_seed: of verification.
+                weights_path: folder with weights of networks.
+                progress: True, False, or None for where somebody looks at it.
+
+            Returns:
+                What each stage did.
+            """
             pairing: Any = translate.native(pairing_options, kind, "pairing_options")
             verification = translate.verification_options(verification_options, random_seed)
             matching, asked = translate.matching_options(matching_options)
             shown = _Cancellable(Progress.given(progress), cancellation_token)
             with _context(database_path, device, asked, weights_path, shown) as context:
-                if names := _described(context):
-                    pairs = choose(context, names, pairing)
+                names = _described(context)
+                if names:
+                    pairs = choose(_Images(context, names), pairing)
                     return _match_descriptors(context, pairs, matching, verification, asked)
                 context.workspace.require("extract")
                 write_images_and_keypoints(context)
-                pairs = choose(context, context.features.names(), pairing)
+                pairs = choose(_Images(context, context.features.names()), pairing)
                 return _match(context, pairs, matching, verification, asked, cancellation_token)
 
         matched.__name__ = matched.__qualname__ = choose.__name__
-        matched.__doc__ = (choose.__doc__ or "").rstrip() + ARGUMENTS
+        texts = (choose.__doc__ or "", matched.__doc__ or "")
+        matched.__doc__ = "\n\n".join(map(cleandoc, texts))
         return matched
 
     return decorate
 
 
 @_matching(pycolmap.ExhaustivePairingOptions)
-def match_exhaustive(
-    _: Context, names: Sequence[str], __: pycolmap.ExhaustivePairingOptions
-) -> Iterable[Pair]:
+def match_exhaustive(images: _Images, _: pycolmap.ExhaustivePairingOptions) -> Iterable[Pair]:
     """Match and verify all pairs of the images that :func:`extract_features` was given."""
-    return exhaustive_pairs(names)
+    return exhaustive_pairs(images.names)
 
 
 @_matching(pycolmap.SequentialPairingOptions)
-def match_sequential(
-    context: Context, _: Sequence[str], options: pycolmap.SequentialPairingOptions
-) -> list[Pair]:
+def match_sequential(images: _Images, options: pycolmap.SequentialPairingOptions) -> list[Pair]:
     """Match images that follow each other by name.
 
     With ``loop_detection`` also images that are alike as a whole, which needs no vocabulary tree:
     as many as ``loop_detection_num_images`` of every ``loop_detection_period``th image.
     """
-    num_alike = -(-options.loop_detection_num_images // max(1, options.loop_detection_period))
+    context = images.context
+    num_alike = math.ceil(options.loop_detection_num_images / max(1, options.loop_detection_period))
     in_order = type(options)({**options.todict(), "loop_detection": False})
     path = context.workspace.database
     pairs = generated_pairs(path, pycolmap.SequentialPairGenerator, in_order)
@@ -173,17 +208,13 @@ def match_sequential(
 
 
 @_matching(pycolmap.SpatialPairingOptions)
-def match_spatial(
-    context: Context, _: Sequence[str], options: pycolmap.SpatialPairingOptions
-) -> list[Pair]:
+def match_spatial(images: _Images, options: pycolmap.SpatialPairingOptions) -> list[Pair]:
     """Match images near to each other; DatabaseError when fewer than two have a position."""
-    return spatial_pairs(context.workspace.database, options)
+    return spatial_pairs(images.context.workspace.database, options)
 
 
 @_matching(pycolmap.ImportedPairingOptions)
-def match_image_pairs(
-    _: Context, names: Sequence[str], options: pycolmap.ImportedPairingOptions
-) -> Iterable[Pair]:
+def match_image_pairs(images: _Images, options: pycolmap.ImportedPairingOptions) -> Iterable[Pair]:
     """Match and verify the pairs of a list, ``match_list_path``, a file of two names per line.
 
     Raises AffrectError without one, or when it names images without features.
@@ -191,7 +222,7 @@ def match_image_pairs(
     path = translate.given_path(options.match_list_path)
     if not path:
         raise AffrectError("pairing_options: give match_list_path, a file with two names per line")
-    return read_pairs(Path(path), names)
+    return read_pairs(Path(path), images.names)
 
 
 def _described(context: Context) -> list[str]:
@@ -213,7 +244,8 @@ def _match_descriptors(
     nearest = matching if isinstance(matching, NearestOptions) else None
     if matching and not nearest:
         raise OptionError("matching_options: descriptors of a database take NearestOptions alone")
-    if refused := sorted(asked.keys() & {"guided_matching", "rig_verification"}):
+    refused = sorted(asked.keys() & {"guided_matching", "rig_verification"})
+    if refused:
         raise OptionError(f"{refused[0]}: not for descriptors of another program")
     path = context.workspace.database
     begun = time.perf_counter()
@@ -274,9 +306,15 @@ def verify_matches(
 ) -> None:
     """Estimate the two-view geometries of the matched pairs of a list that lack one.
 
-    With the preset for sparse sets, or ``options``, ours or those of pycolmap that have a
-    counterpart, in any database; DatabaseError where a match points at no keypoint. ``pairs_path``
-    has two names per line; None stands for all pairs.
+    Args:
+        database_path: any database.
+        pairs_path: list of two names per line; None stands for all pairs.
+        options: ours, or those of pycolmap that have a counterpart; None for the preset for sparse
+            sets.
+        cancellation_token: stops by InterruptedError; what is done is kept.
+
+    Raises:
+        DatabaseError: a match points at no keypoint.
     """
     path = as_path(database_path, "database_path")
     pairs = None
@@ -285,8 +323,9 @@ def verify_matches(
     with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
         if pairs_path is not None:
             ids = image_ids(path)
-            listed = read_pairs(as_path(pairs_path, "pairs_path"), list(ids))
-            pairs = {(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in listed}
+            pairs = set[tuple[int, int]]()
+            for first, second in read_pairs(as_path(pairs_path, "pairs_path"), list(ids)):
+                pairs.add((min(ids[first], ids[second]), max(ids[first], ids[second])))
         verify_database(path, verification, advance=advance, pairs=pairs)
 
 
@@ -312,10 +351,19 @@ def incremental_mapping(
 ) -> dict[int, pycolmap.Reconstruction]:
     """Map any verified database by our mapper and write the models as pycolmap does.
 
-    ``options`` that differ from pycolmap's defaults, or that a dictionary names, win over our
-    preset for sparse sets. Models are written to 0, 1, ... in ``output_path``, or, with
-    ``input_path``, a model to be extended, into it; they are returned by the number of their
-    folder, largest first. A cancelled token stops by InterruptedError.
+    Args:
+        database_path: the database.
+        image_path: folder of the photographs, for the colours of the points.
+        output_path: models are written to 0, 1, ... in it, or, with ``input_path``, into it.
+        options: those that differ from pycolmap's defaults, or that a dictionary names, win over
+            our preset for sparse sets.
+        input_path: a model to be extended.
+        initial_image_pair_callback: is called when the first images are registered.
+        next_image_callback: is called for each further image.
+        cancellation_token: stops by InterruptedError.
+
+    Returns:
+        The models by the number of their folder, largest first.
     """
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
     mapper = MAPPERS.make(translate.mapper_options(options))
@@ -350,11 +398,12 @@ def incremental_mapping(
 def _written(found: Path, output: Path, *, extends: bool) -> dict[int, pycolmap.Reconstruction]:
     """Read models and move their files to where pycolmap writes them."""
     models = {int(path.name): pycolmap.Reconstruction(path) for path in found.iterdir()}
-    files = {
-        path: (output if extends else output / path.parent.name) / path.name
-        for path in found.glob("*/*")
-    }
-    with new_results(*files.values(), replaces=True) as made:
+    files = list(found.glob("*/*"))
+    targets = []
+    for path in files:
+        folder = output if extends else output / path.parent.name
+        targets.append(folder / path.name)
+    with new_results(*targets, replaces=True) as made:
         for path, new in zip(files, made, strict=True):
             path.replace(new)
     return dict(sorted(models.items()))
@@ -389,6 +438,16 @@ class _Cancellable(Progress):
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+        """Show a stage, and look at the token whenever something is done.
+
+        Args:
+            name: of the stage.
+            total: number of steps.
+            unit: what the steps are.
+
+        Raises:
+            InterruptedError: the token is cancelled.
+        """
         self._check()
         with self._shown.stage(name, total, unit) as advance:
 

@@ -61,15 +61,20 @@ SET_OTHERWISE = ("random_seed", "image_path", "fix_existing_frames")
 def native(given: object, kind: type[Native], argument: str) -> Native:
     """Return pycolmap's options, of a nested dictionary too.
 
-    OptionError names a field that is unknown, or that differs from its default and is not honoured.
+    Args:
+        given: options of this class, a dictionary of their fields, or None for the usual ones.
+        kind: the class.
+        argument: that they came by, for errors.
+
+    Raises:
+        OptionError: names a field that is unknown, or that differs from its default and is not
+            honoured.
     """
     options = kind()
     if isinstance(given, kind):
         options = given
     elif given is None or isinstance(given, Mapping):
-        usual = flat_values(options)
-        values = {k: v for k, v in _named(given).items() if k not in usual or v != usual[k]}
-        resolve(options, values, f"{argument}:", owned={})
+        resolve(options, _unusual(_named(given), options), f"{argument}:", owned={})
     else:
         shown = f"{argument}: {type(given).__name__} does not apply here"
         raise OptionError(f"{shown}; give pycolmap.{kind.__name__} or a dictionary of its fields")
@@ -81,15 +86,42 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
 
 
 def _differing(options: Any) -> dict[str, Any]:
-    usual = flat_values(type(options)())
-    return {key: value for key, value in flat_values(options).items() if value != usual[key]}
+    """Return the fields that differ from their defaults."""
+    return _unusual(flat_values(options), type(options)())
+
+
+def _unusual(values: Mapping[str, Any], options: Any) -> dict[str, Any]:
+    """Return the values, by dotted key, that options do not have."""
+    usual = flat_values(options)
+    found = {}
+    for key, value in values.items():
+        if key not in usual or value != usual[key]:
+            found[key] = value
+    return found
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
-    """Return fields that are asked for; OptionError for one we do not have."""
+    """Return the fields that are asked for.
+
+    Args:
+        given: what :func:`native` takes.
+        kind: a class of :data:`HONOURED`.
+        argument: that the options came by, for errors.
+
+    Returns:
+        Values by dotted key: of fields that a dictionary names, or that are not the usual ones.
+
+    Raises:
+        OptionError: names a field that we do not have.
+    """
     options: Any = native(given, kind, argument)
-    named = {k: v for k, v in flat_values(options).items() if k in _named(given) and v != -1}
-    return {k: v for k, v in (named | _differing(options)).items() if k in HONOURED[kind]}
+    named = _named(given)
+    asked = {}
+    for key, value in flat_values(options).items():
+        if key in named and value != -1:
+            asked[key] = value
+    asked |= _differing(options)
+    return {key: value for key, value in asked.items() if key in HONOURED[kind]}
 
 
 def _named(given: object) -> Mapping[str, Any]:
@@ -127,7 +159,9 @@ def verification_options(given: object, random_seed: int | None) -> Verification
         if "max_error_px" in values:  # in pixels of the files
             values["scale_max_error"] = False
         options = VerificationOptions.from_mapping(values, argument)
-    return options.changed(random_seed=options.random_seed if random_seed is None else random_seed)
+    if random_seed is None:
+        return options
+    return options.changed(random_seed=random_seed)
 
 
 def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, MaskOptions]:
@@ -160,10 +194,14 @@ def mapper_options(asked: object) -> MapperOptions:
     for key, value in _differing(given).items():
         if isinstance(value, list | set):
             raise OptionError(f"options: {key}={value} cannot be carried over")
+    kept = {}
     values = differences(given, pycolmap.IncrementalPipelineOptions(), _named(asked))
-    seed = {"random_seed": given.random_seed} if given.random_seed >= 0 else {}
-    kept = {k: v for k, v in values.items() if k.rpartition(".")[2] not in SET_OTHERWISE}
-    options: MapperOptions = MAPPERS.options(
-        {"name": MAPPERS.default, **seed, "mapper_options": kept}, where="options"
-    )
+    for key, value in values.items():
+        name = key.rpartition(".")[2]
+        if name not in SET_OTHERWISE:
+            kept[key] = value
+    ours: dict[str, Any] = {"name": MAPPERS.default, "mapper_options": kept}
+    if given.random_seed >= 0:
+        ours["random_seed"] = given.random_seed
+    options: MapperOptions = MAPPERS.options(ours, where="options")
     return options

@@ -28,7 +28,7 @@ class MapperOptions(PartOptions, PresetOptions):
     ignore_two_view_tracks: bool = False
     """COLMAP's True leaves sparse sets without a model: there most tracks have two views."""
     min_model_size: Annotated[int, within(2, 1_000_000)] = 2
-    """Models of fewer images are dropped."""
+    """Models of fewer images are dropped, as with COLMAP unless they have four fifths of all."""
     keep_given_intrinsics: bool = True
     """Leave camera parameters that the user gave as they are; refining them on a few images of a
     sparse set moves them far away."""

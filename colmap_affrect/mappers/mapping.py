@@ -31,6 +31,7 @@ from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_pro
 MIN_PROBABILITY = 0.05
 """Images leave their model below this probability: nineteen of twenty such poses are wrong."""
 # What was begun is removed while a call of COLMAP may still write there.
+ENOUGH_OF_SMALL_SET = 0.8  # of all images: such a model is never too small (COLMAP)
 NUM_REMOVALS = 5  # times that this is tried
 REMOVAL_INTERVAL_S = 0.05  # between them
 
@@ -162,7 +163,8 @@ def map_database(
             found = mapper.map(whole, raw, mapper.options.random_seed, progress.show)
             remove_own([raw])
         scored = [_without_wrong_images(model, task) for model in found]
-        kept = _large_enough(scored, 1 if task.extend else mapper.options.min_model_size)
+        min_model_size = 1 if task.extend else mapper.options.min_model_size
+        kept = _large_enough(scored, min_model_size, num_images)
         kept.sort(key=lambda model: model.size, reverse=True)
         summaries = _write_models(kept, task, partial)
         remove_own([sparse_path])
@@ -172,9 +174,12 @@ def map_database(
     return summaries
 
 
-def _large_enough(models: Sequence[_ScoredModel], min_num_images: int) -> list[_ScoredModel]:
-    """Return the models of which so many images are left."""
-    return [model for model in models if len(model.confidences) >= min_num_images]
+def _large_enough(
+    models: Sequence[_ScoredModel], min_model_size: int, num_images: int
+) -> list[_ScoredModel]:
+    """Return the models that are large enough, for the number of all images."""
+    least = max(1, min(min_model_size, int(ENOUGH_OF_SMALL_SET * num_images)))
+    return [model for model in models if len(model.confidences) >= least]
 
 
 def _remove_unfinished(partial: Path) -> None:

@@ -8,7 +8,7 @@
   numbers for each match, and an empty line.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,8 +98,11 @@ def _hloc_pairs(source: GivenFile, names: Collection[str]) -> Iterator[tuple[Pai
     for key in source.groups_with(HLOC):
         found = list(_splits(key, "/", by_key)) or list(_splits(key, "_", by_key))
         if len(found) > 1:
-            both = " and ".join(f"{first}, {second}" for first, second in found[:2])
-            raise StoreError(f"{source.path}: {key} may stand for {both}; rename the images")
+            one = ", ".join(found[0])
+            other = ", ".join(found[1])
+            raise StoreError(
+                f"{source.path}: {key} may stand for {one} and {other}; rename the images"
+            )
         if found:
             yield found[0], key
         else:
@@ -113,15 +116,17 @@ def _nested_pairs(source: GivenFile, names: Collection[str]) -> Iterator[tuple[P
     for name in names:
         by_key.setdefault(Path(name).name, name)
     unknown = []
+    has_matches = False
     for key, shape in sorted(source.shapes.items()):
         if len(shape) != 2 or shape[1] != 2:
             continue
+        has_matches = True
         found = list(_splits(key, "/", by_key))
         if found:
             yield found[0], key
         else:
             unknown.append(key)
-    if not any(len(shape) == 2 and shape[1] == 2 for shape in source.shapes.values()):
+    if not has_matches:
         source.groups_with(HLOC)  # which says what is missing
     _refuse_unknown(source.path, unknown)
 
@@ -159,15 +164,22 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
                     f"{path}: line {number}: {line!r} is not two names of images that have "
                     "features, nor two numbers of features"
                 )
-            begin = number
-            while number < len(lines) and _is_match(lines[number]):
-                number += 1
+            end = _end_of_matches(lines, number)
             if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
-                numbers = " ".join(lines[begin:number]).split()
+                numbers = " ".join(lines[number:end]).split()
                 found[pair] = np.array(numbers, np.int64).reshape(-1, 2)
+            number = end
     if not found:
         raise StoreError(f"{path}: holds no matches; give an HDF5 file, or a list of COLMAP")
     return GivenMatches(path, tuple(found), lambda _: iter(found.items()))
+
+
+def _end_of_matches(lines: Sequence[str], begin: int) -> int:
+    """Return the number of the first line, from one on, that is no match."""
+    end = begin
+    while end < len(lines) and _is_match(lines[end]):
+        end += 1
+    return end
 
 
 def _is_match(line: str) -> bool:

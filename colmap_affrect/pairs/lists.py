@@ -6,14 +6,14 @@ import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal, overload
+from typing import Annotated, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.geometry.arrays import Bools
+from colmap_affrect.geometry.arrays import Bools, Indices
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import resolved
@@ -42,9 +42,10 @@ class PairList(Sequence[Pair]):
         if isinstance(pairs, PairList):
             return pairs
         listed = list(pairs)
-        names = sorted({name for pair in listed for name in pair})
+        names = sorted(set(itertools.chain.from_iterable(listed)))
         number = {name: index for index, name in enumerate(names)}
-        return cls(names, np.array([(number[a], number[b]) for a, b in listed], np.int32))
+        numbers = [(number[first], number[second]) for first, second in listed]
+        return cls(names, np.array(numbers, np.int32))
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -99,49 +100,63 @@ def exhaustive_pairs(names: Sequence[str]) -> list[Pair]:
 def sequence_pairs(names: Sequence[str], num_neighbors: int) -> list[Pair]:
     """Return the sorted pairs of each name and the next ones; frame 9 comes before frame 10."""
     ordered = sorted(names, key=_by_numbers)
-    return sorted(
-        (min(first, second), max(first, second))
-        for index, first in enumerate(ordered)
-        for second in ordered[index + 1 : index + 1 + num_neighbors]
-    )
+    pairs = []
+    for index, first in enumerate(ordered):
+        for second in ordered[index + 1 : index + 1 + num_neighbors]:
+            pairs.append((min(first, second), max(first, second)))
+    return sorted(pairs)
 
 
-def _by_numbers(name: str) -> tuple[list[str | int], str]:
-    parts = re.split(r"([0-9]+)", name)
-    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
+def _by_numbers(name: str) -> tuple[list[Any], str]:
+    """Return what names are sorted by: their numbers count as such."""
+    parts: list[Any] = re.split(r"([0-9]+)", name)
+    parts[1::2] = map(int, parts[1::2])
+    return parts, name
 
 
 def most_similar_pairs(
     names: Sequence[str], similarities: Iterable[NDArray[np.number]], num_neighbors: int
 ) -> list[Pair]:
-    """Choose pairs so that images have ``num_neighbors`` (1 or more) neighbours on average.
+    """Choose pairs so that images have as many neighbours as wanted on average.
 
     Each image is paired with half as many that are most similar to it; the rest goes to the most
-    similar pairs of all. ``similarities`` has for each of N images its (N,) similarities with all.
+    similar pairs of all.
+
+    Args:
+        names: of N images.
+        similarities: for each image its (N,) similarities with all, itself included.
+        num_neighbors: of an image on average, 1 or more.
+
+    Returns:
+        The pairs, sorted.
     """
-    half = -(-num_neighbors // 2)
-    count = len(names)
-    candidates = []
+    lower = []  # by image, with those most similar to it: the smaller index of each pair
+    higher = []
+    similarity = []
+    rank = []  # how many images are more similar to it
     for index, row in enumerate(similarities):
         values = row.astype(np.float32)
         order = np.argsort(-values, kind="stable")
         others = order[order != index][: CANDIDATES_PER_NEIGHBOR * num_neighbors]
-        both = np.minimum(others, index), np.maximum(others, index)
-        candidates.append((*both, values[others], np.arange(len(others))))
-    if not candidates:
+        lower.append(np.minimum(others, index))
+        higher.append(np.maximum(others, index))
+        similarity.append(values[others])
+        rank.append(np.arange(len(others)))
+    if not lower:
         return []
-    indices1, indices2, similarity, rank = (
-        np.concatenate(column) for column in zip(*candidates, strict=True)
-    )
-    best_first = np.lexsort((-similarity, rank >= half))
-    _, first = np.unique((indices1 * count + indices2)[best_first], return_index=True)
-    ranked = best_first[np.sort(first)]
-    num_pairs = max(count * num_neighbors // 2, np.count_nonzero(rank[ranked] < half))
-    chosen = ranked[:num_pairs]
-    return sorted(
-        (min(names[i], names[j]), max(names[i], names[j]))
-        for i, j in zip(indices1[chosen], indices2[chosen], strict=True)
-    )
+    is_extra = np.concatenate(rank) >= (num_neighbors + 1) // 2
+    best_first = np.lexsort((-np.concatenate(similarity), is_extra))
+    firsts = np.concatenate(lower)
+    seconds = np.concatenate(higher)
+    _, found_first = np.unique((firsts * len(names) + seconds)[best_first], return_index=True)
+    ranked = best_first[np.sort(found_first)]  # each pair once
+    num_pairs = max(len(names) * num_neighbors // 2, np.count_nonzero(~is_extra[ranked]))
+    pairs = []
+    for chosen in ranked[:num_pairs]:
+        one = names[firsts[chosen]]
+        other = names[seconds[chosen]]
+        pairs.append((min(one, other), max(one, other)))
+    return sorted(pairs)
 
 
 def ordered_for_reuse(pairs: Iterable[Pair], num_images: int) -> PairList:
@@ -175,35 +190,8 @@ def read_pairs(path: Path, names: Sequence[str], image_path: Path | None = None)
         AffrectError: when it is unreadable, or a name is not among ``names``.
     """
     ordered = sorted(set(names))
-    number = {name: index for index, name in enumerate(ordered)}
     folders = _spellings(image_path) if image_path else ()
-    problems: list[tuple[int, str]] = []
-
-    def codes(lines: Iterable[str]) -> Iterator[int]:
-        for count, line in enumerate(lines, start=1):
-            pair = split_line(line.rstrip("\n"), number) or split_line(line.strip(), number)
-            pair = pair or _split_of_others(line, number, folders)
-            if pair:
-                low, high = sorted((number[pair[0]], number[pair[1]]))
-                if low < high:
-                    yield low * len(ordered) + high
-            elif line.strip() and not line.lstrip().startswith("#"):
-                problems.append((count, line.strip()))
-
-    try:
-        with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
-            found = np.fromiter(codes(file), np.int64)
-    except OSError as error:
-        raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise OptionError(f"{path}: cannot be read ({error})") from error
-    if problems:
-        (count, line) = problems[0]
-        more = len(problems) - 1
-        raise OptionError(
-            f"{path}: line {count}: {line!r} is not two names of images"
-            f"{_suggestion(line, ordered)}" + f", nor are {more} more lines" * (more > 0)
-        )
+    found = _read_codes(path, ordered, folders)
     found.sort()  # np.unique takes seven times as much memory
     found = found[np.flatnonzero(np.diff(found, prepend=-1))]
     if not len(found):
@@ -213,12 +201,66 @@ def read_pairs(path: Path, names: Sequence[str], image_path: Path | None = None)
     return PairList(ordered, numbers)
 
 
+def _read_codes(path: Path, names: Sequence[str], folders: Sequence[str]) -> Indices:
+    """Return each pair of a list as one number, as :func:`_codes` says, (N,).
+
+    OptionError names the first line that is none.
+    """
+    problems: list[tuple[int, str]] = []
+    try:
+        with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
+            found = np.fromiter(_codes(file, names, folders, problems), np.int64)
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise OptionError(f"{path}: cannot be read ({error})") from error
+    if problems:
+        (line_number, line) = problems[0]
+        more = len(problems) - 1
+        others = f", nor are {more} more lines" if more else ""
+        raise OptionError(
+            f"{path}: line {line_number}: {line!r} is not two names of images"
+            f"{_suggestion(line, names)}{others}"
+        )
+    return found
+
+
+def _codes(
+    lines: Iterable[str],
+    names: Sequence[str],
+    folders: Sequence[str],
+    problems: list[tuple[int, str]],
+) -> Iterator[int]:
+    """Yield the pair of each line as one number, which takes little memory.
+
+    That is the smaller index among N ``names`` times N, plus the larger one. ``problems`` gets the
+    number and text of lines that are no pair.
+    """
+    number = {name: index for index, name in enumerate(names)}
+    for line_number, line in enumerate(lines, start=1):
+        pair = split_line(line.rstrip("\n"), number) or split_line(line.strip(), number)
+        pair = pair or _split_of_others(line, number, folders)
+        if pair:
+            low, high = sorted((number[pair[0]], number[pair[1]]))
+            if low < high:
+                yield low * len(names) + high
+        elif line.strip() and not line.lstrip().startswith("#"):
+            problems.append((line_number, line.strip()))
+
+
 def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) -> None:
-    """Write 'name1 name2' lines, with tabs if a name has white space; names for an iterator."""
+    """Write a line of two names for each pair, with a tab between if a name has white space.
+
+    Args:
+        path: the list, which is replaced as a whole.
+        pairs: that are written in their order.
+        names: of all images; needed where ``pairs`` is an iterator, which can be read only once.
+    """
     if not names:
         pairs = list(pairs)
-        names = {name for pair in pairs for name in pair}
-    separator = "\t" if any(re.search(r"\s", name) for name in names) else " "
+        names = set(itertools.chain.from_iterable(pairs))
+    has_blanks = any(re.search(r"\s", name) for name in names)
+    separator = "\t" if has_blanks else " "
     replace_text(path, (f"{first}{separator}{second}\n" for first, second in pairs))
 
 
@@ -248,7 +290,7 @@ def _split_of_others(line: str, known: Collection[str], folders: Sequence[str]) 
 
 def _spellings(folder: Path) -> tuple[str, ...]:
     """Return how the path of a folder may begin those of the files in it, the longest first."""
-    paths = {folder, folder.absolute(), resolved(folder)}
+    paths = (folder, folder.absolute(), resolved(folder))
     found = {path.as_posix() for path in paths} - {".", "/"}
     return tuple(sorted(found, key=len, reverse=True))
 
@@ -256,6 +298,8 @@ def _spellings(folder: Path) -> tuple[str, ...]:
 def _suggestion(line: str, names: Sequence[str]) -> str:
     known = set(names)
     words = line[:LONGEST_LINE].replace(",", " ").split()
-    unknown = [word for word in words if word not in known][:MAX_SUGGESTIONS]
-    close = [match for word in unknown for match in difflib.get_close_matches(word, names, n=1)]
+    unknown = [word for word in words if word not in known]
+    close = list[str]()
+    for word in unknown[:MAX_SUGGESTIONS]:
+        close += difflib.get_close_matches(word, names, n=1)
     return f" (did you mean {', '.join(close)}?)" if close else ""

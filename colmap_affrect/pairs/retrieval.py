@@ -5,6 +5,7 @@ its descriptors to their nearest words (Jegou et al. 2010), each of unit length 
 roots (Arandjelovic and Zisserman 2013), less what all images have in common.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import cv2
@@ -83,10 +84,20 @@ def retrieved_pairs(
     num_neighbors: int,
     progress: Progress,
 ) -> list[Pair]:
-    """Return pairs of images that are alike as a whole; none if all features are of warps."""
+    """Return pairs of images that are alike as a whole.
+
+    Args:
+        names: of the images.
+        read: returns the features of an image by its name.
+        num_neighbors: of an image on average, see :func:`~.lists.most_similar_pairs`.
+        progress: shows how many images are done.
+
+    Returns:
+        The pairs, sorted; none if all features are of warps.
+    """
     random = np.random.default_rng(0)
     sampled = random.permutation(len(names))[:NUM_SAMPLED_IMAGES]
-    num_each = -(-NUM_SAMPLES // max(1, len(sampled)))
+    num_each = math.ceil(NUM_SAMPLES / max(1, len(sampled)))
     samples = []
     with progress.stage("retrieval", len(sampled) + len(names), "images") as advance:
         for index in sampled:

@@ -44,7 +44,8 @@ PACKAGES = ("colmap-affrect", "distributed", "numpy", "opencv-python-headless", 
 
 def environment(paths: Iterable[str]) -> dict[str, str]:
     """Return what results depend on besides the task: versions of ``PACKAGES``, sizes of files."""
-    return {name: _version(name) for name in PACKAGES} | {path: _size(path) for path in paths}
+    versions = {package: _version(package) for package in PACKAGES}
+    return versions | {path: _size(path) for path in paths}
 
 
 def _version(package: str) -> str:
@@ -57,7 +58,9 @@ def _version(package: str) -> str:
 
 def _size(path: str) -> str:
     try:
-        return "a folder" if Path(path).is_dir() else f"{Path(path).stat().st_size} bytes"
+        if Path(path).is_dir():
+            return "a folder"
+        return f"{Path(path).stat().st_size} bytes"
     except OSError:
         return "missing"
 
@@ -195,10 +198,17 @@ class Cluster:
     def map(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
-        """See :class:`~colmap_affrect.parallel.executor.Executor`.
+        """Yield the results of tasks in their order, as every executor does.
 
-        Raises AffrectError when the scheduler or all workers are lost for long, several workers are
-        lost with one task, or a worker differs or does not see the files.
+        Args:
+            function: does a task. It does not change its state, and can be pickled.
+            tasks: they are taken when their turn comes, and can be pickled.
+            files: what the function reads.
+
+        Raises:
+            AffrectError: the scheduler or all workers are lost for long, several workers are lost
+                with one task, or a worker differs or does not see the files.
+            Exception: what the function raises, at the place of its task.
         """
         from distributed import KilledWorker
 
@@ -226,7 +236,8 @@ class Cluster:
                 f"{self._address}: the scheduler was lost; start it and run the same command again"
             ) from error
         except (ModuleNotFoundError, RuntimeError) as error:
-            if not isinstance(why := error.__cause__ or error, ModuleNotFoundError):
+            why = error.__cause__ or error
+            if not isinstance(why, ModuleNotFoundError):
                 raise
             raise AffrectError(
                 f"{self._address}: scheduler or workers do not have this version of colmap-affrect "

@@ -32,11 +32,15 @@ class Executor(Protocol):
     def map(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
-        """Yield ``function(task)`` in task order, or raise what it raises; few tasks are in flight.
+        """Yield the results of tasks in their order; few tasks are in flight.
 
-        The function does not change its state; it and the tasks, which are taken from the iterable
-        when their turn comes, can be pickled. ``files`` are what it reads, which is refused
-        where workers do not see the same.
+        Args:
+            function: does a task. It does not change its state, and can be pickled.
+            tasks: they are taken when their turn comes, and can be pickled.
+            files: what the function reads, which is refused where workers do not see the same.
+
+        Raises:
+            Exception: what the function raises, at the place of its task.
         """
 
 
@@ -49,22 +53,31 @@ class Threads:
     def map(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
-        """See :func:`map_ordered`."""
+        """Yield the results of tasks in their order, see :func:`map_ordered`.
+
+        Args:
+            function: does a task.
+            tasks: they are taken when their turn comes.
+            files: what the function reads, which this process sees.
+        """
         del files
         return map_ordered(function, tasks, self.num_threads)
 
 
 def available_cores() -> int:
     """Return the number of cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def available_memory_bytes() -> int:
     """Return the memory that this process may take without harm to others."""
     available = ASSUMED_MEMORY_BYTES
     with suppress(OSError):
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        available = next(int(s.split()[1]) * 1024 for s in lines if s.startswith("MemAvailable:"))
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                available = int(line.split()[1]) * 1024
     with suppress(OSError, ValueError):  # no container, or one without a limit
         limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")
         available = min(available, int(limit))
@@ -77,9 +90,10 @@ def peak_memory_bytes() -> int:
         import resource
     except ImportError:
         return 0
-    whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes
-    return unit * max(resource.getrusage(which).ru_maxrss for which in whose)
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    of_others = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    unit_bytes = 1 if sys.platform == "darwin" else 1024
+    return unit_bytes * max(own, of_others)
 
 
 def return_freed_memory() -> None:
@@ -103,12 +117,20 @@ def one_openmp_thread() -> Iterator[None]:
 def map_ordered(
     function: Callable[[Task], Result], tasks: Iterable[Task], num_threads: int
 ) -> Iterator[Result]:
-    """Yield ``function(task)`` in task order; at most two tasks per thread are in flight.
+    """Yield the results of tasks in their order; at most two tasks per thread are in flight.
 
     Meanwhile numpy's linear algebra keeps to the calling thread, and OpenCV to its share of the
-    cores: thread pools of their own in every task would only wait for each other. An exception of
-    the function is raised at the place of its task. Work that has not begun is dropped when the
-    iteration ends early; KeyboardInterrupt does not wait for what has begun either.
+    cores: thread pools of their own in every task would only wait for each other. Work that has not
+    begun is dropped when the iteration ends early; KeyboardInterrupt does not wait for what has
+    begun either.
+
+    Args:
+        function: does a task, in one of the threads.
+        tasks: they are taken when their turn comes, in the calling thread.
+        num_threads: that work.
+
+    Raises:
+        Exception: what the function raises, at the place of its task.
     """
     pool = ThreadPoolExecutor(num_threads)
     is_waited_for = True

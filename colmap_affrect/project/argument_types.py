@@ -38,13 +38,30 @@ def checks_arguments(function: Callable[Arguments, Result]) -> Callable[Argument
 
 
 def require_type(name: str, value: Any, kind: Any) -> None:
-    """Refuse a value of another type than annotated; OptionError says what to give."""
+    """Refuse a value of another type than annotated.
+
+    Args:
+        name: of the argument.
+        value: that it was given.
+        kind: its annotation.
+
+    Raises:
+        OptionError: says what to give.
+    """
     if _fits(value, kind):
         return
+    if kind is bool:
+        raise OptionError(f"{name}={_shown(value)}: give True or False")
     if get_origin(kind) is Literal:
         known = ", ".join(map(str, get_args(kind)))
         raise OptionError(f"{name} {_shown(value)} is not one of {known}")
     raise OptionError(f"{name}: {_shown(value)} is {type(value).__name__}; give {_name_of(kind)}")
+
+
+def require_bools(**given: Any) -> None:
+    """Refuse arguments, by their names, that are neither True nor False."""
+    for name, value in given.items():
+        require_type(name, value, bool)
 
 
 def _shown(value: Any) -> str:
@@ -81,8 +98,7 @@ def _is_instance(value: Any, kind: Any) -> bool:
     if getattr(kind, "_is_protocol", False):
         wanted = [name for name in vars(kind) if not name.startswith("_")]
         return all(hasattr(value, name) for name in wanted)
-    if kind is bool:  # None and 0 are false; "no" would be true
-        return not isinstance(value, collections.abc.Collection)
+
     if kind in NUMBERS:
         return isinstance(value, NUMBERS[kind]) and not isinstance(value, bool)
     return isinstance(value, kind)

@@ -19,8 +19,10 @@ ROWS = "p,a.jpg,10.5,20\np,b,30,40.25\nq,c.png,1,2\n"
 
 def marked(path: Path, text: str) -> dict[str, dict[str, list[float]]]:
     path.write_text(text, encoding="utf-8")
-    found = read_marks(path, NAMES)
-    return {p: {name: xy.tolist() for name, xy in seen.items()} for p, seen in found.items()}
+    found: dict[str, dict[str, list[float]]] = {}
+    for point, marks in read_marks(path, NAMES).items():
+        found[point] = {name: mark.tolist() for name, mark in marks.items()}
+    return found
 
 
 @pytest.mark.parametrize("text", [

@@ -71,8 +71,10 @@ def rows(lafs: NDArray[np.float64], columns: int = 6) -> NDArray[np.float32]:
 
 def weak_pair(*, frames_agree: bool, planar: bool = False) -> Frames:
     """28 right matches among 130; their positions alone are too few."""
-    normals = [(0.05, 0.02, 0.2)] if planar else [(0.05, 0.02, 0.2), (-0.1, 0.1, 0.3)]
-    homographies = [HOMOGRAPHY] if planar else [plane_homography(np.array(n)) for n in normals]
+    homographies = [HOMOGRAPHY]
+    if not planar:
+        near = plane_homography(np.array((0.05, 0.02, 0.2)))
+        homographies = [near, plane_homography(np.array((-0.1, 0.1, 0.3)))]
     first, second = frames_of(homographies, 28, 1)
     other1, other2 = frames_of([HOMOGRAPHY], 102, 2)
     other2[:, :, 2] = np.random.default_rng(3).uniform((0, 0), SIZE, (102, 2))
@@ -82,10 +84,21 @@ def weak_pair(*, frames_agree: bool, planar: bool = False) -> Frames:
     return np.concatenate([first, other1]), np.concatenate([second, other2])
 
 
+def sides_of(frames: Frames, columns: int = 6) -> tuple[Side, Side]:
+    """Both images of a pair, with their frames as keypoints."""
+    first, second = frames
+    return Side(camera(1), rows(first, columns)), Side(camera(2), rows(second, columns))
+
+
+def row_by_row(count: int) -> NDArray[np.int64]:
+    """Matches of each keypoint of one image with the same one of the other image."""
+    numbers = np.arange(count)
+    return np.stack([numbers, numbers], axis=1)
+
+
 def num_inliers(frames: Frames, columns: int = 6, **options: float) -> int:
-    sides = tuple(Side(camera(i), rows(lafs, columns)) for i, lafs in enumerate(frames, 1))
-    matches = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
-    geometry = estimate_geometry(sides, matches, VerificationOptions(**options))
+    matches = row_by_row(len(frames[0]))
+    geometry = estimate_geometry(sides_of(frames, columns), matches, VerificationOptions(**options))
     return len(geometry.inlier_matches)
 
 
@@ -93,7 +106,8 @@ def num_inliers(frames: Frames, columns: int = 6, **options: float) -> int:
 @pytest.mark.parametrize("planar", [False, True])
 def test_frames_decide_where_positions_do_not(planar: bool) -> None:
     # With a plane the epipolar geometry is arbitrary: only its homography can agree.
-    right, wrong = (weak_pair(frames_agree=agree, planar=planar) for agree in (True, False))
+    right = weak_pair(frames_agree=True, planar=planar)
+    wrong = weak_pair(frames_agree=False, planar=planar)
     by_colmap = VerificationOptions().min_num_inliers
     assert num_inliers(right, min_significance=0.0) >= by_colmap
     assert num_inliers(wrong, min_significance=0.0) == num_inliers(right, min_significance=0.0)
@@ -115,11 +129,10 @@ def test_homography_is_judged_where_epipolar_lines_are_not_significant(frames_ag
     if not frames_agree:
         second[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, 22)) @ second[:, :, :2]
     frames = np.concatenate([first, other1]), np.concatenate([second, other2])
-    sides = [Side(camera(i), rows(lafs)) for i, lafs in enumerate(frames, 1)]
-    same = np.stack([np.arange(180)] * 2, axis=1)
+    sides = sides_of(frames)
 
     def estimated(**options: float) -> pycolmap.TwoViewGeometry:
-        return estimate_geometry((sides[0], sides[1]), same, VerificationOptions(**options))
+        return estimate_geometry(sides, row_by_row(180), VerificationOptions(**options))
 
     lines = estimated(min_significance=0.0)
     plane = estimated(min_significance=30.0)
@@ -145,18 +158,19 @@ def test_database_without_shapes_needs_more_inliers() -> None:
     for lafs in upright:
         lafs[:, :, :2] = 3.0 * np.eye(2)
     assert num_inliers((upright[0], upright[1]), min_significance=5.0) == 0
-    many = tuple(np.concatenate(two) for two in zip(frames, frames, strict=True))
-    assert num_inliers((many[0], many[1]), columns=2, min_significance=5.0) > 0
+    many = (np.concatenate([frames[0], frames[0]]), np.concatenate([frames[1], frames[1]]))
+    assert num_inliers(many, columns=2, min_significance=5.0) > 0
 
 
 def write_pairs(path: Path) -> None:
     """Write images 1 to 4: a right pair (1, 2) and a wrong one (3, 4)."""
-    pairs = [weak_pair(frames_agree=agree) for agree in (True, False)]
+    right = weak_pair(frames_agree=True)
+    wrong = weak_pair(frames_agree=False)
     with open_database(path) as database:
         write_images(database, camera(1), "1234")
-        for image_id, lafs in enumerate((*pairs[0], *pairs[1]), 1):
+        for image_id, lafs in enumerate((*right, *wrong), 1):
             database.write_keypoints(image_id, rows(lafs))
-        same = np.stack([np.arange(len(pairs[0][0]))] * 2, axis=1)
+        same = row_by_row(len(right[0]))
         for pair in ((1, 2), (3, 4)):
             write_matches(database, *pair, same)
 
@@ -239,10 +253,8 @@ def test_writing_at_another_place_ties_no_pair_and_leaves_none() -> None:
     wrong = np.random.default_rng(3).permutation(80)
     unrelated = scene[0], scene[1][wrong]
     for frames, expected in (scene, 80), (unrelated, 0):
-        sides = tuple(
-            Side(camera(number), rows(lafs)) for number, lafs in enumerate(with_caption(frames), 1)
-        )
-        matches = np.stack([np.arange(120)] * 2, axis=1)
+        sides = sides_of(with_caption(frames))
+        matches = row_by_row(120)
         found = estimate_geometry((sides[0], sides[1]), matches, VerificationOptions())
         inliers = np.asarray(found.inlier_matches).reshape(-1, 2)[:, 0]
         assert (inliers < 80).sum() >= 0.95 * expected

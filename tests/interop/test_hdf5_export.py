@@ -70,23 +70,34 @@ def test_our_own_files_are_read_by_hlocs_rules(finished: tuple[Path, Path]) -> N
         assert_array_equal(turned, found[:, ::-1])
 
 
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Return the content of the files of a folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
 @pytest.mark.parametrize("source", ["folder", "database"])
 def test_files_of_a_run_and_of_its_database_give_the_same_database(
     finished: tuple[Path, Path], tmp_path: Path, source: str
 ) -> None:
     photos, out = finished
-    before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
-    files = out / "features.h5", out / "matches.h5"
+    before = files_of(out)
+    folder = out
     if source == "database":
-        files = tmp_path / "features.h5", tmp_path / "matches.h5"
-        exported = export_h5(out / "database.db", *files)
-    imported = import_h5(photos, *files, tmp_path / "new.db", cameras=PINHOLE)
-    assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+        folder = tmp_path
+        exported = export_h5(out / "database.db", folder / "features.h5", folder / "matches.h5")
+    imported = import_h5(
+        photos,
+        folder / "features.h5",
+        folder / "matches.h5",
+        tmp_path / "new.db",
+        cameras=PINHOLE,
+    )
+    assert files_of(out) == before
     assert (imported.num_pairs, imported.num_verified) == (6, 6)
     if source == "database":
         assert exported.num_keypoints == imported.num_keypoints
         assert exported.num_matches == imported.num_matches
-        assert {path.name for path in tmp_path.iterdir()} == {"features.h5", "matches.h5", "new.db"}
+        assert files_of(tmp_path).keys() == {"features.h5", "matches.h5", "new.db"}
     keypoints, pairs = read_database(out / "database.db")
     new_keypoints, new_pairs = read_database(tmp_path / "new.db")
     assert new_pairs == pairs

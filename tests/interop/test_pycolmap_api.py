@@ -117,6 +117,12 @@ def test_reader_options_and_camera_mode_are_those_of_pycolmap(photos: Path, tmp_
         ]
 
 
+def image_rows(database: pycolmap.Database) -> list[tuple[int, str, int, int]]:
+    """Return id, name, camera and frame of each image."""
+    images = database.read_all_images()
+    return [(image.image_id, image.name, image.camera_id, image.frame_id) for image in images]
+
+
 @pytest.mark.long
 def test_features_are_replaced_in_a_new_database_and_the_old_one_stays(
     photos: Path, sift: Path, tmp_path: Path
@@ -128,13 +134,10 @@ def test_features_are_replaced_in_a_new_database_and_the_old_one_stays(
 
     with open_database(sift) as old, open_database(tmp_path / "new.db") as new:
         for kind in ("cameras", "rigs", "frames", "pose_priors"):
-            items = [getattr(data, f"read_all_{kind}")() for data in (old, new)]
-            assert len(items[0]) > 0
-            assert repr(items[0]) == repr(items[1])
-        images = [data.read_all_images() for data in (old, new)]
-        assert [(i.image_id, i.name, i.camera_id, i.frame_id) for i in images[0]] == [
-            (i.image_id, i.name, i.camera_id, i.frame_id) for i in images[1]
-        ]
+            found = getattr(new, f"read_all_{kind}")()
+            assert len(found) > 0
+            assert repr(found) == repr(getattr(old, f"read_all_{kind}")())
+        assert image_rows(new) == image_rows(old)
         assert new.num_verified_image_pairs() == 6
         assert not new.exists_descriptors(1)
     store = FeatureStore(Workspace.beside(tmp_path / "new.db").features)

@@ -186,16 +186,6 @@ def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
     assert model.sure == (third,)
 
 
-@pytest.mark.parametrize("name", ["sparse", "incremental", "global"])
-def test_models_of_fewer_images_than_wanted_are_dropped(tmp_path: Path, name: str) -> None:
-    path = tmp_path / "database.db"
-    synthesize(path, num_rigs=3, num_points3D=150)
-    models, _ = reconstruct(path, mapper_of(name, min_model_size=4))
-    assert not models
-    (model,), _ = reconstruct(path, mapper_of(name, min_model_size=3))
-    assert len(model.registered_names) == 3
-
-
 def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +237,23 @@ def test_two_places_make_two_models_the_largest_first(two_places: Workspace, map
     for folder, names in zip(folders, (large, small), strict=True):
         model = pycolmap.Reconstruction(folder)
         assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(names)
+
+
+@pytest.mark.parametrize(("min_model_size", "num_models"), [(3, 1), (4, 0), (2, 2)])
+def test_models_of_fewer_images_than_wanted_are_dropped(
+    two_places: Workspace, min_model_size: int, num_models: int
+) -> None:
+    mapper = mapper_of(MAPPERS.default, min_model_size=min_model_size)
+    report = map_and_report(Context(two_places), mapper, overwrite=True)
+    assert len(report.models) == num_models
+
+
+@pytest.mark.parametrize("min_model_size", [4, 10])
+def test_a_model_of_a_small_set_is_large_enough(tmp_path: Path, min_model_size: int) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=3, num_points3D=150)
+    (model,), _ = reconstruct(path, mapper_of(MAPPERS.default, min_model_size=min_model_size))
+    assert len(model.registered_names) == 3
 
 
 @pytest.mark.parametrize(("probability", "num_images"), [(0.2, 3), (0.04, 2)])

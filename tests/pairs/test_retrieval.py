@@ -44,31 +44,35 @@ def vectors_of(images: list[NDArray[np.float32]]) -> NDArray[np.float16]:
 def test_images_of_one_place_find_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retrieval, "NUM_WORDS", 64)
     images, places = images_of_places([8, 3, 5, 4], 0)
-    order = np.random.default_rng(0).permutation(len(images))
-    names = [f"{number:02d}" for number in range(len(order))]
-    place_of = {name: places[index] for name, index in zip(names, order, strict=True)}
-    rows = similarities(vectors_of([images[index] for index in order]))
-    pairs = most_similar_pairs(names, rows, 5)
-    right = sum(place_of[first] == place_of[second] for first, second in pairs)
+    place_of = {}
+    shuffled = []
+    for number, index in enumerate(np.random.default_rng(0).permutation(len(images))):
+        place_of[f"{number:02d}"] = places[index]
+        shuffled.append(images[index])
+    pairs = most_similar_pairs(list(place_of), similarities(vectors_of(shuffled)), 5)
+    num_right = 0
+    for first, second in pairs:
+        num_right += place_of[first] == place_of[second]
     assert len(pairs) == 50
-    assert right >= 45  # of 28 + 3 + 10 + 6 = 47 that there are
+    assert num_right >= 45  # of 28 + 3 + 10 + 6 = 47 that there are
 
 
 def test_vector_is_that_of_a_plain_loop() -> None:
     random = np.random.default_rng(1)
     vocabulary = unit_rows(random.random((5, 8)))
     descriptors = unit_rows(random.random((40, 8)))
-    words = [
-        int(np.argmin([np.linalg.norm(row - word) for word in vocabulary])) for row in descriptors
-    ]
     expected = np.zeros((5, 8))
-    for word in set(words):
-        members = [row for row, other in zip(descriptors, words, strict=True) if other == word]
-        expected[word] = sum(row - vocabulary[word] for row in members)
+    nearest = []
+    for descriptor in descriptors:
+        distances = np.linalg.norm(descriptor - vocabulary, axis=1)
+        word = int(np.argmin(distances))
+        nearest.append(word)
+        expected[word] += descriptor - vocabulary[word]
+    for word in set(nearest):
         expected[word] /= np.linalg.norm(expected[word])
     expected = np.sign(expected) * np.sqrt(np.abs(expected))
     expected /= np.linalg.norm(expected)
-    assert nearest_words(descriptors, vocabulary).tolist() == words
+    assert nearest_words(descriptors, vocabulary).tolist() == nearest
     assert_allclose(image_vector(descriptors, vocabulary), expected.ravel(), atol=1e-3)
 
 

@@ -110,6 +110,13 @@ def test_run_registers_all_photographs_and_leaves_all_results(finished: Finished
     stages = ["extract", "pairs", "match", "verify", "escalate", "guide", "map"]
     assert workspace.recorded().keys() == {"recipe", "begun", *stages, "made_from", "mapped"}
     assert workspace.begun == stages
+    lines = FeatureStore(workspace.features).lines(names[0])
+    assert lines is not None
+    assert report.lines.keys() == set(names)
+    assert report.lines[names[0]].num_segments == len(lines.segments)
+    said = json.loads(workspace.report.read_text(encoding="utf-8"))["lines"]
+    assert said[names[0]]["num_segments"] == len(lines.segments)
+    assert 'id="lines"' in workspace.page.read_text(encoding="utf-8")
 
 
 def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(
