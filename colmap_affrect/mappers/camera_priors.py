@@ -17,7 +17,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
 from colmap_affrect.geometry import lines as line_model
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.lines import KNOWN_SIGMA, LineCamera
+from colmap_affrect.geometry.lines import (
+    KNOWN_SIGMA,
+    MIDDLE_SIGMA,
+    SHIFTED_SIGMA,
+    LineCamera,
+)
 
 # The usual focal length and its deviation are judged on lenses of 25 to 70 mm on 35 mm film; the
 # deviation by EXIF covers rounding and the distance of focus.
@@ -32,8 +37,6 @@ CROP_SIGMA = 0.2
 """Of the logarithm of the focal length of a crop, around that of the whole photograph in px: some
 crops were enlarged or shrunk, too (judged)."""
 DISTORTION_SIGMA = 0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
-CENTER_SIGMA = 0.02  # longer sides, of the principal point of a whole photograph (judged)
-SHIFTED_SIGMA = 0.15  # longer sides, of that of a crop, or of a view camera up and down (judged)
 SHIFTED_SHARE = 0.2  # of the photographs of which nothing is known (judged)
 NO_SHARE = 1e-9  # of measurements that are false
 WIDE_SIGMA = 1.0  # of the logarithm of a focal length of which nothing is expected
@@ -257,7 +260,7 @@ def _principal_point(
     ):
         return None
     longer_px = max(camera.width, camera.height)
-    across = Normal(0.0, CENTER_SIGMA)
+    across = Normal(0.0, MIDDLE_SIGMA)
     down = _shift(lines)
     if record.uncropped_px:
         across = Normal(0.0, SHIFTED_SIGMA)
@@ -273,7 +276,7 @@ def _principal_point(
 
 def usual_principal_point(camera: pycolmap.Camera) -> PrincipalPointPrior:
     """Return what is known of the principal point of a whole photograph."""
-    sigma_px = CENTER_SIGMA * max(camera.width, camera.height)
+    sigma_px = MIDDLE_SIGMA * max(camera.width, camera.height)
     return PrincipalPointPrior((camera.width / 2.0, camera.height / 2.0), (sigma_px, sigma_px))
 
 
@@ -294,7 +297,7 @@ def _shift(lines: Iterable[LineCamera]) -> Normal | None:
         return None
     measured = Normal(weighted / precision, precision**-0.5)
     odds = SHIFTED_SHARE / (1.0 - SHIFTED_SHARE)
-    odds *= measured.likelihood(SHIFTED_SIGMA) / measured.likelihood(CENTER_SIGMA)
+    odds *= measured.likelihood(SHIFTED_SIGMA) / measured.likelihood(MIDDLE_SIGMA)
     if odds < 1.0:
         return None
     together = precision + SHIFTED_SIGMA**-2

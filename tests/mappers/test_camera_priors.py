@@ -11,12 +11,10 @@ import pytest
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.geometry import lines
-from colmap_affrect.geometry.lines import LineCamera
+from colmap_affrect.geometry.lines import MIDDLE_SIGMA, SHIFTED_SIGMA, LineCamera
 from colmap_affrect.mappers.camera_priors import (
-    CENTER_SIGMA,
     EXIF_SIGMA,
     LINES_SIGMA,
-    SHIFTED_SIGMA,
     USUAL_FOCAL,
     USUAL_SIGMA,
     ZOOMS,
@@ -114,7 +112,7 @@ def test_a_shift_that_lines_tell_frees_the_principal_point_and_others_do_not() -
     shifted = camera_prior(camera(), NOTHING, [by_lines(1.2, 0.1, 0.18, 0.04)])
     assert shifted.principal_point
     assert shifted.principal_point.center_px == pytest.approx((500.0, 350.0 + 180.0))
-    assert shifted.principal_point.sigmas_px == pytest.approx([1000 * CENTER_SIGMA, 40.0])
+    assert shifted.principal_point.sigmas_px == pytest.approx([1000 * MIDDLE_SIGMA, 40.0])
     for unclear in (by_lines(1.2, 0.1, 0.05, 0.09), by_lines(1.2, 0.1, 0.01, 0.02)):
         assert camera_prior(camera(), NOTHING, [unclear]).principal_point is None
     twice = [by_lines(1.2, 0.1, 0.08, 0.04)] * 3  # of one camera
@@ -128,7 +126,7 @@ def test_a_principal_point_costs_by_its_deviation() -> None:
     prior = replace(camera_prior(moved, NOTHING), principal_point=usual_principal_point(moved))
     assert prior.cost_of(moved) == pytest.approx(0.0)
     assert usual_principal_point(moved).sigmas_px == (20.0, 20.0)
-    moved.principal_point_y += 2.0 * CENTER_SIGMA * 1000
+    moved.principal_point_y += 2.0 * MIDDLE_SIGMA * 1000
     assert prior.cost_of(moved) == pytest.approx(2.0)
 
 
