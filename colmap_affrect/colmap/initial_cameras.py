@@ -44,13 +44,8 @@ from colmap_affrect.images.exif import (
     exif_focal,
     read_camera_tags,
 )
-from colmap_affrect.images.photographs import (
-    IMAGE_SUFFIXES,
-    CameraOptions,
-    photograph_files,
-    require_folder,
-)
-from colmap_affrect.images.reading import why_unusable
+from colmap_affrect.images.photographs import CameraOptions, photograph_files, require_folder
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, why_unusable
 from colmap_affrect.project.outputs import database_files, remove_own, temporary_folder
 
 MAX_LINES = 5  # that are logged; report.json says all

@@ -30,7 +30,8 @@ def cameras_that_tell_distortion(graph: PairGraph) -> frozenset[int]:
     for image_id, num_partners in _num_partners(graph).items():
         camera = graph.cameras[image_id]
         key = camera.camera_id
-        redundancies[key] += redundancy_of(camera, graph.keypoints[image_id], num_partners)
+        keypoints = graph.keypoints[image_id].astype(np.float64)
+        redundancies[key] += redundancy_of(camera, keypoints, num_partners)
         num_images[key] += 1
     found = set[int]()
     for key, redundancy in redundancies.items():
@@ -57,7 +58,8 @@ def redundancy_of(camera: pycolmap.Camera, keypoints: Array, num_partners: Indic
         num_partners: (N,) numbers of other images in which they are matched.
     """
     cells = (keypoints / [camera.width, camera.height] * GRID).astype(np.int64)
-    numbers = np.clip(cells, 0, GRID - 1) @ [1, GRID]
+    columns, rows = np.clip(cells, 0, GRID - 1).T
+    numbers: Indices = columns + GRID * rows
     most = np.zeros(GRID * GRID, np.int64)
     np.maximum.at(most, numbers, num_partners)
     num_views = most[most > 0] + 1
