@@ -37,7 +37,11 @@ class VanishingFit:
     """
 
     def __init__(
-        self, segments: Segments, rotations: Floats, focals: Floats, shifts: Floats
+        self,
+        segments: Segments,
+        rotations: Floats,
+        focals: Floats,
+        shifts: Floats,
     ) -> None:
         self.segments = segments
         self.rotations = rotations
@@ -123,7 +127,11 @@ class VanishingFit:
 
 
 def refined(
-    segments: Segments, rotations: Floats, focals: Floats, shifts: Floats, num_steps: int
+    segments: Segments,
+    rotations: Floats,
+    focals: Floats,
+    shifts: Floats,
+    num_steps: int,
 ) -> tuple[Floats, Floats]:
     """Turn cameras so that their vanishing points explain more segments.
 

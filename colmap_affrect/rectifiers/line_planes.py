@@ -66,7 +66,11 @@ class LinePlanes(WithInputs):
         return RectificationPlan(photograph.size, tuple(items))
 
     def _warps(
-        self, is_of_plane: NDArray[np.bool_], normal: Floats, camera: Array, first_number: int
+        self,
+        is_of_plane: NDArray[np.bool_],
+        normal: Floats,
+        camera: Array,
+        first_number: int,
     ) -> list[Rectification]:
         """Return the warps of the connected regions of one plane.
 
@@ -104,7 +108,9 @@ def camera_matrix_of(explanation: Explanation, size: tuple[int, int]) -> Array:
 
 
 def plane_labels(
-    segments: Segments, explanation: Explanation, size: tuple[int, int]
+    segments: Segments,
+    explanation: Explanation,
+    size: tuple[int, int],
 ) -> NDArray[np.int32]:
     """Return which pair of directions spans the plane at each pixel.
 

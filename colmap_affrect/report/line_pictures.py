@@ -146,7 +146,10 @@ def _gray_values(image: NDArray[Any]) -> GrayImage:
 
 
 def line_sheet(
-    gray: GrayImage, lines: Lines, report: LineReport, mask: Mask | None = None
+    gray: GrayImage,
+    lines: Lines,
+    report: LineReport,
+    mask: Mask | None = None,
 ) -> bytes:
     """Draw a photograph with its lines in the colours of their directions, as PNG.
 
