@@ -11,6 +11,7 @@ from typing import Any
 
 from colmap_affrect.errors import such_as
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
 
 NUM_WORST = 3  # tie points that a summary names
@@ -366,6 +367,8 @@ class ReconstructionReport(Summarized):
     ``matches_before`` and ``matches_after``; empty where no pair needed it."""
     cameras: tuple[dict[str, Any], ...] = ()
     """The cameras, and where their focal lengths are from."""
+    lines: dict[str, LineReport] = field(default_factory=dict)
+    """What the straight lines of photographs say of their cameras, by name."""
     by_hand: tuple[str, ...] = ()
     """What was done otherwise than matches alone say."""
     effort: str = ""

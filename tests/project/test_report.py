@@ -89,7 +89,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "recipe": "default", "preset": "sparse", "mapper": "incremental",
         "mapper_options": {"mapper.init_max_error": 3.0}, "verification": {"min_num_inliers": 20},
         "mapping": {"min_model_size": 2}, "random_seed": 7, "versions": {"pycolmap": "4.2.1"},
-        "by_hand": [], "tie_points": [], "one_view": [],
+        "by_hand": [], "tie_points": [], "one_view": [], "lines": {},
         "effort": "", "matched_again": [], "untried": [],
     }  # fmt: skip
     assert [(stage["name"], stage["wall_s"]) for stage in stages] == [
