@@ -287,15 +287,18 @@ class Adjuster:
         """Hold what of a camera is known, and add the prior of what is not."""
         prior = self.priors[camera.camera_id]
         fixed = self._fixed_parameters(camera)
-        if len(fixed) == len(camera.params):
+        number = len(camera.params)
+        if len(fixed) == number:
             problem.set_parameter_block_constant(camera.params)
             return
         if fixed:
-            manifold = pyceres.SubsetManifold(len(camera.params), fixed)
-            problem.set_manifold(camera.params, manifold)
+            problem.set_manifold(camera.params, pyceres.SubsetManifold(number, fixed))
         if prior.sigma:
-            cost = IntrinsicsCost(camera, prior, self.noise_px, fixed)
-            problem.add_residual_block(cost, None, [camera.params])
+            problem.add_residual_block(
+                IntrinsicsCost(camera, prior, self.noise_px, fixed),
+                None,
+                [camera.params],
+            )
 
     def _fixed_parameters(self, camera: pycolmap.Camera) -> list[int]:
         """Return the indices of the parameters of a camera that are held."""

@@ -219,11 +219,7 @@ def camera_prior(
     if record.source in TRUSTED if record else camera.has_prior_focal_length:
         return CameraPrior(focal_px, EXIF_SIGMA)
     longer_px = max(camera.width, camera.height)
-    told = list[Measurement]()
-    for line_camera in lines:
-        measured = measurement_of_lines(line_camera)
-        if measured:
-            told.append(measured)
+    told = [measured for measured in map(measurement_of_lines, lines) if measured]
     usual = USUAL
     if record and record.uncropped_px:
         usual = LogNormal(record.uncropped_px / longer_px, CROP_SIGMA)
@@ -239,11 +235,8 @@ def camera_prior(
 
 def _starts(focal_px: LogNormal) -> tuple[float, ...]:
     """Return the focal lengths near which models begin, the likeliest first."""
-    starts = list[float]()
     zooms = ZOOMS if focal_px.sigma > KNOWN_SIGMA else ZOOMS[:1]
-    for zoom in zooms:
-        starts.append(focal_px.focal * zoom ** (focal_px.sigma / USUAL_SIGMA))
-    return tuple(starts)
+    return tuple(focal_px.focal * zoom ** (focal_px.sigma / USUAL_SIGMA) for zoom in zooms)
 
 
 def _principal_point(
@@ -319,8 +312,7 @@ def camera_priors(
     found = {}
     for camera in cameras:
         record = records.get(camera.camera_id)
-        names = record.names if record else ()
-        of_images = [lines[name] for name in names if name in lines]
+        of_images = [lines[name] for name in (record.names if record else ()) if name in lines]
         found[camera.camera_id] = camera_prior(camera, record, of_images)
     return found
 
@@ -342,12 +334,10 @@ def focal_contradictions(
         record = records.get(camera.camera_id)
         if record is None or record.source not in TRUSTED:
             continue
-        told = list[Measurement]()
-        for name in record.names:
-            measured = measurement_of_lines(lines[name]) if name in lines else None
-            if measured:
-                told.append(replace(measured, false_share=NO_SHARE))
-        by_lines = product(LogNormal(USUAL_FOCAL, WIDE_SIGMA), told)
+        of_images = [lines[name] for name in record.names if name in lines]
+        told = [measured for measured in map(measurement_of_lines, of_images) if measured]
+        certain = [replace(measured, false_share=NO_SHARE) for measured in told]
+        by_lines = product(LogNormal(USUAL_FOCAL, WIDE_SIGMA), certain)
         longer_px = max(camera.width, camera.height)
         said_px = float(camera.mean_focal_length())
         difference = math.log(said_px / (by_lines.focal * longer_px))

@@ -182,10 +182,12 @@ class Search:
         """Return a search whose unknown focal lengths begin at one of their starts, or the last."""
         priors = {}
         for key, prior in self.unknown.items():
-            starts_px = prior.starts_px
             sigma = min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma
-            start_px = starts_px[min(number, len(starts_px) - 1)]
-            priors[key] = replace(prior, focal_px=start_px, sigma=sigma)
+            priors[key] = replace(
+                prior,
+                focal_px=prior.starts_px[min(number, len(prior.starts_px) - 1)],
+                sigma=sigma,
+            )
         return self._with_priors(priors)
 
     def _with_focals_of(self, model: pycolmap.Reconstruction) -> Self:

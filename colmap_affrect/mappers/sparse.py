@@ -185,10 +185,10 @@ class SparseMapper(IncrementalMapper):
             for key, prior in priors.items():
                 priors[key] = replace(prior, sigma=prior.sigma or EXIF_SIGMA)
         told = cameras_that_tell_distortion(graph)
-        for key, prior in priors.items():
-            if prior.is_unknown:
-                priors[key] = replace(prior, has_distortion=key in told)
-        return priors
+        return {
+            key: replace(prior, has_distortion=key in told or not prior.is_unknown)
+            for key, prior in priors.items()
+        }
 
     def _constant_cameras(
         self, task: MappingTask, graph: PairGraph, native: pycolmap.IncrementalPipelineOptions
