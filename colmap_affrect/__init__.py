@@ -48,6 +48,8 @@ _NAMES_OF_MODULES = {
     "project.reasons": ("Doubt", "Missing"),
     "project.report": ("ModelSummary", "ReconstructionReport", "StageReport"),
     "recipes": ("ExtractionOptions", "Recipe", "load_recipe", "recipe_names"),
+    "project.line_report": ("LineReport",),
+    "report.line_pictures": ("LineReports", "camera_from_lines", "report_lines"),
     "report.run_report": ("RunReport",),
     "session.context": ("Resources",),
     "session.run_options": ("RunOptions",),

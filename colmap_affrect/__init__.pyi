@@ -56,6 +56,7 @@ from colmap_affrect.pipeline import match as match
 from colmap_affrect.pipeline import run as run
 from colmap_affrect.pipeline import verify as verify
 from colmap_affrect.progress import Progress as Progress
+from colmap_affrect.project.line_report import LineReport as LineReport
 from colmap_affrect.project.reasons import Doubt as Doubt
 from colmap_affrect.project.reasons import Missing as Missing
 from colmap_affrect.project.report import ModelSummary as ModelSummary
@@ -65,6 +66,9 @@ from colmap_affrect.recipes import ExtractionOptions as ExtractionOptions
 from colmap_affrect.recipes import Recipe as Recipe
 from colmap_affrect.recipes import load_recipe as load_recipe
 from colmap_affrect.recipes import recipe_names as recipe_names
+from colmap_affrect.report.line_pictures import LineReports as LineReports
+from colmap_affrect.report.line_pictures import camera_from_lines as camera_from_lines
+from colmap_affrect.report.line_pictures import report_lines as report_lines
 from colmap_affrect.report.run_report import RunReport as RunReport
 from colmap_affrect.session.context import Resources as Resources
 from colmap_affrect.session.run_options import RunOptions as RunOptions

@@ -40,7 +40,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.advice import advice
 from colmap_affrect.report.pairs import draw_pairs_to_check
 from colmap_affrect.report.run_page import RunContent, write_run_page
-from colmap_affrect.report.run_report import RunReport, cameras_of_report
+from colmap_affrect.report.run_report import RunReport, cameras_of_report, lines_of_report
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
@@ -467,6 +467,7 @@ def map_and_report(
         mapping=options.to_mapping(),
         guided={} if copied else guided_counts(context),
         cameras=cameras_of_report(workspace, models, before),
+        lines={} if copied else lines_of_report(context.features, names),
         extended=tuple(before),
         advice=advice(context, missing, models, strongest, again.untried, again.effort),
         by_hand=context.by_hand.texts(),

@@ -18,7 +18,7 @@ from colmap_affrect.rectifiers.base import CoverOptions
 NAMES = [
     "affnet-shapes", "aliked-lightglue", "asift", "asift-recommended", "default", "dense-affnet",
     "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended", "depth-planes",
-    "depth-planes-recommended", "on-demand", "rectified", "second-moment-shapes",
+    "depth-planes-recommended", "lines", "on-demand", "rectified", "second-moment-shapes",
     "unrectified", "unrectified-rootsift",
 ]  # fmt: skip
 

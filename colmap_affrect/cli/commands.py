@@ -39,6 +39,7 @@ from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.report.inspection import inspect_image
+from colmap_affrect.report.line_pictures import report_lines
 from colmap_affrect.report.pairs import draw_pair
 from colmap_affrect.session.run_options import RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
@@ -309,6 +310,12 @@ def inspect(options: argparse.Namespace) -> None:
     mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])
     show(inspect_image(extractor, options.image, options.output_path, mask))
+
+
+def lines(options: argparse.Namespace) -> None:
+    found = report_lines(options.photographs, options.target_path)
+    show(found.to_json() if options.json else found.summary())
+    _refuse_failures(found.failures, options)
 
 
 def show_pair(options: argparse.Namespace) -> None:

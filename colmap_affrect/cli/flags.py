@@ -259,6 +259,9 @@ FLAGS: dict[str, Settings] = {
         default=[]),
     # looking into things
     "image": _path("IMAGE", "the photograph"),
+    "photographs": _path("PHOTO", "a photograph, or several", nargs="+"),
+    "--output-path@pictures": _path("FOLDER", "folder for a picture of the lines of each "
+        "photograph; nothing in it is overwritten (default: none are drawn)", dest="target_path"),
     "pair": _value("IMAGE", "the names of two photographs, as in pairs.txt", nargs=2),
     "--image-path@pair": _path("PATH", "folder of the photographs (default: that of the run)"),
     "--output-path@pair": _path("FILE", "PNG file to make, in no folder of photographs (default: "

@@ -29,6 +29,7 @@ EXAMPLES = (
     "convert --image-path scans --output-path photos",
     "panoramas --image-path panoramas --output-path out",
     "inspect photos/a.jpg --output-path out",
+    "lines photos/a.jpg photos/b.jpg --output-path pictures",
     "show-pair out a.jpg b.jpg",
     "show-pair any.db a.jpg b.jpg --image-path photos --output-path pair.png",
     "recipes on-demand",
@@ -258,6 +259,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "inspect": (
         "draw what a recipe does to one image, a sheet for each level: regions, warps, features",
         f"image --output-path! {MASKS} {RECIPE} --depth-path {NETWORKS}"),
+    "lines": (
+        "what the straight lines of photographs say of their cameras: focal length, axis, upright",
+        "photographs --output-path@pictures --max-failures --json"),
     "show-pair": (
         "draw two photographs side by side, with lines between what was matched",
         "path pair --image-path@pair --output-path@pair"),

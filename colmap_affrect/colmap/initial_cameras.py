@@ -8,7 +8,7 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path, PurePosixPath
 
 from PIL import ExifTags, Image
@@ -39,12 +39,13 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
     PLAUSIBLE_FOCALS,
+    CameraTags,
     ExifFocal,
     exif_focal,
     read_camera_tags,
 )
-from colmap_affrect.images.photographs import CameraOptions, require_folder
-from colmap_affrect.images.reading import why_unusable
+from colmap_affrect.images.photographs import CameraOptions, photograph_files, require_folder
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, why_unusable
 from colmap_affrect.project.outputs import database_files, remove_own, temporary_folder
 
 MAX_LINES = 5  # that are logged; report.json says all
@@ -83,7 +84,7 @@ class InitialCameras:
         if self.options.mode == "per-image":
             return ("per-image", name)
         tags = None if self.options.ignore_exif else self._tags(name)
-        if tags and tags.identity:
+        if tags and tags.identity and not self._may_be_crop(tags):
             return ("exif", *tags.identity, self.given(name).said)
         return ("image", name)
 
@@ -240,10 +241,11 @@ class InitialCameras:
             why = "a panorama, which no camera model fits? give the photographs that it is made of"
         if source == "given" and focal and not low <= focal / longer <= high:
             why = f"{focal / longer:.2g} longer sides; is it in px of the stored files?"
-        lens_mm = self._exif_focal(names).lens_mm if source == "guess" else 0.0
-        return camera, CameraRecord(
-            tuple(sorted(names)), source, focal, why, size, tuple(parts), lens_mm
-        )
+        record = CameraRecord(tuple(sorted(names)), source, focal, why, size, tuple(parts))
+        if source == "guess":
+            found = self._exif_focal(names)
+            record = replace(record, lens_mm=found.lens_mm, uncropped_px=found.uncropped_px)
+        return camera, record
 
     def _set_focal(
         self, camera: pycolmap.Camera, given: GivenCamera, names: Sequence[str]
@@ -271,6 +273,19 @@ class InitialCameras:
             camera.params[index] = focal
         return source, why
 
+    def _may_be_crop(self, tags: CameraTags) -> bool:
+        """Tell whether a photograph that has kept its shape may be a crop, as others of its body.
+
+        All of the folder are looked at, but only where one is smaller than when it was taken.
+        """
+        return tags.scale < 1.0 and tags.body in self._cropped_bodies
+
+    @cached_property
+    def _cropped_bodies(self) -> set[tuple[str, str, str]]:
+        """Bodies of cameras of which photographs were cropped."""
+        all_tags = [self._tags(name) for name in photograph_files(self.image_path, IMAGE_SUFFIXES)]
+        return {tags.body for tags in all_tags if tags and tags.was_cropped and any(tags.body)}
+
     def _exif_focal(self, names: Sequence[str]) -> ExifFocal:
         """Return the focal length that EXIF gives images of one camera; first that has one."""
         if self.options.ignore_exif:
@@ -279,7 +294,7 @@ class InitialCameras:
         for tags in filter(None, map(self._tags, names)):
             make, model, _ = tags.body
             width_mm = sensor_width_mm(make, model) if tags.focal_mm else None
-            found.append(exif_focal(tags, width_mm))
+            found.append(exif_focal(tags, width_mm, has_crops=self._may_be_crop(tags)))
         trusted = [focal for focal in found if focal.focal_px]
         if not trusted:
             return found[0] if found else ExifFocal(None, why="no readable header")

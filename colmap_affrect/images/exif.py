@@ -6,7 +6,7 @@ Shrunk or cropped files often keep it: statements are compared with each other a
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -70,6 +70,7 @@ class ExifFocal:
     is_rescaled: bool = False  # it is not the one that COLMAP would take
     why: str = ""  # what is wrong; empty if nothing
     lens_mm: float = 0.0  # focal length of the lens, where nothing tells how large the sensor is
+    uncropped_px: float = 0.0  # of the whole photograph that this is a crop of, if EXIF says it
 
 
 def read_camera_tags(path: Path) -> CameraTags | None:
@@ -129,14 +130,24 @@ def _similar(first: float, second: float) -> bool:
     return abs(first / second - 1.0) <= MAX_ASPECT_ERROR
 
 
-def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFocal:
+def exif_focal(
+    tags: CameraTags, sensor_width_mm: float | None = None, *, has_crops: bool = False
+) -> ExifFocal:
     """Decide on the focal length that EXIF gives a photograph.
 
     Of statements that agree the first counts, in COLMAP's order: 35 mm equivalent, focal-plane
     resolution, width of the sensor of this model, where it is known.
+
+    Args:
+        tags: What the file says.
+        sensor_width_mm: Longer side of the sensor, where it is known.
+        has_crops: Whether other photographs of this camera were cropped. One that is smaller than
+            when it was taken may then be a crop, too, also where it has kept its shape.
     """
-    if tags.was_cropped:
-        return ExifFocal(None, why=f"cropped or padded: {_sizes(tags)}")
+    if tags.was_cropped or (has_crops and tags.scale < 1.0):
+        why = "cropped or padded" if tags.was_cropped else "cropped, as others, or shrunk"
+        whole = exif_focal(replace(tags, size=tags.original_size or tags.size), sensor_width_mm)
+        return ExifFocal(None, why=f"{why}: {_sizes(tags)}", uncropped_px=whole.focal_px or 0.0)
     if tags.original_size and tags.scale < 1.0 and max(tags.size) <= MAX_THUMBNAIL_PX:
         return ExifFocal(None, why=f"a thumbnail: {_sizes(tags)}")
     stated = _statements(tags, sensor_width_mm)

@@ -15,13 +15,13 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import require_inside, triangulated
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, FATAL_FOR_MAPPING
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.colmap.model_files import FAR, why_unusable, write_model
+from colmap_affrect.colmap.model_files import FAR, model_folder, why_unusable, write_model
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.interop.consensus import agreeing
 from colmap_affrect.interop.consensus import residuals as residuals_of
-from colmap_affrect.interop.finished_models import read_finished_model
+from colmap_affrect.interop.finished_models import read_finished_model, stand_upright
 from colmap_affrect.options import Options, Summarized, documented, takes_fields_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
@@ -65,10 +65,14 @@ class Alignment(Summarized):
     """How far each position, point or distance is off, in metres."""
     left_out: Mapping[str, str] = field(default_factory=dict)
     """Why positions did not count."""
+    upright: str = ""
+    """Whose straight lines tell where up is, where distances alone are known; z is up then."""
 
     def summary(self) -> str:
         """Return a few lines."""
         lines = [f"scale       {self.scale:.6g} metres for a unit of the old model"]
+        if self.upright:
+            lines.append(f"upright     {self.upright}: z is up")
         if len(self.residuals) > 1:  # a single distance is met exactly
             largest = sorted(self.residuals.items(), key=lambda item: -item[1])
             lines.append(
@@ -98,7 +102,8 @@ def align(
 ) -> Alignment:
     """Write a COLMAP model in metres to a new folder; the old one stays as it is.
 
-    Positions and control points give scale, rotation and place, distances the scale alone. Those
+    Positions and control points give scale, rotation and place, distances the scale alone; models
+    of runs then stand upright by the straight lines of photographs, where these agree. Those
     that are no place on earth, or do not fit the others, are left out and named.
 
     Args:
@@ -150,6 +155,7 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
         right = _without(true, left_out)
         new_from_old, residuals, origin = _similarity(old, right, is_on_earth=is_on_earth)
     model.transform(new_from_old)
+    upright = stand_upright(model_folder(model_path), model) if reference.distances else ""
     why = why_unusable(model)
     if not why and new_from_old.scale <= 1.0 / FAR:
         why = "it has no extent"
@@ -160,7 +166,7 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
         if origin:
             content = dict(zip(ON_EARTH, origin, strict=True))
             replace_text(folder / GEOREFERENCE, json.dumps(content, indent=1) + "\n")
-    return Alignment(float(new_from_old.scale), residuals, left_out)
+    return Alignment(float(new_from_old.scale), residuals, left_out, upright)
 
 
 def _without(places: Places, names: Collection[str]) -> Places:

@@ -5,7 +5,7 @@ import io
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
 from colmap_affrect.images.orientation import forget_orientation
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.interop.camera_models import with_camera_model
-from colmap_affrect.interop.finished_models import read_finished_model
+from colmap_affrect.interop.finished_models import read_finished_model, stand_upright
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.argument_types import checks_arguments
@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 USUAL = ("ply", "text", "cameras")  # formats that need no photographs
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
+UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright
 MEAN_DISTANCE_IN_CUBES = 1.32  # of cameras from the middle, as instant-ngp's converter has it
 FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL and nerfstudio
 
@@ -48,6 +49,7 @@ class Source:
     path: Path  # folder of the model
     model: pycolmap.Reconstruction  # its content
     image_path: Path | None  # folder of the photographs; None if it is not known
+    is_upright: bool = False  # whether z is known to point up
 
     def images(self) -> list[pycolmap.Image]:
         """Return the registered images by name."""
@@ -67,7 +69,8 @@ def export(
 ) -> dict[str, Path]:
     """Write a COLMAP model in some formats.
 
-    The output folder is made if missing; nothing in it is overwritten.
+    The output folder is made if missing; nothing in it is overwritten. Where straight lines of
+    several photographs agree on what is upright, models of runs are turned so that z is up.
 
     Args:
         model_path: folder of a model, or the output folder of a run, whose largest model it is.
@@ -76,7 +79,7 @@ def export(
             ``USUAL``, without text where COLMAP could not read it back.
         image_path: the photographs to undistort, by default those of the run.
         camera_model: of ``text`` and ``cameras``, fitted to the cameras; empty: their own.
-        note: is told how well that fits.
+        note: is told how well that fits, and whether the model was turned.
 
     Returns:
         What was written, by format.
@@ -89,6 +92,10 @@ def export(
     image_path = as_path_or_none(image_path, "image_path")
     formats = _checked_formats(formats)
     source = _source(model_path, image_path)
+    upright = stand_upright(model_path, source.model)
+    if upright:
+        source = replace(source, is_upright=True)
+        note(f"upright     {upright}: z is up")
     if not formats:
         formats = _usual(source)
     if camera_model:
@@ -239,7 +246,7 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
     try:
-        flat = Source(path, read_given_model(path / "sparse"), None)
+        flat = Source(path, read_given_model(path / "sparse"), None, source.is_upright)
     except (OptionError, StoreError) as error:  # which COLMAP does not say when it writes
         raise why_not_written(path / "sparse", error) from error
     with native_writes(path):
@@ -293,7 +300,7 @@ def _place(source: Source) -> dict[str, Any]:
     mean_distance = np.linalg.norm(centers - middle, axis=1).mean()
     half = mean_distance / (2.0 * MEAN_DISTANCE_IN_CUBES) or 1.0
     box = [(middle - half).tolist(), (middle + half).tolist()]
-    up = -poses[:, :, 1].mean(axis=0)
+    up = UP if source.is_upright else -poses[:, :, 1].mean(axis=0)
     return {"aabb_scale": 32, "aabb": box, "up": (up / np.linalg.norm(up)).tolist()}
 
 

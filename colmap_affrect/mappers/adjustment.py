@@ -6,7 +6,7 @@ few points are seen by many images, its focal lengths run away.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,17 +16,16 @@ from pycolmap.cost_functions import ReprojErrorCost
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX
-from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
 from colmap_affrect.colmap.model_files import all_see_long_tracks
+from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.mappers.camera_priors import (
+    DISTORTION_SIGMA,
+    MIN_FOCAL_PX,
+    CameraPrior,
+    usual_principal_point,
+)
 from colmap_affrect.mappers.tie_points import NONE, TiePoints
 
-# Priors of intrinsics. The usual focal length and its deviation are judged on lenses of 25 to
-# 70 mm on 35 mm film; the deviation by EXIF covers rounding and the distance of focus.
-USUAL_FOCAL = 1.15  # longer sides of the image, the median
-USUAL_SIGMA = 0.4  # of the logarithm of an uncalibrated focal length
-EXIF_SIGMA = 0.08  # of the logarithm of a focal length by EXIF
-DISTORTION_SIGMA = 0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
-UNKNOWN_SIGMA = 1e6  # px, of parameters without a prior (the principal point)
 NOISE_PX = 0.7  # standard deviation of keypoints, judged on the benchmark scenes
 
 FAST = 15  # iterations while a model grows
@@ -44,30 +43,6 @@ TIE_POINT_LOSS_SCALE = 4.0  # in deviations of keypoints: tie points pull from f
 FIRST_STEPS = 3  # of an adjustment, which say nothing of those that follow
 SMALL_STEP = 0.001  # part of the excess over the other cost, below which a step is small
 NUM_SMALL = 3  # small steps in a row that end an adjustment
-
-
-@dataclass(frozen=True)
-class FocalPrior:
-    """What is known of a focal length."""
-
-    focal_px: float  # its median
-    sigma: float  # standard deviation of its logarithm; 0 where it is given and held
-
-    @classmethod
-    def of(cls, camera: pycolmap.Camera, record: CameraRecord | None) -> "FocalPrior":
-        """Return what is known of a camera of a database, by the record of it if there is one."""
-        focal_px = float(camera.mean_focal_length())
-        if record and "focal" in record.given:
-            return cls(focal_px, 0.0)
-        if record.source in TRUSTED if record else camera.has_prior_focal_length:
-            return cls(focal_px, EXIF_SIGMA)
-        return cls(USUAL_FOCAL * max(camera.width, camera.height), USUAL_SIGMA)
-
-    def cost(self, focal_px: float) -> float:
-        """Return how much a focal length costs, in nats."""
-        if not self.sigma:
-            return 0.0
-        return 0.5 * (math.log(max(focal_px, 1e-9) / self.focal_px) / self.sigma) ** 2
 
 
 class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
@@ -113,18 +88,60 @@ class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
         return lowest_cost >= self.enough * self.other_cost or self._num_small >= NUM_SMALL
 
 
-def focal_priors(
-    cameras: Iterable[pycolmap.Camera], records: Mapping[int, CameraRecord]
-) -> dict[int, FocalPrior]:
-    """Return the priors of the focal lengths of cameras, by camera id."""
-    return {c.camera_id: FocalPrior.of(c, records.get(c.camera_id)) for c in cameras}
+class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
+    """The prior of intrinsics: focal lengths log-normal, all else that is free normal.
+
+    Residuals are deviations in units of ``noise_px``, as reprojection errors are in px.
+    """
+
+    def __init__(
+        self, camera: pycolmap.Camera, prior: CameraPrior, noise_px: float, fixed: Sequence[int]
+    ) -> None:
+        """Begin.
+
+        Args:
+            camera: Whose parameters are observed.
+            prior: What is known of them.
+            noise_px: Standard deviation of keypoints.
+            fixed: Indices of the parameters that are held, which cost nothing.
+        """
+        super().__init__()
+        number = len(camera.params)
+        self.focal = list(camera.focal_length_idxs())
+        self.focal_px = prior.focal_px
+        self.mean: Array = np.zeros(number)
+        self.weights: Array = np.zeros(number)
+        self.weights[self.focal] = noise_px / prior.sigma
+        self.weights[list(camera.extra_params_idxs())] = noise_px / DISTORTION_SIGMA
+        indices = list(camera.principal_point_idxs())
+        center = prior.principal_point or usual_principal_point(camera)
+        self.mean[indices] = center.center_px
+        self.weights[indices] = noise_px / np.array(center.sigmas_px)
+        self.weights[list(fixed)] = 0.0
+        self.set_num_residuals(number)
+        self.set_parameter_block_sizes([number])
+
+    def Evaluate(
+        self, parameters: list[Array], residuals: Array, jacobians: list[Array] | None
+    ) -> bool:
+        """See Ceres' CostFunction."""
+        params = parameters[0]
+        focals_px = np.maximum(params[self.focal], MIN_FOCAL_PX)
+        deviations = params - self.mean
+        deviations[self.focal] = np.log(focals_px / self.focal_px)
+        residuals[:] = self.weights * deviations
+        if jacobians is not None and jacobians[0] is not None:
+            slopes = self.weights.copy()
+            slopes[self.focal] /= focals_px
+            jacobians[0][:] = np.diag(slopes).ravel()
+        return True
 
 
 @dataclass(frozen=True)
 class Adjuster:
     """Adjusts models with priors on intrinsics."""
 
-    priors: Mapping[int, FocalPrior]  # by camera id
+    priors: Mapping[int, CameraPrior]  # by camera id
     noise_px: float  # standard deviation of the keypoints, the scale of the robust loss
     refining: pycolmap.BundleAdjustmentOptions  # say which parameters of cameras are refined
     constant: frozenset[int] = frozenset()  # ids of the cameras of which nothing is refined
@@ -165,7 +182,7 @@ class Adjuster:
         others = registered.difference(images)
         fixed = {model.images[image_id].camera_id for image_id in others} | self.constant
         config = self._config(model, images, cameras & fixed, fix_gauge=image_ids is None)
-        options = self._options(model)
+        options = self._options(model, cameras - fixed)
         problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
         self._add_tie_points(problem, model)
         for key in sorted(cameras - fixed):
@@ -195,7 +212,7 @@ class Adjuster:
         cameras = {model.images[image_id].camera_id for image_id in images}
         config = self._config(model, images, cameras & self.constant, fix_gauge=False)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
-        options = self._options(model)
+        options = self._options(model, cameras - self.constant)
         problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
         self._add_tie_points(problem, model)
         for key in sorted(cameras - self.constant):
@@ -205,10 +222,12 @@ class Adjuster:
         wanted.params = pycolmap.BACovarianceOptionsParams.POSES
         return pycolmap.estimate_ba_covariance_from_problem(wanted, model, problem)
 
-    def _options(self, model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentOptions:
+    def _options(
+        self, model: pycolmap.Reconstruction, free_cameras: Iterable[int]
+    ) -> pycolmap.BundleAdjustmentOptions:
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
         options.refine_focal_length = self.refining.refine_focal_length
-        options.refine_principal_point = self.refining.refine_principal_point
+        options.refine_principal_point = any(map(self._is_center_free, free_cameras))
         options.refine_extra_params = self.refining.refine_extra_params
         options.refine_sensor_from_rig = self.refining.refine_sensor_from_rig
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -265,23 +284,40 @@ class Adjuster:
                 problem.add_residual_block(cost, loss, blocks)
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
+        """Hold what of a camera is known, and add the prior of what is not."""
         prior = self.priors[camera.camera_id]
-        focal = list(camera.focal_length_idxs())
-        extra = list(camera.extra_params_idxs())
-        if not prior.sigma:  # distortion alone is refined
-            fixed = [*focal, *camera.principal_point_idxs()]
-            if len(fixed) == len(camera.params):
-                return  # COLMAP holds it already
-            manifold = pyceres.SubsetManifold(len(camera.params), fixed)
-            problem.set_manifold(camera.params, manifold)
+        fixed = self._fixed_parameters(camera)
+        number = len(camera.params)
+        if len(fixed) == number:
+            problem.set_parameter_block_constant(camera.params)
             return
-        mean = camera.params.copy()
-        sigma = np.full(len(camera.params), UNKNOWN_SIGMA)
-        mean[focal], sigma[focal] = prior.focal_px, prior.sigma * prior.focal_px
-        mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
-        # Reprojection errors are in px, priors in units of their deviation times the noise.
-        normal = pyceres.factors.NormalPrior(mean, np.diag((sigma / self.noise_px) ** 2))
-        problem.add_residual_block(normal, None, [camera.params])
+        if fixed:
+            problem.set_manifold(camera.params, pyceres.SubsetManifold(number, fixed))
+        if prior.sigma:
+            problem.add_residual_block(
+                IntrinsicsCost(camera, prior, self.noise_px, fixed),
+                None,
+                [camera.params],
+            )
+
+    def _fixed_parameters(self, camera: pycolmap.Camera) -> list[int]:
+        """Return the indices of the parameters of a camera that are held."""
+        prior = self.priors[camera.camera_id]
+        fixed = list[int]()
+        if not (self.refining.refine_focal_length and prior.sigma):
+            fixed += camera.focal_length_idxs()
+        if not self._is_center_free(camera.camera_id):
+            fixed += camera.principal_point_idxs()
+        if not (self.refining.refine_extra_params and prior.has_distortion):
+            fixed += camera.extra_params_idxs()
+        return sorted(fixed)
+
+    def _is_center_free(self, camera_id: int) -> bool:
+        """Tell whether the principal point of a camera is refined."""
+        prior = self.priors[camera_id]
+        return bool(prior.principal_point) or (
+            self.refining.refine_principal_point and prior.sigma > 0.0
+        )
 
 
 def _solver_options(max_iterations: int, num_images: int) -> Any:

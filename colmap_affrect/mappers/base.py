@@ -17,6 +17,7 @@ from colmap_affrect.options import MAX_SEED, PartOptions, PresetOptions, Registr
 if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
     from colmap_affrect.colmap.cameras import CameraRecord
+    from colmap_affrect.geometry.lines import LineCamera
     from colmap_affrect.mappers.existing import ExistingModel
     from colmap_affrect.project.report import Bridge
 
@@ -61,6 +62,8 @@ class MappingTask:
     # pairs of image names that only affine frames verify which were not measured one by one
     unmeasured_pairs: frozenset[tuple[str, str]] = frozenset()
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)  # what is known, by id
+    # what the straight lines of images say of their cameras, by image name
+    lines: Mapping[str, LineCamera] = field(default_factory=dict)
     may_share: bool = False  # images of one size may turn out to share an uncalibrated camera
     # keypoints of the tie points, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)

@@ -6,20 +6,14 @@ length fits, and where it lowers the cost, a given one is wrong.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers.adjustment import (
-    EXIF_SIGMA,
-    FINAL,
-    NOISE_PX,
-    Adjuster,
-    EarlyStop,
-    FocalPrior,
-    focal_priors,
-)
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, EarlyStop
 from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.mappers.camera_priors import CameraPrior, camera_priors, with_distortion_of
 from colmap_affrect.mappers.model_score import num_occupied_cells
 from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs, sampling_step
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -46,7 +40,7 @@ class _FocalTrials:
     def __init__(
         self,
         model: pycolmap.Reconstruction,
-        priors: Mapping[int, FocalPrior],
+        priors: Mapping[int, CameraPrior],
         refining: pycolmap.BundleAdjustmentOptions,
         fixed: frozenset[int],
     ) -> None:
@@ -89,9 +83,11 @@ def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each uncalibrated camera, while all else may move.
     """
-    priors = focal_priors(cameras_of(model).values(), task.cameras)
+    cameras = cameras_of(model).values()
+    priors = camera_priors(cameras, task.cameras, task.lines)
+    priors = with_distortion_of(priors, cameras)
     recorded = sorted(priors.keys() & task.cameras.keys())
-    unknown = [key for key in recorded if priors[key].sigma > EXIF_SIGMA]
+    unknown = [key for key in recorded if priors[key].is_unknown]
     if not unknown or not _is_tried(model):
         return {}
     fixed = frozenset(key for key in recorded if task.cameras[key].is_fixed)
@@ -110,7 +106,7 @@ def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int
 
 
 def fitting_focals(
-    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, FocalPrior]
+    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, CameraPrior]
 ) -> dict[int, float]:
     """Find focal lengths that fit better than those that the user gave.
 
@@ -130,7 +126,7 @@ def fitting_focals(
         return {}
     free_priors = {**priors}
     for key in given:
-        free_priors[key] = FocalPrior(priors[key].focal_px, FREE_SIGMA)
+        free_priors[key] = replace(priors[key], sigma=FREE_SIGMA)
     # A wrong focal length is made up for by distortion, where that was free.
     constant = frozenset(key for key in given if task.cameras[key].is_fixed)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
@@ -138,7 +134,7 @@ def fitting_focals(
     fixed_cost = Adjuster(priors, NOISE_PX, refining, constant).adjust(fixed, FINAL)
     free = with_fewer_points(model)
     free_cost = Adjuster(free_priors, NOISE_PX, refining).adjust(free, FINAL)
-    num = _num_occupied_cells(fixed)
+    num = num_independent(fixed)
     gain = (fixed_cost - free_cost) * (num / max(1, fixed.compute_num_observations()))
     if gain < 0.5 * len(given) * np.log(max(2, num)):
         return {}
@@ -171,8 +167,8 @@ def _is_tried(model: pycolmap.Reconstruction) -> bool:
     return model.num_reg_images() <= MAX_NUM_IMAGES and model.num_points3D() > 0
 
 
-def _num_occupied_cells(model: pycolmap.Reconstruction) -> int:
-    """Return how many cells of all images hold observations."""
+def num_independent(model: pycolmap.Reconstruction) -> int:
+    """Return how many cells of all images hold observations, which err together in a cell."""
     num = 0
     for image_id, camera in cameras_of(model).items():
         seen = [p.xy for p in model.images[image_id].get_observation_points2D()]

@@ -9,8 +9,9 @@ from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.native_options import Plain, resolve, set_values
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, focal_priors
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
+from colmap_affrect.mappers.camera_priors import camera_priors
 
 FLAG = "--mapper-options"
 TRACK_LENGTHS = (
@@ -146,5 +147,5 @@ class GlobalMapper:
                 camera.params = given[key]
                 has_changed = True
         if has_changed:
-            priors = focal_priors(model.cameras.values(), task.cameras)
+            priors = camera_priors(model.cameras.values(), task.cameras, task.lines)
             Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(model, FINAL)

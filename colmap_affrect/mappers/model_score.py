@@ -17,7 +17,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import seen_points
 from colmap_affrect.geometry.arrays import Floats, Indices
-from colmap_affrect.mappers.adjustment import FocalPrior
+from colmap_affrect.mappers.camera_priors import CameraPrior
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of, poses_of
 
 
@@ -43,7 +43,7 @@ class ModelScorer:
     """Scores models of one database."""
 
     graph: PairGraph
-    priors: Mapping[int, FocalPrior]  # by camera id
+    priors: Mapping[int, CameraPrior]  # by camera id
     _num_cells: dict[Ids, int] = field(default_factory=dict, init=False, repr=False)
 
     def score(self, model: pycolmap.Reconstruction) -> float:
@@ -56,7 +56,7 @@ class ModelScorer:
             num_agreeing = self.graph.agreement(pair, poses, cameras) * num
             total += pair_log_ratio(num_agreeing, num)
         used = {camera.camera_id: camera for camera in cameras.values()}
-        costs = [self.priors[key].cost(camera.mean_focal_length()) for key, camera in used.items()]
+        costs = [self.priors[key].cost_of(camera) for key, camera in used.items()]
         return total - sum(costs)
 
     def is_confirmed(self, model: pycolmap.Reconstruction) -> bool:

@@ -133,6 +133,11 @@ class PairGraph:
         """All pairs, also those that are not among the strongest."""
         return self.pairs + self.weak
 
+    @property
+    def has_rigs(self) -> bool:
+        """Whether several sensors belong to one rig."""
+        return any(rig.num_sensors() > 1 for rig in self.cache.rigs.values())
+
     @cached_property
     def most_connected(self) -> frozenset[int]:
         """The images of the largest connected component."""

@@ -13,8 +13,9 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import connected_parts, lone_ties
 from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
-from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster, focal_priors
+from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.camera_priors import camera_priors, with_distortion_of
 from colmap_affrect.mappers.direction_uncertainty import direction_sigmas_deg
 from colmap_affrect.mappers.focal_observability import fitting_focals, focal_growths
 from colmap_affrect.mappers.model_score import ModelScorer, pair_log_ratio
@@ -84,7 +85,8 @@ class _ModelContext:
         self.cameras = cameras_of(self.model)
         used = {camera.camera_id: camera for camera in self.cameras.values()}
         self.used_cameras = used
-        self.priors = focal_priors(used.values(), task.cameras)
+        priors = camera_priors(used.values(), task.cameras, task.lines)
+        self.priors = with_distortion_of(priors, used.values())
         self.scorer = ModelScorer(self.graph, self.priors)
         self.pairs = self.graph.pairs_inside(self.poses)
         self.agreements: dict[Ids, float] = {}
@@ -147,7 +149,7 @@ def features_of(
         log_ratio = _pair_log_ratio(context, image_id) + track_log_ratios.get(image_id, 0.0)
         bridge = bridges.get(image_id)
         found[names[image_id]] = ReliabilityFeatures(
-            log_likelihood_ratio=log_ratio - context.priors[key].cost(focal_px),
+            log_likelihood_ratio=log_ratio - context.priors[key].cost_of(camera),
             agreement=_agreement(context, image_id),
             num_three_view_points=num_three_view_points[image_id],
             focal_growth=growths.get(key, 1.0),

@@ -14,17 +14,15 @@ from functools import cached_property
 from typing import Self
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA, MEDIUM, Adjuster, FocalPrior
+from colmap_affrect.mappers.adjustment import MEDIUM, Adjuster
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import BridgeFinder
+from colmap_affrect.mappers.camera_priors import CameraPrior
 from colmap_affrect.mappers.growing import Grower, register_bridges
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
-ZOOMS = 1.0, 1.4, 0.7, 2.0
-"""Factors of the usual focal length near which unknown ones begin (judged): all lenses from wide to
-long are within a fifth of one of them."""
 SHARED_SIGMA = 0.1
 """Deviation of the logarithm of a focal length that several images share, while models grow
 (judged): two or three of these images do not tell it."""
@@ -153,10 +151,10 @@ class Search:
         return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(model)
 
     @cached_property
-    def unknown(self) -> dict[int, FocalPrior]:
+    def unknown(self) -> dict[int, CameraPrior]:
         """Priors of the unknown focal lengths, by camera id."""
         priors = self.adjuster.priors
-        return {key: prior for key, prior in priors.items() if prior.sigma > EXIF_SIGMA}
+        return {key: prior for key, prior in priors.items() if prior.is_unknown}
 
     @cached_property
     def _shared(self) -> set[int]:
@@ -168,26 +166,38 @@ class Search:
         return self.scorer.score(mapped.reconstruction)
 
     def _with_initial_focals(self) -> list[Self]:
-        """Return searches with several values of unknown focal lengths, the usual one first."""
-        if not self._shared:
-            return [self]
-        zooms = ZOOMS if self.num_starts else ZOOMS[:1]
-        return [self._with_focals_near(zoom) for zoom in zooms]
+        """Return searches with several values of unknown focal lengths, the likeliest first.
 
-    def _with_focals_near(self, zoom: float) -> Self:
-        """Return a search that keeps unknown focal lengths near the usual one times a factor."""
+        Where no images share a camera, only the first one builds bridges, to save time.
+        """
+        numbers = [len(prior.starts_px) for prior in self.unknown.values()]
+        searches = [self._with_start(0)]
+        if self.num_starts:
+            for number in range(1, max(numbers, default=1)):
+                search = self._with_start(number)
+                searches.append(search if self._shared else replace(search, num_starts=0))
+        return searches
+
+    def _with_start(self, number: int) -> Self:
+        """Return a search whose unknown focal lengths begin at one of their starts, or the last."""
         priors = {}
         for key, prior in self.unknown.items():
             sigma = min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma
-            priors[key] = FocalPrior(zoom * prior.focal_px, sigma)
+            priors[key] = replace(
+                prior,
+                focal_px=prior.starts_px[min(number, len(prior.starts_px) - 1)],
+                sigma=sigma,
+            )
         return self._with_priors(priors)
 
     def _with_focals_of(self, model: pycolmap.Reconstruction) -> Self:
         """Return a search that keeps unknown focal lengths near those of a model."""
-        focals = self._unknown_focals(model).items()
-        return self._with_priors({key: FocalPrior(px, SHARED_SIGMA) for key, px in focals})
+        priors = {}
+        for key, focal_px in self._unknown_focals(model).items():
+            priors[key] = replace(self.unknown[key], focal_px=focal_px, sigma=SHARED_SIGMA)
+        return self._with_priors(priors)
 
-    def _with_priors(self, priors: Mapping[int, FocalPrior]) -> Self:
+    def _with_priors(self, priors: Mapping[int, CameraPrior]) -> Self:
         together = {**self.adjuster.priors, **priors}
         return replace(self, adjuster=replace(self.adjuster, priors=together))
 

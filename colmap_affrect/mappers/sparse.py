@@ -1,5 +1,6 @@
 """The sparse mapper: mapping as one estimate, for small sets with few matches."""
 
+import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -8,14 +9,11 @@ from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
-from colmap_affrect.mappers.adjustment import (
-    EXIF_SIGMA,
-    NOISE_PX,
-    Adjuster,
-    FocalPrior,
-    focal_priors,
-)
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
+from colmap_affrect.mappers.distortion import cameras_that_tell_distortion
 from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
@@ -31,9 +29,13 @@ ALL_PAIRS = "with all pairs"
 SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
 OWN_CAMERAS = "with a camera for each photograph"
+COLMAP_MODEL = "from COLMAP's model"
 
+NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from (judged)
 FORWARD_MOTION = "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
+
+logger = logging.getLogger(__name__)
 
 
 class SparseOptions(PipelineOptions):
@@ -84,7 +86,7 @@ class SparseMapper(IncrementalMapper):
         if is_small:
             if FORWARD_MOTION not in self.options.mapper_options:
                 native.mapper.init_max_forward_motion = 1.0  # the score decides on such pairs
-            return self._map_small(task, graph, native, show_or_stop)
+            return self._map_small(task, graph, native, output_path, show_or_stop)
         search = self._search(task, graph, native, show_or_stop)
         search = replace(search, num_starts=1)
         if task.previous_models:
@@ -108,6 +110,7 @@ class SparseMapper(IncrementalMapper):
         task: MappingTask,
         graph: PairGraph,
         native: pycolmap.IncrementalPipelineOptions,
+        output_path: Path,
         show: Callable[[int], None],
     ) -> list[MappedModel]:
         """Return the models with the highest scores.
@@ -116,14 +119,16 @@ class SparseMapper(IncrementalMapper):
         hypothesis, which scores higher where they differ, or some images are parts of others.
         """
         own = self._search(task, graph, native, show)
+        bare = replace(task, image_path=None, snapshot_path=None)
+        by_colmap = partial(super().map, bare, output_path, native.random_seed, show)
         best = list[MappedModel]()
         cameras = with_shared_cameras(task.cameras) if task.may_share else task.cameras
         if len(cameras) < len(task.cameras):
             sharing = replace(task, cameras=cameras)
             shared = self._search(sharing, graph.with_cameras(cameras), native, show)
-            best = _HypothesisTest(task, shared, own).run()
+            best = _HypothesisTest(task, shared, own, by_colmap).run()
         if not best:
-            best = _HypothesisTest(task, own, None).run()
+            best = _HypothesisTest(task, own, None, by_colmap).run()
         for mapped in best:
             if not has_rigs(mapped.reconstruction):  # which tell the scale
                 mapped.reconstruction.normalize()  # as COLMAP does
@@ -170,16 +175,20 @@ class SparseMapper(IncrementalMapper):
 
     def _priors(
         self, task: MappingTask, graph: PairGraph, native: pycolmap.IncrementalPipelineOptions
-    ) -> dict[int, FocalPrior]:
+    ) -> dict[int, CameraPrior]:
         """Return the priors of the focal lengths, by camera id."""
         if not native.ba_refine_focal_length:  # then they are those of the database
             used = {camera.camera_id: camera for camera in graph.cameras.values()}
-            return {k: FocalPrior(float(c.mean_focal_length()), 0.0) for k, c in used.items()}
-        priors = focal_priors(graph.cameras.values(), task.cameras)
+            return {k: CameraPrior(float(c.mean_focal_length()), 0.0) for k, c in used.items()}
+        priors = camera_priors(graph.cameras.values(), task.cameras, task.lines)
         if not self.options.keep_given_intrinsics:
             for key, prior in priors.items():
                 priors[key] = replace(prior, sigma=prior.sigma or EXIF_SIGMA)
-        return priors
+        told = cameras_that_tell_distortion(graph)
+        return {
+            key: replace(prior, has_distortion=key in told or not prior.is_unknown)
+            for key, prior in priors.items()
+        }
 
     def _constant_cameras(
         self, task: MappingTask, graph: PairGraph, native: pycolmap.IncrementalPipelineOptions
@@ -207,15 +216,23 @@ class _Hypothesis:
 class _HypothesisTest:
     """Makes models under several hypotheses and keeps those with the highest score."""
 
-    def __init__(self, task: MappingTask, search: Search, own: Search | None) -> None:
+    def __init__(
+        self,
+        task: MappingTask,
+        search: Search,
+        own: Search | None,
+        by_colmap: Callable[[], list[MappedModel]],
+    ) -> None:
         """Begin with the previous models of a task.
 
         Args:
             task: What to map.
             search: Makes and scores models, with the cameras that images have at first.
             own: The same with a camera for each image; None if they have these at first.
+            by_colmap: Returns the models that COLMAP's own mapper makes.
         """
         self.task = task
+        self.by_colmap = by_colmap
         self.search = search
         self.own = own
         self.best = _restarted(search, task.previous_models)
@@ -231,6 +248,8 @@ class _HypothesisTest:
             if models and (not self.best or score > self.score):
                 self._take(hypothesis, models, score)
                 self._try_own_cameras(hypothesis)
+        if not self._is_certain():
+            self._try_colmap()
         return _joined_by_tie_points(self.search, self.best)
 
     def _hypotheses(self) -> list[_Hypothesis]:
@@ -263,6 +282,29 @@ class _HypothesisTest:
         moves = _without_duplicates((*before, hypothesis.name, *models[0].moves))
         self.best = [replace(mapped, moves=moves) for mapped in models]
         self.score = score
+
+    def _try_colmap(self) -> None:
+        """Take over the poses of COLMAP's own model where the model of these scores higher."""
+        search = self.search
+        if not search.unknown or search.graph.has_rigs or self.task.previous_models:
+            return
+        try:
+            models = self.by_colmap()
+        except AffrectError as error:  # ours stays
+            logger.info("%s", error)
+            return
+        models.sort(key=lambda mapped: -mapped.reconstruction.num_reg_images())
+        grower = search.grower(search.graph)
+        found = list[MappedModel]()
+        for mapped in models[:NUM_COLMAP_MODELS]:
+            model = grower.restart_from(mapped.reconstruction)
+            grower.finish(model)
+            found.append(MappedModel(model))
+        found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
+        found = search.with_bridges(search.graph, found)
+        score = search.best_score(found)
+        if found and score > self.score + MIN_SCORE_GAIN:
+            self._take(_Hypothesis(COLMAP_MODEL, ()), found, score)
 
     def _try_own_cameras(self, hypothesis: _Hypothesis) -> None:
         """Give each image of the best model a camera of its own where that scores higher."""

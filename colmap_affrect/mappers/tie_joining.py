@@ -11,13 +11,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX
 from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import BridgeFinder
 from colmap_affrect.mappers.growing import Grower, register_bridges
 from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import CameraById, PoseById, cameras_of, poses_of
-from colmap_affrect.mappers.search import ZOOMS
 from colmap_affrect.mappers.tie_points import AGREEING_PX, MIN_NUM_POINTS, TiePoints
 
 BY_HAND = "with tie points"  # what made the model, in the words of a report
@@ -167,10 +165,10 @@ class TieJoiner:
         is_used = key in {camera.camera_id for camera in cameras_of(model).values()}
         camera = (model if is_used else self.grower.graph.cache).cameras[key]
         prior = self.grower.adjuster.priors[key]
-        is_open = not is_used and prior.sigma > EXIF_SIGMA
+        is_open = not is_used and prior.is_unknown
         trials = [copy.copy(camera)]
         if is_open:
-            trials = [_with_focal(camera, zoom * prior.focal_px) for zoom in ZOOMS]
+            trials = [_with_focal(camera, focal_px) for focal_px in prior.starts_px]
         best: _Resection | None = None
         for trial in trials:
             found = self._resection(points2d, points3d, trial, refine_focal=is_open)

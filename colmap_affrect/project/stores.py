@@ -26,7 +26,9 @@ from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.project.group_store import GroupStore, checked, entries_of, has_entry
+from colmap_affrect.project.line_report import LINE_DATASETS, line_datasets, lines_from_datasets
 from colmap_affrect.project.match_state import STATE_JSON, MatchState, Names, Worth
 from colmap_affrect.project.record import Content, stamp_of
 
@@ -79,6 +81,10 @@ def _level_ends(group: h5py.Group) -> dict[int, int]:
     return dict(zip(levels, ends, strict=True))
 
 
+def _line_datasets(group: h5py.Group) -> dict[str, NDArray[Any]]:
+    return {key: checked(group, key) for key in LINE_DATASETS if key in group}
+
+
 def frame_datasets(lafs: Floats) -> dict[str, Singles]:
     """Return (N, 2, 3) frames, and their scales in sigmas and orientations in degrees."""
     stored = lafs.astype(np.float32)
@@ -114,10 +120,21 @@ class FeatureStore(GroupStore):
         features: LocalFeatures,
         image_size: tuple[int, int],
         content: Content = NOT_KNOWN,
+        lines: Lines | None = None,
     ) -> None:
-        """Write the features of one image, and what the files hold that they are from."""
+        """Write the features of one image.
+
+        Args:
+            name: of the image.
+            features: of the image.
+            image_size: (width, height) in px.
+            content: what the files hold that they are from.
+            lines: its straight lines; None where they were not measured.
+        """
+        more = {} if lines is None else line_datasets(lines)
         with self._open("a") as file:
-            self._write_features(file, name, features, image_size, {0: len(features)}, content)
+            ends = {0: len(features)}
+            self._write_features(file, name, features, image_size, ends, content, more)
 
     def contents(self) -> dict[str, Content]:
         """Return for each image what the files hold that it was extracted from."""
@@ -147,7 +164,8 @@ class FeatureStore(GroupStore):
             added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
             both = union(of_one_size([there, added]))
             ends[level] = len(both)
-            self._write_features(file, name, both, size, ends, _content(group))
+            more = _line_datasets(group)
+            self._write_features(file, name, both, size, ends, _content(group), more)
 
     def _write_features(
         self,
@@ -157,6 +175,7 @@ class FeatureStore(GroupStore):
         image_size: tuple[int, int],
         level_ends: dict[int, int],
         content: Content,
+        more: Mapping[str, NDArray[Any]],
     ) -> None:
         datasets = {
             "keypoints": features.keypoints.astype(np.float32),
@@ -167,6 +186,7 @@ class FeatureStore(GroupStore):
             "rectification_ids": features.rectification_ids,
             "levels": np.asarray(list(level_ends)),
             "level_ends": np.asarray(list(level_ends.values())),
+            **more,
         }
         self._write(file, name, datasets, content=content.digest, stamp=content.stamp)
 
@@ -174,6 +194,11 @@ class FeatureStore(GroupStore):
         """Read all features of one image; StoreError if they are missing."""
         with self._open("r") as file:
             return self._features(self._group(file, name))
+
+    def lines(self, name: str) -> Lines | None:
+        """Return the straight lines of one image; None in the files of older versions."""
+        with self._open("r") as file:
+            return lines_from_datasets(_line_datasets(self._group(file, name)))
 
     def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
         """Return the indices of the features of two levels, each once, rising."""
@@ -360,10 +385,11 @@ class MatchStore(GroupStore):
         """
         if not self.path.exists():
             return
-        names = {pair_key(name, "")[:-1] for name in images}
+        gone = set(images)
+        names = {pair_key(name, "")[:-1] for name in gone}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            _write_state(file, _read_state(file).without_pairs())
+            _write_state(file, _read_state(file).without_pairs(gone))
             for key, group in list(entries_of(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
                 is_escalated = group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs

@@ -134,6 +134,7 @@ RECTIFIERS: Registry[Rectifier] = Registry(
         "depth-planes": "colmap_affrect.rectifiers.depth_planes:DepthPlanes",
         "depth-affnet": "colmap_affrect.rectifiers.depth_planes:DepthAffNet",
         "dense-shapes": "colmap_affrect.rectifiers.affine_warps:DenseShapes",
+        "lines": "colmap_affrect.rectifiers.line_planes:LinePlanes",
     },
     default="dense-shapes",
     protocol=Rectifier,

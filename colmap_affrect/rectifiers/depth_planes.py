@@ -123,12 +123,12 @@ def planar_segments(
     for label, normal in enumerate(clusters.normals):
         cosines = planes.viewing_cosines(normal, photograph.camera_matrix, photograph.size)
         is_on_plane = (labels == label) & (cosines >= min_cosine)
-        for region in _connected_regions(is_on_plane, min_area_px):
+        for region in connected_regions(is_on_plane, min_area_px):
             segments.append(PlanarSegment(region, normal))
     return segments
 
 
-def _connected_regions(mask: Mask, min_area_px: float) -> Iterator[Region]:
+def connected_regions(mask: Mask, min_area_px: float) -> Iterator[Region]:
     """Yield the 4-connected regions that have enough pixels."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     for label, (left, top, width, height, area) in enumerate(stats.tolist()):

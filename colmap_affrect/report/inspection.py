@@ -23,9 +23,12 @@ from colmap_affrect.data import (
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Bytes
+from colmap_affrect.images.lines import lines_of
 from colmap_affrect.project.atomic_files import replace_bytes
+from colmap_affrect.project.line_report import line_report
 from colmap_affrect.project.outputs import fitting_name, new_results
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.line_pictures import line_sheet
 from colmap_affrect.report.sheets import (
     PALETTE,
     Color,
@@ -191,7 +194,8 @@ def inspect_image(
     """Carry out a recipe on one image and draw every level.
 
     ``<stem>-inspection.png`` is the level of every image, ``<stem>-inspection-level-<k>.png`` level
-    k of escalation. Where a depth map cannot be used the level has no warps, as in extraction.
+    k of escalation, ``<stem>-inspection-lines.png`` has its straight lines. Where a depth map
+    cannot be used the level has no warps, as in extraction.
 
     Args:
         extractor: carries out the recipe.
@@ -200,7 +204,7 @@ def inspect_image(
         mask: (H, W) bool of the image as it is stored, False where it is not to be used.
 
     Returns:
-        A line for each level and for each sheet.
+        A line for each level, one on the lines, and one for each sheet.
 
     Raises:
         ImageError: the photograph cannot be read.
@@ -210,22 +214,32 @@ def inspect_image(
     workspace.require_own(path.parent)
     numbers = list(extractor.rectifiers)
     photographs = []
-    sheets = []
+    sheets = [output_path / fitting_name(path.stem, "-inspection-lines.png")]
+    original_size = (0, 0)
     for number in numbers:
-        photograph, _ = extractor.photograph(path, mask=mask, level=number)
+        photograph, original_size = extractor.photograph(path, mask=mask, level=number)
         photographs.append(photograph)
         suffix = f"-level-{number}" if number else ""
         sheets.append(output_path / fitting_name(path.stem, f"-inspection{suffix}.png"))
     workspace.begin()
     lines = []
     with new_results(*sheets, replaces=True) as new_sheets:
-        for number, photograph, sheet in zip(numbers, photographs, new_sheets, strict=True):
+        for number, photograph, sheet in zip(numbers, photographs, new_sheets[1:], strict=True):
             level = inspect_level(extractor, photograph, number)
             name = extractor.options.levels[number].rectifier.name
             line = f"level {number}, {name}: {_summary(level)}"
             draw_sheet(level, line, sheet)
             lines.append(f"{line}; {level.warning}" if level.warning else line)
+        lines.append(_draw_lines(photographs[0], original_size, new_sheets[0]))
     return "\n".join([*lines, *map(str, sheets)])
+
+
+def _draw_lines(photograph: Photograph, original_size: tuple[int, int], sheet: Path) -> str:
+    """Draw the straight lines of a photograph; return what they say."""
+    found = lines_of(photograph.gray, photograph.mask)
+    report = line_report(found, original_size)
+    replace_bytes(sheet, line_sheet(photograph.gray, found, report, photograph.mask))
+    return f"lines: {report.sentence()}"
 
 
 def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int) -> InspectedLevel:

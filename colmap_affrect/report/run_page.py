@@ -110,6 +110,8 @@ def write_run_page(
             "pairs_to_check": content.pairs_to_check,
             "line_colors": LEGEND,
             **_cameras(report, names),
+            "lines": list(report.lines.items())[:MAX_NUM_CAMERAS],
+            "num_lines_known": sum(one.is_known for one in report.lines.values()),
             "wants_marks": bool(content.marks) or len(model.registered_names) < len(names),
             "residuals": [
                 f"{one.point} in {one.image}: {one.error_px:.1f} px" for one in model.tie_points

@@ -11,8 +11,10 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.errors import NoModelError, OptionError, shown
 from colmap_affrect.options import documented
+from colmap_affrect.project.line_report import LineReport, line_report
 from colmap_affrect.project.reasons import text_of
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport
+from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 MAX_ROWS = 200  # photographs in the table of a notebook; report.json has all
@@ -154,6 +156,17 @@ def cameras_of_report(
     for camera_id, record in read_camera_records(workspace.cameras).items():
         found.append(_extended(record, before).to_report(camera_id, largest))
     return tuple(found)
+
+
+def lines_of_report(features: FeatureStore, names: Sequence[str]) -> dict[str, LineReport]:
+    """Return what straight lines say of photographs, without those that older versions read."""
+    found = {}
+    sizes = features.image_sizes()
+    for name in names:
+        lines = features.lines(name) if name in sizes else None
+        if lines is not None:
+            found[name] = line_report(lines, sizes[name])
+    return found
 
 
 def _extended(record: CameraRecord, before: Sequence[str]) -> CameraRecord:

@@ -10,14 +10,15 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.arrays import Array, Floats
+from colmap_affrect.geometry.upright import upright_rotation
 from colmap_affrect.report.pictures import base64_text
+from colmap_affrect.report.upright import upright_of_run
 
 # What is in the view, and how it is drawn, was chosen by eye.
 MAX_NUM_POINTS = 20_000  # that are drawn of a model; a page stays below some MB
 POINT_PERCENTILE = 90.0  # share of the points, by distance from their median, that is in the view
 RADIUS_MARGIN = 1.15  # radius of the view per distance of the farthest camera or point from it
-MIN_COMMON_DIRECTION = 0.3  # length of the mean horizontal viewing direction that gives a front
 MIN_COMMON_UP = 1e-6  # length of the mean up vector that gives one; cameras held in all ways: none
 CAMERA_DEPTH = 0.07  # depth of the pyramids that stand for cameras, in radii of the view
 MAX_HALF_WIDTH = 0.8  # half width of a pyramid per depth; wider cameras would hide the model
@@ -64,18 +65,23 @@ def read_view(path: Path | None, kinds: Mapping[str, str]) -> View3D:
         model = read_given_model(path)
     except AffrectError as error:
         return View3D(note=f"The model cannot be shown: {error}")
-    turn_upright(model)
+    upright = upright_of_run(path, model)
+    fit_upright(model, None if upright is None else upright.direction)
     return replace(_view(model), kinds=kinds)
 
 
-def turn_upright(model: pycolmap.Reconstruction) -> None:
-    """Move a model into a sphere of radius 1 about 0, as cameras are held on average.
+def fit_upright(model: pycolmap.Reconstruction, up: Floats | None = None) -> None:
+    """Move a model into a sphere of radius 1 about 0.
 
     Its z axis points up, and its y axis where the cameras look.
+
+    Args:
+        model: that is changed.
+        up: (3,) unit vector; None: as cameras are held on average.
     """
     axes, centers = _poses(model)
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    rotation = _upright_from_world(axes)
+    rotation = _upright_from_world(axes, up)
     inner = points
     if len(points):  # the farthest are often wrong
         distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
@@ -87,17 +93,14 @@ def turn_upright(model: pycolmap.Reconstruction) -> None:
     model.transform(pycolmap.Sim3d(1 / radius, pycolmap.Rotation3d(rotation), -middle / radius))
 
 
-def _upright_from_world(axes: Array) -> Array:
-    """Return a (3, 3) rotation, of (M, 3, 3) world_from_camera rotations."""
-    up = -axes[:, :, 1].mean(axis=0)  # y of a camera points down
-    if np.linalg.norm(up) < MIN_COMMON_UP:
-        up = -axes[0, :, 1]
-    up /= np.linalg.norm(up)
-    right = np.cross(axes[:, :, 2].mean(axis=0), up)
-    if np.linalg.norm(right) < MIN_COMMON_DIRECTION:  # they look in all directions
-        right = np.linalg.svd(up[None])[2][1]
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(up, right), up])
+def _upright_from_world(axes: Array, up: Floats | None) -> Floats:
+    """Return a (3, 3) rotation, of (M, 3, 3) world_from_camera rotations and (3,) up, if known."""
+    if up is None:
+        up = -axes[:, :, 1].mean(axis=0)  # y of a camera points down
+        if np.linalg.norm(up) < MIN_COMMON_UP:
+            up = -axes[0, :, 1]
+        up = up / np.linalg.norm(up)
+    return upright_rotation(up, axes[:, :, 2].mean(axis=0))
 
 
 def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

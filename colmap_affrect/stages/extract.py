@@ -146,7 +146,8 @@ def _extract_missing(
                     faded.append(name)
                 if found.mask_is_white:
                     white.append(name)
-                store.write(name, found.features, found.image_size, contents[name])
+                size = found.image_size
+                store.write(name, found.features, size, contents[name], found.lines)
             advance(1)
     if faded:
         warnings["contrast"] = (

@@ -17,8 +17,10 @@ from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import camera_matrix, is_inside, resized_from_original
+from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.images import reading
 from colmap_affrect.images.depth import DepthMaps
+from colmap_affrect.images.lines import lines_of
 from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.parallel.executor import available_cores, available_memory_bytes
 from colmap_affrect.progress import SILENT, Progress
@@ -39,6 +41,7 @@ class ExtractedImage:
     warning: str = ""  # why it was not rectified; empty if all went well
     stretched: bool = False  # whether its contrast was low and was stretched
     mask_is_white: bool = False  # whether it has a mask, which leaves out nothing
+    lines: Lines | None = None  # straight ones; None where they were not asked for
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,9 @@ class ImageExtractor:
         path = task.photographs.folder / task.name
         try:
             mask = task.photographs.mask(task.name)
-            found = self.extract_file(path, task.name, task.intrinsics, task.level, mask)
+            found = self.extract_file(
+                path, task.name, task.intrinsics, task.level, mask, with_lines=task.level == 0
+            )
         except ImageError as error:
             return error
         except Exception as error:
@@ -99,12 +104,24 @@ class ImageExtractor:
         intrinsics: Array | None = None,
         level: int = 0,
         mask: Mask | None = None,
+        *,
+        with_lines: bool = False,
     ) -> ExtractedImage:
         """Read an image and extract its features.
 
-        ``name`` is the key of its depth map, the file's name by default; for ``intrinsics`` and
-        ``level`` see :class:`ImageTask`; ``mask`` is (H, W) bool of the stored image, where
-        features may be. ImageError when the file cannot be read, or its mask has another size.
+        Args:
+            path: the file.
+            name: key of its depth map; empty: the file's name.
+            intrinsics: (3, 3) in pixel-centre px as stored; None: COLMAP's guess.
+            level: of escalation: above 0 only the features that its rectifier adds.
+            mask: (H, W) bool of the stored image, where features may be.
+            with_lines: also measure its straight lines.
+
+        Returns:
+            The features, in px of the stored image.
+
+        Raises:
+            ImageError: the file cannot be read, or its mask has another size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
         with self.network_lock if self.options.levels[level].uses_networks else nullcontext():
@@ -118,7 +135,8 @@ class ImageExtractor:
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
         kept = features.select(keep)
-        return ExtractedImage(kept, original_size, warning, photograph.stretched)
+        lines = lines_of(photograph.gray, photograph.mask) if with_lines else None
+        return ExtractedImage(kept, original_size, warning, photograph.stretched, lines=lines)
 
     def photograph(
         self,

@@ -49,7 +49,7 @@ def test_help_has_options_and_examples(command: list[str], call: Call) -> None:
 def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
     parser = build_parser()
     assert {example.split()[0] for example in EXAMPLES} == {
-        *COMMANDS, "convert", "panoramas", "show-pair", "import-h5", "export-h5",
+        *COMMANDS, "convert", "panoramas", "show-pair", "lines", "import-h5", "export-h5",
         "export-database", "export", "align",
     }  # fmt: skip
     for example in EXAMPLES:
@@ -268,6 +268,23 @@ def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
     sheet = out / "view_5_tilt70-inspection.png"
     assert sheet.stat().st_size > 50_000
     assert str(sheet) in done.stdout
+
+
+def test_lines_go_on_past_what_cannot_be_read(tmp_path: Path, call: Call) -> None:
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes(b"no image")
+    out = tmp_path / "pictures"
+    done = call("lines", bad, FACADE, "--output-path", out)
+    assert done.code == 1
+    assert f"{FACADE}: the lines tell a focal length of " in done.stdout
+    assert f"{bad}: not read: " in done.stdout
+    assert "could not read 1 of the images" in done.stderr[-1]
+    assert (out / f"{FACADE.name}-lines.png").stat().st_size > 50_000
+    again = call("lines", FACADE, "--output-path", out)
+    assert (again.code, again.stdout) == (2, "")  # a picture is there already
+    numbers = json.loads(call("lines", FACADE, bad, "--json", "--max-failures", 1).stdout)
+    assert numbers["photographs"][str(FACADE)]["is_known"]
+    assert list(numbers["failures"]) == [str(bad)]
 
 
 def test_show_pair_draws_matches_of_a_run_and_of_any_database(

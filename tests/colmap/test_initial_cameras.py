@@ -320,3 +320,23 @@ def test_cameras_of_another_program_are_given_where_they_are_flagged(
     record_cameras(ViewGraph(path).cameras, records_path, InitialCameras(photos, CameraOptions()))
     assert [r.source for r in read_camera_records(records_path).values()] == ["given", "guess"]
     assert camera_of(path, "a.jpg").params.tolist() == [71, 72, 44, 31]
+
+
+def test_where_one_photograph_was_cropped_a_smaller_one_of_its_body_may_be_a_crop(
+    tmp_path: Path,
+) -> None:
+    tags = {**LENS_50, "ExifImageWidth": 4368, "ExifImageHeight": 2912}
+    photos = tmp_path / "photos"
+    write_photograph(photos / "a.jpg", (1092, 728), tags)
+    write_photograph(photos / "b.jpg", (1092, 728), tags)
+    initial = InitialCameras(photos, CameraOptions())
+    assert initial.group("a.jpg") == initial.group("b.jpg")
+    _, record = initial.camera(["a.jpg", "b.jpg"], (1092, 728))
+    assert (record.source, record.uncropped_px) == ("exif-rescaled", 0.0)
+    write_photograph(photos / "c.jpg", (1000, 800), tags)
+    with_crop = InitialCameras(photos, CameraOptions())
+    assert with_crop.group("a.jpg") != with_crop.group("b.jpg")
+    for name, size in (("a.jpg", (1092, 728)), ("c.jpg", (1000, 800))):
+        _, record = with_crop.camera([name], size)
+        assert record.source == "guess"
+        assert record.uncropped_px == pytest.approx(50 / 35.8 * 4368)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -107,3 +108,25 @@ def test_damaged_headers_never_raise(tmp_path: Path, num_bytes: int) -> None:
     found = read_camera_tags(path)
     if found:
         exif_focal(found)
+
+
+ORIGINAL = {"ExifImageWidth": 4368, "ExifImageHeight": 2912}
+
+
+def test_exif_of_a_crop_tells_the_focal_length_of_the_whole_photograph(tmp_path: Path) -> None:
+    found = exif_focal(tags_of(tmp_path / "a.jpg", (1092, 600), {**LENS_50, **ORIGINAL}))
+    assert (found.focal_px, found.uncropped_px) == (None, pytest.approx(50 / 35.8 * 4368))
+    equivalent = {**BODY, "FocalLengthIn35mmFilm": 50, **ORIGINAL}
+    found = exif_focal(tags_of(tmp_path / "b.jpg", (1092, 600), equivalent))
+    assert found.uncropped_px == pytest.approx(50 / 43.27 * math.hypot(4368, 2912))
+
+
+def test_a_photograph_that_kept_its_shape_is_no_shrunk_one_where_others_are_crops(
+    tmp_path: Path,
+) -> None:
+    tags = tags_of(tmp_path / "a.jpg", (1092, 728), {**LENS_50, **ORIGINAL})
+    assert exif_focal(tags).focal_px == pytest.approx(50 / 35.8 * 1092)
+    found = exif_focal(tags, has_crops=True)
+    assert (found.focal_px, found.uncropped_px) == (None, pytest.approx(50 / 35.8 * 4368))
+    whole = tags_of(tmp_path / "b.jpg", (4368, 2912), {**LENS_50, **ORIGINAL})
+    assert exif_focal(whole, has_crops=True) == exif_focal(whole)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,13 @@ from mapping_tasks import synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
-from colmap_affrect.mappers.adjustment import FINAL, Adjuster, FocalPrior
+from colmap_affrect.mappers.adjustment import FINAL, Adjuster, IntrinsicsCost
+from colmap_affrect.mappers.camera_priors import (
+    CameraPrior,
+    PrincipalPointPrior,
+    camera_prior,
+    usual_principal_point,
+)
 
 TRUE_FOCAL = 1280.0
 SIZE = (1024, 768)
@@ -26,7 +33,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Reconstruction:
 def mean_distortion(model: pycolmap.Reconstruction, noise_px: float) -> float:
     """Adjust a copy of a model, with known focal lengths, to keypoints of some noise."""
     trial = pycolmap.Reconstruction(model)
-    priors = dict.fromkeys(model.cameras, FocalPrior(TRUE_FOCAL, 1e-4))
+    priors = dict.fromkeys(model.cameras, CameraPrior(TRUE_FOCAL, 1e-4))
     Adjuster(priors, noise_px, pycolmap.BundleAdjustmentOptions()).adjust(trial, FINAL)
     return float(np.mean([camera.params[3] for camera in trial.cameras.values()]))
 
@@ -41,7 +48,7 @@ def test_distortion_is_found_by_exact_keypoints_and_stays_near_zero_by_noisy_one
 def cost_of(factor: float, **known: str) -> float:
     """What a focal length costs that is so many times the expected one."""
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE)
-    prior = FocalPrior.of(camera, CameraRecord(("a",), size=SIZE, focal_px=TRUE_FOCAL, **known))
+    prior = camera_prior(camera, CameraRecord(("a",), size=SIZE, focal_px=TRUE_FOCAL, **known))
     return prior.cost(factor * prior.focal_px)
 
 
@@ -54,3 +61,66 @@ def test_lenses_from_wide_to_long_cost_little_and_others_much() -> None:
 def test_a_focal_length_by_exif_may_be_off_by_a_tenth_and_not_by_half() -> None:
     assert cost_of(1.1, source="exif") < 1.0
     assert cost_of(1.5, source="exif") > 4.0
+
+
+def deviations(model: pycolmap.Reconstruction, prior: CameraPrior) -> pycolmap.Reconstruction:
+    """Adjust a copy of a model, whose cameras all have one prior."""
+    trial = pycolmap.Reconstruction(model)
+    priors = dict.fromkeys(model.cameras, prior)
+    Adjuster(priors, 0.5, pycolmap.BundleAdjustmentOptions()).adjust(trial, FINAL)
+    return trial
+
+
+def test_cost_of_an_adjustment_and_of_a_score_have_the_same_prior() -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE)
+    for factor in (0.4, 0.8, 1.0, 2.5):
+        prior = CameraPrior(TRUE_FOCAL / factor, 0.3, usual_principal_point(camera))
+        camera.params = [TRUE_FOCAL, SIZE[0] / 2 + 9.0, SIZE[1] / 2 - 5.0, 0.0]
+        cost = IntrinsicsCost(camera, prior, 0.5, fixed=[])
+        residuals = np.zeros(4)
+        jacobian = np.zeros(16)
+        assert cost.Evaluate([camera.params], residuals, [jacobian])
+        assert 0.5 * (residuals @ residuals) / 0.5**2 == pytest.approx(prior.cost_of(camera))
+        for index, step in enumerate([1e-3, 1e-3, 1e-3, 1e-6]):
+            moved = camera.params.copy()
+            moved[index] += step
+            changed = np.zeros(4)
+            cost.Evaluate([moved], changed, None)
+            slopes = (changed - residuals) / step
+            assert jacobian.reshape(4, 4)[:, index] == pytest.approx(slopes, rel=1e-4, abs=1e-6)
+
+
+def test_focal_lengths_without_information_go_to_their_prior_also_from_far_away(
+    model: pycolmap.Reconstruction,
+) -> None:
+    trial = pycolmap.Reconstruction(model)
+    for camera in trial.cameras.values():
+        camera.params = [TRUE_FOCAL * 1.2, *camera.params[1:]]
+    priors = dict.fromkeys(model.cameras, CameraPrior(TRUE_FOCAL, 1e-5))
+    Adjuster(priors, 0.5, pycolmap.BundleAdjustmentOptions()).adjust(trial, FINAL)
+    for camera in trial.cameras.values():
+        assert camera.params[0] == pytest.approx(TRUE_FOCAL, rel=1e-3)
+
+
+def test_principal_points_move_only_where_they_are_unknown(model: pycolmap.Reconstruction) -> None:
+    shifted = pycolmap.Reconstruction(model)
+    for camera in shifted.cameras.values():
+        camera.params = [*camera.params[:2], camera.params[2] - 40.0, *camera.params[3:]]
+    known = CameraPrior(TRUE_FOCAL, 0.05)
+    for camera in deviations(shifted, known).cameras.values():
+        assert camera.params[2] == SIZE[1] / 2 - 40.0
+    unknown = replace(known, principal_point=PrincipalPointPrior(
+        (SIZE[0] / 2, SIZE[1] / 2), (20.0, 20.0)
+    ))  # fmt: skip
+    found = deviations(shifted, unknown).cameras.values()
+    assert np.mean([camera.params[2] for camera in found]) > SIZE[1] / 2 - 20.0
+
+
+def test_distortion_that_images_cannot_tell_stays_as_it_is(model: pycolmap.Reconstruction) -> None:
+    straight = pycolmap.Reconstruction(model)
+    for camera in straight.cameras.values():
+        camera.params = [*camera.params[:3], 0.0]
+    told = CameraPrior(TRUE_FOCAL, 0.05)
+    held = replace(told, has_distortion=False)
+    assert all(c.params[3] == 0.0 for c in deviations(straight, held).cameras.values())
+    assert all(c.params[3] != 0.0 for c in deviations(straight, told).cameras.values())

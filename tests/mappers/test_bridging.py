@@ -11,9 +11,10 @@ from wall_scene import views, write_scene
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose, pose_errors, relative_pose
-from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster, focal_priors
+from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import BridgeFinder, BridgeHypothesis
+from colmap_affrect.mappers.camera_priors import camera_priors
 from colmap_affrect.mappers.growing import Grower, register_bridges
 from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import PairGraph, poses_of
@@ -32,7 +33,7 @@ def grower(tmp_path_factory: pytest.TempPathFactory) -> Grower:
     task = task_with_given_cameras(path)
     graph = PairGraph.read(path)
     native = mapper_of("sparse").native(task, SEED)
-    priors = focal_priors(graph.cameras.values(), task.cameras)
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
     fixed = frozenset(priors)
     adjuster = Adjuster(priors, NOISE_PX, native.get_global_bundle_adjustment(), fixed)
     return Grower(graph, adjuster, native, lambda _: None)

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers import direction_uncertainty
-from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, FocalPrior
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster
+from colmap_affrect.mappers.camera_priors import CameraPrior
 from colmap_affrect.mappers.direction_uncertainty import direction_sigmas_deg
 
 FOCAL_PX = 1200.0
@@ -45,7 +46,7 @@ def model_of(
 
 
 def adjuster(focal_sigma: float) -> Adjuster:
-    priors = {key: FocalPrior(FOCAL_PX, focal_sigma) for key in range(1, 5)}
+    priors = {key: CameraPrior(FOCAL_PX, focal_sigma) for key in range(1, 5)}
     return Adjuster(priors, NOISE_PX, pycolmap.BundleAdjustmentOptions())
 
 

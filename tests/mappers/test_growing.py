@@ -10,7 +10,8 @@ import pytest
 from mapping_tasks import SEED, mapper_of, synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers.adjustment import FAST, NOISE_PX, Adjuster, focal_priors
+from colmap_affrect.mappers.adjustment import FAST, NOISE_PX, Adjuster
+from colmap_affrect.mappers.camera_priors import camera_priors
 from colmap_affrect.mappers.growing import Grower
 from colmap_affrect.mappers.pair_graph import PairGraph, poses_of
 
@@ -37,7 +38,7 @@ def grower_of(path: Path) -> Grower:
     task = task_with_given_cameras(path)
     graph = PairGraph.read(path)
     native = mapper_of("sparse", init_min_num_inliers=1).native(task, SEED)
-    priors = focal_priors(graph.cameras.values(), task.cameras)
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
     refining = native.get_global_bundle_adjustment()
     adjuster = Recorder(priors, NOISE_PX, refining, frozenset(priors))
     return Grower(graph, adjuster, native, lambda _: None)

@@ -14,8 +14,9 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.parallax import mirrored_share
-from colmap_affrect.mappers.adjustment import Adjuster, FocalPrior
+from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.camera_priors import CameraPrior
 from colmap_affrect.mappers.reliability import TERMS, confidence, score_images
 from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
 from colmap_affrect.project.reasons import Doubt
@@ -325,7 +326,7 @@ def test_distortion_does_not_hide_that_a_given_focal_length_is_wrong(
     focal_px = factor * 1500.0
     mapped.reconstruction.cameras[1].params = [focal_px, 320, 240, 0]
     refining = pycolmap.BundleAdjustmentOptions()
-    Adjuster({1: FocalPrior(focal_px, 0.0)}, 0.7, refining).adjust(mapped.reconstruction, 300)
+    Adjuster({1: CameraPrior(focal_px, 0.0)}, 0.7, refining).adjust(mapped.reconstruction, 300)
     record = replace(task.cameras[1], source="given", focal_px=focal_px, given=("focal",))
     found = features_of(mapped, replace(task, cameras={1: record}))["2.jpg"].fitting_focal_px
     assert found == 0.0 if factor == 1.0 else found == pytest.approx(1500.0, rel=0.05)

@@ -20,21 +20,22 @@ from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.mappers import adjustment
-from colmap_affrect.mappers.adjustment import (
+from colmap_affrect.mappers.adjustment import FINAL, Adjuster
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.camera_priors import (
     EXIF_SIGMA,
-    FINAL,
     USUAL_FOCAL,
     USUAL_SIGMA,
-    Adjuster,
-    FocalPrior,
-    focal_priors,
+    ZOOMS,
+    CameraPrior,
+    camera_prior,
+    camera_priors,
 )
-from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer, pair_log_ratio
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
 from colmap_affrect.mappers.search import Search
-from colmap_affrect.mappers.sparse import OWN_CAMERAS
+from colmap_affrect.mappers.sparse import COLMAP_MODEL, OWN_CAMERAS
 
 TRUE_FOCAL = 1280.0
 SIZE = (1024, 768)
@@ -72,7 +73,7 @@ def widen(model: pycolmap.Reconstruction, factor: float) -> None:
 
 
 def adjuster(
-    model: pycolmap.Reconstruction, prior: FocalPrior, noise_px: float = NOISE_PX
+    model: pycolmap.Reconstruction, prior: CameraPrior, noise_px: float = NOISE_PX
 ) -> Adjuster:
     priors = dict.fromkeys(model.cameras, prior)
     return Adjuster(priors, noise_px, pycolmap.BundleAdjustmentOptions())
@@ -88,27 +89,27 @@ def test_what_is_known_of_a_focal_length(
     record: CameraRecord | None, focal_px: float, sigma: float
 ) -> None:
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE)
-    assert FocalPrior.of(camera, record) == FocalPrior(focal_px, sigma)
+    assert camera_prior(camera, record) == CameraPrior(focal_px, sigma)
 
 
 def test_a_prior_costs_by_its_deviation_and_nothing_where_it_is_held() -> None:
-    prior = FocalPrior(1000.0, 0.2)
+    prior = CameraPrior(1000.0, 0.2)
     assert prior.cost(1000.0) == 0.0
     assert prior.cost(1000.0 * math.exp(0.4)) == pytest.approx(2.0)
     assert prior.cost(1000.0 * math.exp(-0.4)) == pytest.approx(2.0)
-    assert FocalPrior(1000.0, 0.0).cost(2000.0) == 0.0
+    assert CameraPrior(1000.0, 0.0).cost(2000.0) == 0.0
 
 
 def test_adjustment_finds_focal_lengths_that_points_know(model: pycolmap.Reconstruction) -> None:
     widen(model, 1.1)
-    adjuster(model, FocalPrior(USUAL_FOCAL * SIZE[0], USUAL_SIGMA)).adjust(model, FINAL)
+    adjuster(model, CameraPrior(USUAL_FOCAL * SIZE[0], USUAL_SIGMA)).adjust(model, FINAL)
     assert focals(model) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.02)
 
 
 def test_noisier_keypoints_leave_focal_lengths_nearer_to_the_prior(
     model: pycolmap.Reconstruction,
 ) -> None:
-    prior = FocalPrior(0.8 * TRUE_FOCAL, 0.05)
+    prior = CameraPrior(0.8 * TRUE_FOCAL, 0.05)
     exact, noisy = (pycolmap.Reconstruction(model) for _ in range(2))
     adjuster(exact, prior, 0.4).adjust(exact, FINAL)
     adjuster(noisy, prior, 3.0).adjust(noisy, FINAL)
@@ -118,7 +119,7 @@ def test_noisier_keypoints_leave_focal_lengths_nearer_to_the_prior(
 def test_given_focal_lengths_stay_to_the_bit(model: pycolmap.Reconstruction) -> None:
     widen(model, 1.1)
     before = [camera.params[:3].tolist() for camera in model.cameras.values()]
-    adjuster(model, FocalPrior(1.1 * TRUE_FOCAL, 0.0)).adjust(model, FINAL)
+    adjuster(model, CameraPrior(1.1 * TRUE_FOCAL, 0.0)).adjust(model, FINAL)
     assert [camera.params[:3].tolist() for camera in model.cameras.values()] == before
 
 
@@ -127,7 +128,7 @@ def test_an_adjustment_of_some_images_leaves_the_others_where_they_are(
 ) -> None:
     *some, last = sorted(model.reg_image_ids())
     before = model.images[last].cam_from_world().matrix()
-    adjuster(model, FocalPrior(TRUE_FOCAL, 0.0)).adjust(model, FINAL, some)
+    adjuster(model, CameraPrior(TRUE_FOCAL, 0.0)).adjust(model, FINAL, some)
     assert (model.images[last].cam_from_world().matrix() == before).all()
 
 
@@ -144,10 +145,10 @@ def test_more_agreement_is_more_score_and_contradiction_costs_little(
 def test_a_wrong_pose_and_an_unlikely_lens_have_a_lower_score(
     scene: Scene, model: pycolmap.Reconstruction
 ) -> None:
-    prior = dict.fromkeys(model.cameras, FocalPrior(TRUE_FOCAL, EXIF_SIGMA))
+    prior = dict.fromkeys(model.cameras, CameraPrior(TRUE_FOCAL, EXIF_SIGMA))
     graph = PairGraph.read(scene[0])
     right = ModelScorer(graph, prior).score(model)
-    unlikely = dict.fromkeys(model.cameras, FocalPrior(2 * TRUE_FOCAL, EXIF_SIGMA))
+    unlikely = dict.fromkeys(model.cameras, CameraPrior(2 * TRUE_FOCAL, EXIF_SIGMA))
     assert ModelScorer(graph, unlikely).score(model) < right - 3.0
     image = model.images[max(model.reg_image_ids())]
     turned = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.5, 0.0])), np.zeros(3))
@@ -199,7 +200,7 @@ def test_an_adjustment_of_some_images_holds_cameras_that_others_share(tmp_path: 
     widen(model, 1.05)
     before = camera.params.tolist()
     some = sorted(model.reg_image_ids())[:3]
-    adjuster(model, FocalPrior(TRUE_FOCAL, USUAL_SIGMA)).adjust(model, FINAL, some)
+    adjuster(model, CameraPrior(TRUE_FOCAL, USUAL_SIGMA)).adjust(model, FINAL, some)
     assert camera.params.tolist() == before
 
 
@@ -270,12 +271,49 @@ def test_bridges_are_built_anew_with_a_focal_length_that_a_model_has_found(tmp_p
     native = mapper_of("sparse").native(MappingTask(path, None, cameras={1: record}), 0)
     native.mapper.init_max_forward_motion = 1.0
     graph = PairGraph.read(path)
-    priors = focal_priors(graph.cameras.values(), {1: record})
+    priors = camera_priors(graph.cameras.values(), {1: record}, {})
     adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
     search = RecordingSearch(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
     (found,) = search.best(graph)
     assert found.reconstruction.num_reg_images() == 4
     assert search.tried_px == pytest.approx([USUAL_FOCAL * 1000, 977.5], rel=0.02)
+
+
+@dataclass(frozen=True)
+class NeverCertain(RecordingSearch):
+    """Tries all focal lengths."""
+
+    def is_certain(self, *_: Any, **__: Any) -> bool:
+        return False
+
+
+def test_cameras_of_one_image_each_begin_at_focal_lengths_from_wide_to_long(
+    scene: Scene,
+) -> None:
+    task = task_of(scene, UNKNOWN)
+    native = mapper_of("sparse").native(task, 0)
+    graph = PairGraph.read(scene[0])
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
+    adjuster = Adjuster(priors, NOISE_PX, native.get_global_bundle_adjustment())
+    search = NeverCertain(adjuster, ModelScorer(graph, priors), native, 1, lambda _: None)
+    (found,) = search.best(graph)
+    assert focals(found.reconstruction) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.03)
+    for zoom in ZOOMS:
+        assert (
+            min(abs(tried / (zoom * USUAL_FOCAL * SIZE[0]) - 1) for tried in search.tried_px) < 0.01
+        )
+
+
+def test_colmaps_own_model_is_taken_where_ours_scores_lower(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Search, "best", lambda *_: [])
+    (found,) = mapper_of("sparse").map(task_of(scene, UNKNOWN), tmp_path, 0, lambda _: None)
+    assert found.moves == (COLMAP_MODEL,)
+    assert focals(found.reconstruction) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.05)
+    assert not mapper_of("sparse").map(
+        task_with_given_cameras(scene[0]), tmp_path, 0, lambda _: None
+    )
 
 
 def test_a_token_stops_the_search(scene: Scene, tmp_path: Path) -> None:

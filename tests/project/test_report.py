@@ -89,7 +89,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "recipe": "default", "preset": "sparse", "mapper": "incremental",
         "mapper_options": {"mapper.init_max_error": 3.0}, "verification": {"min_num_inliers": 20},
         "mapping": {"min_model_size": 2}, "random_seed": 7, "versions": {"pycolmap": "4.2.1"},
-        "by_hand": [], "tie_points": [], "one_view": [],
+        "by_hand": [], "tie_points": [], "one_view": [], "lines": {},
         "effort": "", "matched_again": [], "untried": [],
     }  # fmt: skip
     assert [(stage["name"], stage["wall_s"]) for stage in stages] == [
@@ -144,6 +144,11 @@ def test_summary_says_where_exif_is_wrong_or_needs_the_size_of_the_sensor() -> N
     text = replace(REPORT, cameras=(right, {**right, "refined_px": None})).summary()
     assert "EXIF may be wrong" not in text
     assert "sensor" not in text
+    database = {**camera, "source": "given", "focal_px": 2560.0, "refined_px": 1279.0}
+    text = replace(REPORT, cameras=(database, {**right, "source": "given"})).summary()
+    line = "the given focal length may be wrong: 2560 px given, 1279 px in the model; --cameras"
+    assert line in text
+    assert "EXIF" not in text
 
 
 def test_summary_says_what_cannot_be_trusted() -> None:

@@ -41,6 +41,11 @@ def inspect(extractor: ImageExtractor, path: Path, output_path: Path) -> str:
     assert picture.shape[1] == WIDTH_PX
     assert 50 < picture.shape[0] < 6000
     assert picture.std() > 5.0
+    lines = cv2.imdecode(
+        np.fromfile(output_path / f"{path.stem}-inspection-lines.png", np.uint8), cv2.IMREAD_COLOR
+    )
+    assert lines.shape[1] == WIDTH_PX
+    assert "lines: " in said
     return said
 
 

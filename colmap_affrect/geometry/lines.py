@@ -1,0 +1,297 @@
+"""Focal length, axis and upright direction of one photograph from its straight lines.
+
+Buildings, rooms and streets hold lines in three orthogonal directions. The vanishing points of
+these tell the focal length, where the optical axis meets the image, and how the camera is turned
+(Caprile and Torre, IJCV 1990). For each focal length and shift of a grid the rotation is sought
+that explains most segments (:mod:`colmap_affrect.geometry.vanishing`). What is left is a likelihood
+of focal length and shift, which priors can be multiplied with.
+
+Lengths are in longer sides of the image, positions count from its middle, x right, y down; the
+camera looks along z. A shift is that of the principal point, down.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
+from colmap_affrect.geometry.segments import Segments
+from colmap_affrect.geometry.vanishing import VanishingFit, refined
+
+FOCALS: Array = np.exp(np.linspace(math.log(0.4), math.log(6.0), 28))
+"""Grid of focal lengths, longer sides: lenses of 14 to 216 mm for film of 36 mm."""
+SHIFTS: Array = np.linspace(-0.3, 0.3, 25)
+"""Grid of shifts, longer sides: view cameras go to a quarter of their plate."""
+
+MIN_NUM_SEGMENTS = 12  # fewer say nothing: three directions and a focal length have 4 unknowns
+NUM_SEGMENTS_OF_TRIALS = 90  # the longest, by which first frames are tried
+NUM_TRIALS = 160  # frames of three directions that are tried for each focal length
+NUM_KEPT = 3  # of these, which are refined for each focal length
+MIN_SINE = 1e-3  # of the angle between planes that meet in a direction of a first frame
+NUM_STEPS = 5  # of refinement without a shift
+NUM_STEPS_SHIFTED = 3  # of refinement for each shift, from there
+TEMPER = 3.0  # lines that count as one piece of evidence: what is built errs together
+MODEL_SIGMA = 0.04
+"""Deviation of log focal length that is left where lines are many. This and ``TEMPER`` are fitted
+by ``tests/benchmarks/lines.py``, with each scene left out in turn."""
+USUAL_FOCAL = 1.2  # longer sides: what COLMAP guesses
+USUAL_FOCAL_SIGMA = 0.5  # of the logarithm of the focal lengths that photographs have
+KNOWN_SIGMA = 0.15  # of log focal length, below which lines know it
+MIDDLE_SIGMA = 0.02  # longer sides, of the axis of a photograph that is as the camera took it
+SHIFTED_SIGMA = 0.15  # longer sides, of the axis of a print: view cameras shift, and prints are cut
+MIN_EVIDENCE = 3.0  # nats, from which on lines have their directions not by chance
+SHIFT_EVIDENCE = 3.0  # nats, from which on lines say that the axis is not in the middle
+
+
+@dataclass(frozen=True)
+class LineLikelihood:
+    """What the lines of a photograph say of its camera.
+
+    Attributes:
+        log_likelihoods: (F, S) for ``FOCALS`` and ``SHIFTS``, tempered; 0 is what chance explains.
+        rotations: (F, S, 3, 3), rows are the three directions in the camera's frame.
+    """
+
+    log_likelihoods: Floats
+    rotations: Floats
+
+
+@dataclass(frozen=True)
+class LineCamera:
+    """The camera of a photograph by its straight lines.
+
+    Attributes:
+        focal: focal length in longer sides, the geometric mean.
+        focal_sigma: deviation of its logarithm.
+        shift: of the principal point, down from the middle, in longer sides.
+        shift_sigma: its deviation.
+        rotation: (3, 3), rows are the three directions in the camera's frame, for the likeliest.
+        up: (3,) the direction of these that is nearest to the upright of the image, upwards.
+    """
+
+    focal: float
+    focal_sigma: float
+    shift: float
+    shift_sigma: float
+    rotation: Floats
+    up: Floats
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the lines tell the focal length."""
+        return self.focal_sigma < KNOWN_SIGMA
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The likeliest camera on the grid, and which segments it explains.
+
+    Attributes:
+        focal: focal length in longer sides.
+        shift: of the principal point, down from the middle, in longer sides.
+        rotation: (3, 3), rows are the three directions in the camera's frame.
+        kinds: (N,) number of the direction of each segment, ``CHANCE`` for none.
+        evidence: nats by which the lines are likelier with these directions than by chance.
+    """
+
+    focal: float
+    shift: float
+    rotation: Floats
+    kinds: Indices
+    evidence: float
+
+    @property
+    def up(self) -> Floats:
+        """(3,) the direction that is nearest to the upright of the image, upwards."""
+        return upright_of(self.rotation)
+
+    @property
+    def horizon(self) -> Floats:
+        """(3,) homogeneous line of the image, in longer sides from its middle."""
+        x, y, z = self.up / self.focal
+        return np.array([x, y, self.focal * z - self.shift * y])
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The straight lines of a photograph, and what they say.
+
+    Attributes:
+        segments: of the photograph.
+        likelihood: of its camera; None where there are too few segments to say anything.
+    """
+
+    segments: Segments
+    likelihood: LineLikelihood | None
+
+    @property
+    def says_shifted(self) -> bool:
+        """Whether the lines say that the optical axis is not in the middle of the image."""
+        return self.likelihood is not None and shift_evidence(self.likelihood) > SHIFT_EVIDENCE
+
+    @property
+    def usual_shift_sigma(self) -> float:
+        """How far the axis may be from the middle where nobody knows, in longer sides."""
+        return SHIFTED_SIGMA if self.says_shifted else MIDDLE_SIGMA
+
+    def camera(self, shift_sigma: float | None = None) -> LineCamera | None:
+        """Return the camera by the lines; None where they are too few.
+
+        Args:
+            shift_sigma: how far the axis may be from the middle, in longer sides; None: in the
+                middle, unless the lines say otherwise.
+        """
+        if self.likelihood is None:
+            return None
+        sigma = self.usual_shift_sigma if shift_sigma is None else shift_sigma
+        return line_camera(self.likelihood, sigma)
+
+    def explanation(self) -> Explanation | None:
+        """Return which segments belong to which direction; None where they are too few."""
+        if self.likelihood is None:
+            return None
+        row, column = _likeliest(posterior(self.likelihood, self.usual_shift_sigma))
+        focal = float(FOCALS[row])
+        shift = float(SHIFTS[column])
+        rotation = self.likelihood.rotations[row, column]
+        fit = VanishingFit(self.segments, rotation[None], np.array([focal]), np.array([shift]))
+        evidence = float(self.likelihood.log_likelihoods[row, column])
+        return Explanation(focal, shift, rotation, fit.kinds()[0], evidence)
+
+
+def measure_lines(segments: Segments) -> Lines:
+    """Return segments with what they say of the camera."""
+    return Lines(segments, line_likelihood(segments))
+
+
+def line_camera(likelihood: LineLikelihood, shift_sigma: float = MIDDLE_SIGMA) -> LineCamera:
+    """Return what lines say of a camera, together with what is usual.
+
+    Args:
+        likelihood: of the lines.
+        shift_sigma: how far the optical axis may be from the middle beforehand, in longer sides.
+
+    Returns:
+        The camera, with deviations.
+    """
+    chances = posterior(likelihood, shift_sigma)
+    log_focals = np.log(FOCALS)
+    of_focals = chances.sum(axis=1)
+    of_shifts = chances.sum(axis=0)
+    log_focal = float(of_focals @ log_focals)
+    focal_variance = float(of_focals @ (log_focals - log_focal) ** 2)
+    shift = float(of_shifts @ SHIFTS)
+    shift_variance = float(of_shifts @ (SHIFTS - shift) ** 2)
+    rotation = likelihood.rotations[_likeliest(chances)]
+    return LineCamera(
+        focal=math.exp(log_focal),
+        focal_sigma=math.hypot(math.sqrt(focal_variance), MODEL_SIGMA),
+        shift=shift,
+        shift_sigma=math.sqrt(shift_variance),
+        rotation=rotation,
+        up=upright_of(rotation),
+    )
+
+
+def shift_evidence(likelihood: LineLikelihood) -> float:
+    """Return by how many nats lines are likelier with a free axis than with one in the middle."""
+    free = _log_joint(likelihood, SHIFTED_SIGMA)
+    in_the_middle = _log_joint(likelihood, MIDDLE_SIGMA)
+    return float(
+        np.logaddexp.reduce(free, axis=None) - np.logaddexp.reduce(in_the_middle, axis=None)
+    )
+
+
+def upright_of(rotation: Floats) -> Floats:
+    """Return the row of a (3, 3) rotation that is nearest to the image's upright, upwards."""
+    row = rotation[np.abs(rotation[:, 1]).argmax()]
+    return np.asarray(row if row[1] < 0.0 else -row)
+
+
+def _log_joint(likelihood: LineLikelihood, shift_sigma: float) -> Floats:
+    """Return (F, S) log-likelihoods with log-probabilities beforehand, which sum to one."""
+    focal_prior = -0.5 * (np.log(FOCALS / USUAL_FOCAL) / USUAL_FOCAL_SIGMA) ** 2
+    shift_prior = -0.5 * (SHIFTS / shift_sigma) ** 2
+    prior = focal_prior[:, None] + shift_prior[None, :]
+    return np.asarray(likelihood.log_likelihoods + prior - np.logaddexp.reduce(prior, axis=None))
+
+
+def posterior(likelihood: LineLikelihood, shift_sigma: float) -> Floats:
+    """Return (F, S) probabilities of focal lengths and shifts."""
+    logs = _log_joint(likelihood, shift_sigma)
+    return np.asarray(np.exp(logs - np.logaddexp.reduce(logs, axis=None)))
+
+
+def _likeliest(chances: Floats) -> tuple[int, int]:
+    """Return row and column of the largest of (F, S) probabilities."""
+    row, column = np.unravel_index(int(chances.argmax()), chances.shape)
+    return int(row), int(column)
+
+
+def line_likelihood(segments: Segments, random_seed: int = 0) -> LineLikelihood | None:
+    """Return how likely focal lengths and shifts are by the straight lines of a photograph.
+
+    Args:
+        segments: of the photograph.
+        random_seed: of the frames that are tried.
+
+    Returns:
+        The likelihood; None where there are too few segments to say anything.
+    """
+    if len(segments) < MIN_NUM_SEGMENTS:
+        return None
+    centred = _rotations_of_centred_cameras(segments, random_seed)
+    grid = (len(FOCALS), len(SHIFTS))
+    focals = np.repeat(FOCALS, len(SHIFTS))
+    shifts = np.tile(SHIFTS, len(FOCALS))
+    starts = np.repeat(centred, len(SHIFTS), axis=0)
+    rotations, scores = refined(segments, starts, focals, shifts, NUM_STEPS_SHIFTED)
+    log_likelihoods = scores.reshape(grid) / TEMPER
+    return LineLikelihood(log_likelihoods, rotations.reshape(*grid, 3, 3))
+
+
+def _rotations_of_centred_cameras(segments: Segments, random_seed: int) -> Floats:
+    """Return the (F, 3, 3) rotations that explain most for each focal length, without a shift."""
+    starts = _first_rotations(segments, random_seed)
+    focals = np.repeat(FOCALS, NUM_KEPT)
+    found, scores = refined(
+        segments, starts.reshape(-1, 3, 3), focals, np.zeros(len(focals)), NUM_STEPS
+    )
+    best = scores.reshape(-1, NUM_KEPT).argmax(axis=1)
+    return np.asarray(found.reshape(-1, NUM_KEPT, 3, 3)[np.arange(len(best)), best])
+
+
+def _first_rotations(segments: Segments, random_seed: int) -> Floats:
+    """Return the (F, K, 3, 3) best of many frames for each focal length."""
+    longest = segments.longest(NUM_SEGMENTS_OF_TRIALS)
+    random = np.random.default_rng(random_seed)
+    importance = longest.weights * longest.lengths
+    chances = importance / importance.sum()
+    chosen = random.choice(len(longest), (NUM_TRIALS, 3), p=chances)
+    no_shift = np.zeros(NUM_TRIALS)
+    kept = np.empty((len(FOCALS), NUM_KEPT, 3, 3))
+    for number, focal in enumerate(FOCALS):
+        normals = _unit(longest.lines * [focal, focal, 1.0])  # of planes with the camera's centre
+        rotations = _frames(normals[chosen])
+        scores = VanishingFit(longest, rotations, np.full(NUM_TRIALS, focal), no_shift).scores()
+        kept[number] = rotations[np.argsort(-scores, kind="stable")[:NUM_KEPT]]
+    return kept
+
+
+def _frames(normals: Floats) -> Floats:
+    """Return the (K, 3, 3) frames of (K, 3, 3) normals of planes; where these do not tell, usual.
+
+    The first two planes meet in the first direction, and the second direction lies in the third.
+    """
+    first = np.cross(normals[:, 0], normals[:, 1])
+    second = np.cross(first, normals[:, 2])
+    is_good = np.linalg.norm(first, axis=1) > MIN_SINE
+    is_good &= np.linalg.norm(second, axis=1) > MIN_SINE
+    first = _unit(np.where(is_good[:, None], first, [1.0, 0.0, 0.0]))
+    second = _unit(np.where(is_good[:, None], second, [0.0, 1.0, 0.0]))
+    return np.stack([first, second, np.cross(first, second)], axis=1)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

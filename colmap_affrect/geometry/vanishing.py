@@ -1,0 +1,168 @@
+"""How well segments point at the vanishing points of three orthogonal directions.
+
+Each segment points at one of three vanishing points or is there by chance: the mixture of Coughlan
+and Yuille (Manhattan world, ICCV 1999). The shares of these kinds are estimated together with the
+rotation. Many cameras are looked at in one go, as arrays.
+
+A camera has a focal length and a shift of its principal point, down from the middle of the image,
+both in longer sides; it looks along z, x right, y down. The rows of a rotation are the three
+directions in its frame.
+"""
+
+import math
+
+import numpy as np
+
+from colmap_affrect.geometry.arrays import Floats, Indices
+from colmap_affrect.geometry.segments import Segments
+
+CHANCE_DENSITY = 2.0 / math.pi  # of the angle of a segment that is there by chance, per rad
+CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand
+DIRECTION_COUNT = 1.0  # segments of each direction that are reckoned with beforehand
+NUM_EM_STEPS = 3  # for the shares of the directions and of chance
+MAX_STEP = 0.1  # rad, of a step of refinement
+DAMPING = 1e-6  # of it, relative to what is known of the turn
+TINY = 1e-12
+CHANCE = -1  # kind of a segment that belongs to no direction
+
+
+class VanishingFit:
+    """How well segments fit vanishing points of several cameras at once.
+
+    Args:
+        segments: N of them.
+        rotations: (K, 3, 3), rows are directions in the camera's frame.
+        focals: (K,) focal lengths.
+        shifts: (K,) shifts of the principal point.
+    """
+
+    def __init__(
+        self,
+        segments: Segments,
+        rotations: Floats,
+        focals: Floats,
+        shifts: Floats,
+    ) -> None:
+        self.segments = segments
+        self.rotations = rotations
+        self.focals = focals
+        self.shifts = shifts
+        points = self._vanishing_points(rotations)
+        self.distances = self._distances(points)  # (K, 3, N) from middles to vanishing points
+        self.sines = self._crossed(points) / self.distances  # of the angles to these
+        sigmas = segments.sigmas
+        densities = np.empty((len(focals), 4, len(segments)))
+        densities[:, :3] = np.exp(-0.5 * (self.sines / sigmas) ** 2)
+        densities[:, :3] *= math.sqrt(2.0 / math.pi) / sigmas
+        densities[:, 3] = CHANCE_DENSITY
+        self.densities = densities  # (K, 4, N) of the three directions and of chance
+        self.shares = self._estimated_shares()
+
+    def _vanishing_points(self, directions: Floats) -> Floats:
+        """Return the (K, 3, 3) homogeneous points in which directions vanish."""
+        x, y, z = np.moveaxis(directions, -1, 0)
+        focals = self.focals[:, None]
+        shifts = self.shifts[:, None]
+        return np.stack([focals * x, focals * y + shifts * z, z], axis=-1)
+
+    def _distances(self, points: Floats) -> Floats:
+        """Return the (K, 3, N) lengths of the vectors from middles to homogeneous points."""
+        middles = self.segments.middles
+        across = points[..., :1] - points[..., 2:] * middles[:, 0]
+        down = points[..., 1:2] - points[..., 2:] * middles[:, 1]
+        return np.asarray(np.sqrt(across * across + down * down) + TINY)
+
+    def _crossed(self, points: Floats) -> Floats:
+        """Return the (K, 3, N) cross products of these vectors with the directions of segments."""
+        return np.asarray(points @ self.segments.lines.T)
+
+    def _estimated_shares(self) -> Floats:
+        """Return the (K, 4) shares of the kinds of segments, by a few steps of EM."""
+        beforehand = np.array([DIRECTION_COUNT] * 3 + [CHANCE_COUNT])
+        num_segments = beforehand.sum() + self.segments.weights.sum()
+        shares = np.tile(beforehand / beforehand.sum(), (len(self.focals), 1))
+        for _ in range(NUM_EM_STEPS):
+            portions = self.segments.weights / self._likelihoods(shares)
+            counts = shares * (self.densities @ portions[:, :, None])[:, :, 0]
+            shares = (counts + beforehand) / num_segments
+        return shares
+
+    def _likelihoods(self, shares: Floats) -> Floats:
+        """Return the (K, N) densities of the angles of segments."""
+        return np.asarray((shares[:, None, :] @ self.densities)[:, 0])
+
+    def scores(self) -> Floats:
+        """Return (K,) log-likelihood ratios against chance alone."""
+        ratios = self._likelihoods(self.shares) / CHANCE_DENSITY
+        return np.asarray(np.log(ratios) @ self.segments.weights)
+
+    def improved(self) -> Floats:
+        """Return the (K, 3, 3) rotations after a Gauss-Newton step.
+
+        It holds the distances to the vanishing points, as a small turn hardly changes them.
+        """
+        segments = self.segments
+        portions = segments.weights / segments.sigmas**2 / self._likelihoods(self.shares)
+        parts = self.densities[:, :3] * self.shares[:, :3, None] * portions[:, None, :]
+        num_cameras = len(self.focals)
+        slopes = np.empty((num_cameras, 3, *self.sines.shape[1:]))
+        for axis in range(3):
+            turned = np.cross(np.eye(3)[axis], self.rotations)
+            slopes[:, axis] = self._crossed(self._vanishing_points(turned)) / self.distances
+        weighted = (slopes * parts[:, None]).reshape(num_cameras, 3, -1)
+        slopes = slopes.reshape(num_cameras, 3, -1)
+        normal = weighted @ np.swapaxes(slopes, 1, 2)
+        gradient = weighted @ self.sines.reshape(num_cameras, -1, 1)
+        damping = DAMPING * (1.0 + np.trace(normal, axis1=1, axis2=2))
+        normal += damping[:, None, None] * np.eye(3)
+        steps = -np.linalg.solve(normal, gradient)[..., 0]
+        sizes = np.linalg.norm(steps, axis=1, keepdims=True)
+        steps *= np.minimum(1.0, MAX_STEP / np.maximum(sizes, TINY))
+        return _turned(self.rotations, steps)
+
+    def kinds(self) -> Indices:
+        """Return the (K, N) likeliest kinds, ``CHANCE`` for chance."""
+        kinds = (self.densities * self.shares[:, :, None]).argmax(axis=1)
+        return np.where(kinds == 3, CHANCE, kinds)
+
+
+def refined(
+    segments: Segments,
+    rotations: Floats,
+    focals: Floats,
+    shifts: Floats,
+    num_steps: int,
+) -> tuple[Floats, Floats]:
+    """Turn cameras so that their vanishing points explain more segments.
+
+    Args:
+        segments: of the photograph.
+        rotations: (K, 3, 3), rows are directions in the camera's frame.
+        focals: (K,) focal lengths, longer sides.
+        shifts: (K,) shifts of the principal point, longer sides.
+        num_steps: of Gauss-Newton; those that explain less are passed over.
+
+    Returns:
+        (K, 3, 3) rotations, and (K,) log-likelihood ratios against chance alone.
+    """
+    best = rotations
+    fit = VanishingFit(segments, rotations, focals, shifts)
+    scores = fit.scores()
+    for _ in range(num_steps):
+        fit = VanishingFit(segments, fit.improved(), focals, shifts)
+        found = fit.scores()
+        is_better = found > scores
+        best = np.where(is_better[:, None, None], fit.rotations, best)
+        scores = np.where(is_better, found, scores)
+    return best, scores
+
+
+def _turned(rotations: Floats, steps: Floats) -> Floats:
+    """Turn (K, 3, 3) rows by (K, 3) rotation vectors (Rodrigues)."""
+    angles = np.linalg.norm(steps, axis=1)[:, None, None]
+    axes = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
+    crossed = np.cross(axes[:, None, :], rotations)
+    along = (rotations @ axes[:, :, None]) * axes[:, None, :]
+    return np.asarray(
+        rotations * np.cos(angles) + crossed * np.sin(angles) + along * (1.0 - np.cos(angles))
+    )

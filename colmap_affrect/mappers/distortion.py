@@ -1,0 +1,66 @@
+"""Which cameras have images that can tell their distortion.
+
+What an image says of its camera is what its features say more than points and pose need. A point
+that n images see has 2 n coordinates for three of its own, so that 2 - 3 / n of each observation
+are left; features in one cell of an image err together and count as one. Of these redundant
+observations (Förstner and Wrobel, Photogrammetric Computer Vision, 2016) the pose takes six.
+"""
+
+from collections import defaultdict
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.arrays import Array, Indices
+from colmap_affrect.mappers.model_score import GRID
+from colmap_affrect.mappers.pair_graph import PairGraph
+
+NUM_POSE_PARAMETERS = 6
+MIN_NUM_IMAGES = 3
+"""Images of a camera, from which on they tell its distortion: what else is wrong of a model is not
+the same in all of them (judged)."""
+MIN_REDUNDANCY = 60.0
+"""Redundant observations of one or two images, from which on these tell it (judged)."""
+
+
+def cameras_that_tell_distortion(graph: PairGraph) -> frozenset[int]:
+    """Return the ids of the cameras whose distortion the verified pairs of a graph tell."""
+    redundancies: defaultdict[int, float] = defaultdict(float)
+    num_images: defaultdict[int, int] = defaultdict(int)
+    for image_id, num_partners in _num_partners(graph).items():
+        camera = graph.cameras[image_id]
+        key = camera.camera_id
+        keypoints = graph.keypoints[image_id].astype(np.float64)
+        redundancies[key] += redundancy_of(camera, keypoints, num_partners)
+        num_images[key] += 1
+    found = set[int]()
+    for key, redundancy in redundancies.items():
+        if num_images[key] >= MIN_NUM_IMAGES or redundancy >= MIN_REDUNDANCY:
+            found.add(key)
+    return frozenset(found)
+
+
+def _num_partners(graph: PairGraph) -> dict[int, Indices]:
+    """Return in how many other images each feature is matched, by image id."""
+    found = {i: np.zeros(len(points), np.int64) for i, points in graph.keypoints.items()}
+    for pair in graph.verified:
+        for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
+            found[image_id][np.unique(features)] += 1
+    return found
+
+
+def redundancy_of(camera: pycolmap.Camera, keypoints: Array, num_partners: Indices) -> float:
+    """Return how many observations of an image are redundant.
+
+    Args:
+        camera: Of the image.
+        keypoints: (N, 2) px.
+        num_partners: (N,) numbers of other images in which they are matched.
+    """
+    cells = (keypoints / [camera.width, camera.height] * GRID).astype(np.int64)
+    columns, rows = np.clip(cells, 0, GRID - 1).T
+    numbers: Indices = columns + GRID * rows
+    most = np.zeros(GRID * GRID, np.int64)
+    np.maximum.at(most, numbers, num_partners)
+    num_views = most[most > 0] + 1
+    return max(0.0, float((2.0 - 3.0 / num_views).sum()) - NUM_POSE_PARAMETERS)

@@ -1,0 +1,76 @@
+"""Made-up scenes of straight lines, and what a camera sees of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from strategies import Array
+
+SIZE = (1500, 1000)  # of the images, px
+
+
+def turn(axis: int, degrees: float) -> Array:
+    """A (3, 3) turn about x, y or z."""
+    angle = np.deg2rad(degrees)
+    first = (axis + 1) % 3
+    second = (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[first, first] = matrix[second, second] = np.cos(angle)
+    matrix[first, second] = -np.sin(angle)
+    matrix[second, first] = np.sin(angle)
+    return matrix
+
+
+@dataclass(frozen=True)
+class Building:
+    """A building of random straight edges, and the camera before it."""
+
+    focal: float = 1.0  # longer sides
+    shift: float = 0.0  # of the principal point, down, longer sides
+    # columns are the building's right, down and ahead in the camera's frame
+    rotation: Array = field(default_factory=lambda: turn(2, 3.0) @ turn(0, -12.0) @ turn(1, 35.0))
+    num_each: int = 25  # edges of each direction
+    noise_px: float = 0.4  # of the ends
+    directions: tuple[int, ...] = (0, 1, 2)
+
+    def edges(self, seed: int = 0) -> Array:
+        """(N, 4) ends in pixel-centre px of an image of ``SIZE``."""
+        random = np.random.default_rng(seed)
+        longer = max(SIZE)
+        middle = np.array(SIZE) / 2.0 - 0.5
+        found = []
+        while len(found) < self.num_each * len(self.directions):
+            direction = self.directions[len(found) % len(self.directions)]
+            start = random.uniform([-4.0, -3.0, 5.0], [4.0, 3.0, 12.0])
+            end = start + self.rotation[:, direction] * random.uniform(0.6, 2.0)
+            ends = np.stack([start, end])
+            flat = self.focal * ends[:, :2] / ends[:, 2:] + [0.0, self.shift]
+            pixels = flat * longer + middle + random.normal(0.0, self.noise_px, (2, 2))
+            inside = (pixels > 0.0).all() and (pixels < np.array(SIZE) - 1.0).all()
+            if ends[:, 2].min() > 1.0 and inside:
+                found.append(pixels.ravel())
+        return np.array(found)
+
+
+def chance_edges(number: int, seed: int = 0) -> Array:
+    """(N, 4) ends of edges that point anywhere, px."""
+    random = np.random.default_rng(seed)
+    middles = random.uniform([100.0, 100.0], [1400.0, 900.0], (number, 2))
+    angles = random.uniform(0.0, np.pi, number)
+    halves = random.uniform(20.0, 90.0, number)[:, None] * np.stack(
+        [np.cos(angles), np.sin(angles)], axis=1
+    )
+    return np.hstack([middles - halves, middles + halves])
+
+
+def arch_edges(number: int) -> Array:
+    """(N, 4) ends of chords of half circles about one another, as of a round portal, px."""
+    found = []
+    for radius in (200.0, 260.0, 320.0, 380.0):
+        angles = np.linspace(np.pi, 2.0 * np.pi, number + 1)
+        points = np.array([750.0, 700.0]) + radius * np.stack(
+            [np.cos(angles), np.sin(angles)], axis=1
+        )
+        found.append(np.hstack([points[:-1], points[1:]]))
+    return np.concatenate(found)

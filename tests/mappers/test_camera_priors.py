@@ -1,0 +1,144 @@
+"""What is known of cameras before mapping, combined as distributions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cameras import CameraRecord
+from colmap_affrect.geometry import lines
+from colmap_affrect.geometry.lines import MIDDLE_SIGMA, SHIFTED_SIGMA, LineCamera
+from colmap_affrect.mappers.camera_priors import (
+    EXIF_SIGMA,
+    LINES_SIGMA,
+    USUAL_FOCAL,
+    USUAL_SIGMA,
+    ZOOMS,
+    CameraPrior,
+    LogNormal,
+    Measurement,
+    camera_prior,
+    focal_contradictions,
+    measurement_of_lines,
+    product,
+    usual_principal_point,
+)
+
+SIZE = (1000, 700)
+NOTHING = CameraRecord(("a.jpg",), "guess", 1200.0, size=SIZE)
+USUAL = LogNormal(USUAL_FOCAL, USUAL_SIGMA)
+
+
+def camera(focal_px: float = 1200.0) -> pycolmap.Camera:
+    return pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *SIZE)
+
+
+def by_lines(
+    focal: float, sigma: float = 0.06, shift: float = 0.0, shift_sigma: float = SHIFTED_SIGMA
+) -> LineCamera:
+    return LineCamera(focal, sigma, shift, shift_sigma, np.eye(3), np.array([0.0, -1.0, 0.0]))
+
+
+def test_log_normals_multiply_by_their_precisions() -> None:
+    measured = Measurement(LogNormal(2.0, 0.2), 1e-12)
+    found = product(USUAL, [measured])
+    precision = USUAL_SIGMA**-2 + 0.2**-2
+    mean = (math.log(USUAL_FOCAL) * USUAL_SIGMA**-2 + math.log(2.0) * 0.2**-2) / precision
+    assert found.focal == pytest.approx(math.exp(mean), rel=1e-3)
+    assert found.sigma == pytest.approx(precision**-0.5, rel=1e-2)
+
+
+def test_one_of_three_measurements_that_is_far_from_the_others_hardly_counts() -> None:
+    near = Measurement(LogNormal(1.0, 0.06), 0.1)
+    far = Measurement(LogNormal(2.5, 0.06), 0.1)
+    assert product(USUAL, [near, near, far]).focal == pytest.approx(1.0, rel=0.06)
+    alone = product(USUAL, [near, far])  # the one that is the more usual is likelier
+    assert alone.focal == pytest.approx(1.0, rel=0.06)
+    assert alone.sigma > 1.5 * product(USUAL, [near]).sigma
+
+
+def test_what_is_usual_is_divided_out_of_what_lines_say() -> None:
+    nothing = by_lines(lines.USUAL_FOCAL, lines.USUAL_FOCAL_SIGMA)
+    assert measurement_of_lines(nothing) is None
+    sharp = measurement_of_lines(by_lines(0.9, 0.06))
+    assert sharp
+    assert sharp.focal.focal == pytest.approx(0.9, rel=0.01)
+    vague = measurement_of_lines(by_lines(1.6, 0.35))
+    assert vague
+    assert vague.focal.focal > 1.6
+    assert vague.focal.sigma > 0.35
+
+
+def test_lines_tell_an_unknown_focal_length_and_leave_a_known_one_as_it_is() -> None:
+    said = [by_lines(0.9)]
+    prior = camera_prior(camera(), NOTHING, said)
+    assert prior.focal_px == pytest.approx(900.0, rel=0.04)
+    assert LINES_SIGMA <= prior.sigma < 0.2
+    assert prior.is_unknown
+    assert prior.starts_px == (prior.focal_px,)
+    exif = replace(NOTHING, source="exif")
+    assert camera_prior(camera(), exif, said) == CameraPrior(1200.0, EXIF_SIGMA)
+    given = replace(NOTHING, source="given", given=("focal",))
+    assert camera_prior(camera(), given, said) == CameraPrior(1200.0, 0.0)
+
+
+def test_without_lines_models_begin_with_lenses_from_wide_to_long() -> None:
+    prior = camera_prior(camera(), NOTHING)
+    assert (prior.focal_px, prior.sigma) == (USUAL_FOCAL * 1000, USUAL_SIGMA)
+    assert prior.starts_px == pytest.approx([zoom * USUAL_FOCAL * 1000 for zoom in ZOOMS])
+    absurd = camera_prior(camera(), NOTHING, [by_lines(4.0)])  # lines lie more often than that
+    assert absurd.focal_px < 1600.0
+    vague = camera_prior(camera(), NOTHING, [by_lines(1.6, 0.3)])
+    assert len(vague.starts_px) == len(ZOOMS)
+    assert max(vague.starts_px) / min(vague.starts_px) < max(ZOOMS) / min(ZOOMS)
+
+
+def test_models_of_crops_begin_with_the_focal_length_of_the_whole_photograph() -> None:
+    crop = replace(NOTHING, uncropped_px=2400.0)
+    prior = camera_prior(camera(), crop)
+    assert prior.starts_px[0] == pytest.approx(2400.0)
+    assert prior.cost(1.5 * 2400.0) == pytest.approx(2.05, abs=0.1)  # it may have been scaled, too
+    by_lines_too = camera_prior(camera(), crop, [by_lines(2.3)])
+    assert by_lines_too.focal_px == pytest.approx(2320.0, rel=0.02)
+    assert prior.principal_point
+    assert prior.principal_point.sigmas_px == pytest.approx([150.0, 150.0])
+
+
+def test_a_shift_that_lines_tell_frees_the_principal_point_and_others_do_not() -> None:
+    shifted = camera_prior(camera(), NOTHING, [by_lines(1.2, 0.1, 0.18, 0.04)])
+    assert shifted.principal_point
+    assert shifted.principal_point.center_px == pytest.approx((500.0, 350.0 + 180.0))
+    assert shifted.principal_point.sigmas_px == pytest.approx([1000 * MIDDLE_SIGMA, 40.0])
+    for unclear in (by_lines(1.2, 0.1, 0.05, 0.09), by_lines(1.2, 0.1, 0.01, 0.02)):
+        assert camera_prior(camera(), NOTHING, [unclear]).principal_point is None
+    twice = [by_lines(1.2, 0.1, 0.08, 0.04)] * 3  # of one camera
+    assert camera_prior(camera(), NOTHING, twice).principal_point
+    given = replace(NOTHING, given=("principal-point",))
+    assert camera_prior(camera(), given, twice).principal_point is None
+
+
+def test_a_principal_point_costs_by_its_deviation() -> None:
+    moved = camera(1150.0)
+    prior = replace(camera_prior(moved, NOTHING), principal_point=usual_principal_point(moved))
+    assert prior.cost_of(moved) == pytest.approx(0.0)
+    assert usual_principal_point(moved).sigmas_px == (20.0, 20.0)
+    moved.principal_point_y += 2.0 * MIDDLE_SIGMA * 1000
+    assert prior.cost_of(moved) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("focal", "sigma", "is_named"), [
+    (0.9, 0.06, True), (1.25, 0.06, False), (0.9, 0.3, False),
+])  # fmt: skip
+def test_exif_and_given_focal_lengths_that_lines_contradict_are_named(
+    focal: float, sigma: float, *, is_named: bool
+) -> None:
+    said = {"a.jpg": by_lines(focal, sigma)}
+    for source in ("exif", "given"):
+        record = replace(NOTHING, source=source)
+        found = focal_contradictions([camera()], {1: record}, said)
+        assert [c.names for c in found] == ([("a.jpg",)] if is_named else [])
+    assert not focal_contradictions([camera()], {1: NOTHING}, said)

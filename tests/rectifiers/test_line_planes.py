@@ -1,0 +1,84 @@
+"""Rectifier `lines`: walls that straight lines span, as if seen from the front."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from line_scenes import SIZE, chance_edges, turn
+from numpy.testing import assert_allclose
+from strategies import Array
+
+from colmap_affrect.data import GrayImage, Photograph
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.conventions import camera_matrix
+from colmap_affrect.rectifiers.base import RECTIFIERS, RectifierInputs
+
+FOCAL = 1.0  # longer sides
+TURN = turn(0, -8.0) @ turn(1, 42.0)  # columns are right, down and ahead of the building
+
+
+def pixels(points: Array) -> Array:
+    """(N, 2) pixel-centre px of (N, 3) points in the frame of the building, its corner at 0."""
+    in_camera = points @ TURN.T + [0.0, 0.0, 6.0]
+    return FOCAL * SIZE[0] * in_camera[:, :2] / in_camera[:, 2:] + np.array(SIZE) / 2.0 - 0.5
+
+
+def draw_wall(image: GrayImage, along: Array) -> None:
+    """Draw windows on a wall that runs from the corner along a direction."""
+    down = np.array([0.0, 1.0, 0.0])
+    for column in range(5):
+        for row in range(4):
+            start = along * (0.3 + 0.55 * column) + down * (0.6 * row - 1.2)
+            corners = [start, start + 0.35 * along, start + 0.35 * along + 0.4 * down,
+                       start + 0.4 * down]  # fmt: skip
+            outline = np.rint(pixels(np.array(corners))).astype(np.int32)
+            cv2.fillPoly(image, [outline], 40, cv2.LINE_AA)
+
+
+def photograph_of(image: GrayImage) -> Photograph:
+    size = (image.shape[1], image.shape[0])
+    return Photograph(image, "a.png", None, camera_matrix(size), None, None, False)
+
+
+@pytest.fixture(scope="module")
+def corner() -> Photograph:
+    """Two walls of a court that meet in the middle."""
+    image = np.full(SIZE[::-1], 200, np.uint8)
+    draw_wall(image, np.array([1.0, 0.0, 0.0]))
+    draw_wall(image, np.array([0.0, 0.0, -1.0]))
+    return photograph_of(image)
+
+
+def test_each_wall_of_a_corner_is_shown_from_the_front(corner: Photograph) -> None:
+    rectifier = RECTIFIERS.make(RECTIFIERS.options("lines"), RectifierInputs())
+    plan = rectifier.plan(corner)
+    assert len(plan.items) == 2
+    for along in (np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])):
+        square = np.array([[0.6, -0.4, 0.6], [1.6, -0.4, 1.6], [1.6, 0.6, 1.6], [0.6, 0.6, 0.6]])
+        points = square * (along + np.array([0.0, 1.0, 0.0]))
+        in_image = pixels(points)
+        holding = [item for item in plan.items if item.in_region(in_image).all()]
+        assert len(holding) == 1
+        mapped = project(holding[0].rectified_from_image, in_image)
+        sides = np.linalg.norm(np.roll(mapped, -1, axis=0) - mapped, axis=1)
+        assert_allclose(sides / sides.mean(), 1.0, atol=0.01)  # a square again
+        diagonals = np.linalg.norm(mapped[:2] - mapped[2:], axis=1)
+        assert_allclose(diagonals[0] / diagonals[1], 1.0, atol=0.01)
+        before = np.linalg.norm(np.roll(in_image, -1, axis=0) - in_image, axis=1)
+        assert before.max() / before.min() > 1.2  # it was none in the photograph
+        assert holding[0].tilt > 1.1
+
+
+def test_walls_from_the_front_are_left_as_they_are(corner: Photograph) -> None:
+    options = RECTIFIERS.options({"name": "lines", "min_angle_deg": 70.0})
+    assert not RECTIFIERS.make(options, RectifierInputs()).plan(corner).items
+
+
+def test_lines_by_chance_and_empty_pictures_give_no_warps() -> None:
+    image = np.full(SIZE[::-1], 230, np.uint8)
+    for x1, y1, x2, y2 in chance_edges(60, 3).round().astype(int).tolist():
+        cv2.line(image, (x1, y1), (x2, y2), 30, 3, cv2.LINE_AA)
+    rectifier = RECTIFIERS.make(RECTIFIERS.options("lines"), RectifierInputs())
+    assert not rectifier.plan(photograph_of(image)).items
+    assert not rectifier.plan(photograph_of(np.full((90, 120), 128, np.uint8))).items
