@@ -62,7 +62,9 @@ class ConversionReport(Summarized):
 
 
 def convert_images(
-    image_path: PathLike, output_path: PathLike, progress: GivenProgress = None
+    image_path: PathLike,
+    output_path: PathLike,
+    progress: GivenProgress = None,
 ) -> ConversionReport:
     """Make a new folder with the photographs of another one, all in formats that COLMAP reads.
 
@@ -108,7 +110,11 @@ class _Conversion:
     """The photographs of a folder on their way into another one."""
 
     def __init__(
-        self, image_path: Path, folder: Path, output_path: Path, names: Sequence[str]
+        self,
+        image_path: Path,
+        folder: Path,
+        output_path: Path,
+        names: Sequence[str],
     ) -> None:
         """Take both folders, the name that the new one will have, and the photographs to come."""
         self.image_path = image_path

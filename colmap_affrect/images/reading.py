@@ -358,7 +358,11 @@ def decode(path: Path, flags: int = GRAY_AS_STORED, *, keeps_numbers: bool = Fal
 
 
 def decoded(
-    data: Bytes, path: Path, flags: int = GRAY_AS_STORED, *, keeps_numbers: bool = False
+    data: Bytes,
+    path: Path,
+    flags: int = GRAY_AS_STORED,
+    *,
+    keeps_numbers: bool = False,
 ) -> NDArray[Any]:
     """Decode the bytes of a photograph, which may change them; see :func:`decode`."""
     if name := foreign_format(data):

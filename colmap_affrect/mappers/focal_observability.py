@@ -106,7 +106,9 @@ def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int
 
 
 def fitting_focals(
-    model: pycolmap.Reconstruction, task: MappingTask, priors: Mapping[int, CameraPrior]
+    model: pycolmap.Reconstruction,
+    task: MappingTask,
+    priors: Mapping[int, CameraPrior],
 ) -> dict[int, float]:
     """Find focal lengths that fit better than those that the user gave.
 

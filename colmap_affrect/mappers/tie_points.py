@@ -57,7 +57,8 @@ class TiePoints:
                     _replace_point(model, seen, position)
 
     def observed(
-        self, model: pycolmap.Reconstruction
+        self,
+        model: pycolmap.Reconstruction,
     ) -> Iterator[tuple[str, int, pycolmap.Point2D]]:
         """Yield name of the point, image id and mark of all that a model observes."""
         for name, seen in self._seen(model).items():
@@ -178,7 +179,9 @@ def _is_observed(model: pycolmap.Reconstruction, seen: Mapping[int, int]) -> boo
 
 
 def _replace_point(
-    model: pycolmap.Reconstruction, seen: Mapping[int, int], position: Array
+    model: pycolmap.Reconstruction,
+    seen: Mapping[int, int],
+    position: Array,
 ) -> None:
     """Let keypoints observe a new point, in the place of all that they have observed."""
     track = pycolmap.Track()
@@ -210,7 +213,9 @@ def _error_px(model: pycolmap.Reconstruction, image_id: int, xy: Array, position
 
 
 def _max_error_px(
-    model: pycolmap.Reconstruction, marks: Mapping[int, Array], position: Array
+    model: pycolmap.Reconstruction,
+    marks: Mapping[int, Array],
+    position: Array,
 ) -> float:
     return max(_error_px(model, image_id, xy, position) for image_id, xy in marks.items())
 
