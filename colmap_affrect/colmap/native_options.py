@@ -38,11 +38,8 @@ def differences(options: Any, default: Any, named: Collection[str] = ()) -> dict
         Values by dotted key.
     """
     usual = _plain_values(default)
-    found = {}
-    for key, value in _plain_values(options).items():
-        if key in named or value != usual[key]:
-            found[key] = value
-    return found
+    values = _plain_values(options)
+    return {key: value for key, value in values.items() if key in named or value != usual[key]}
 
 
 def set_values(options: Any, values: Mapping[str, Any]) -> None:

@@ -378,11 +378,11 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
     """Return the number of inliers of each verified pair of image ids."""
     with colmap_database.open_database(path) as database:
         pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    found = {}
-    for pair_id, count in zip(pair_ids, counts, strict=True):
-        if count >= min_num_inliers:
-            found[pycolmap.pair_id_to_image_pair(pair_id)] = int(count)
-    return found
+    return {
+        pycolmap.pair_id_to_image_pair(pair_id): int(count)
+        for pair_id, count in zip(pair_ids, counts, strict=True)
+        if count >= min_num_inliers
+    }
 
 
 def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
@@ -408,11 +408,11 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
 
     graph: networkx.Graph[T] = networkx.Graph()
     graph.add_edges_from(listed)
-    found = []
-    for first, second in networkx.bridges(graph):
-        if len(partners[first]) > 1 and len(partners[second]) > 1:
-            found.append((min(first, second), max(first, second)))
-    return found
+    return [
+        (min(first, second), max(first, second))
+        for first, second in networkx.bridges(graph)
+        if len(partners[first]) > 1 and len(partners[second]) > 1
+    ]
 
 
 def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:

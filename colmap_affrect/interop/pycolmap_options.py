@@ -93,11 +93,7 @@ def _differing(options: Any) -> dict[str, Any]:
 def _unusual(values: Mapping[str, Any], options: Any) -> dict[str, Any]:
     """Return the values, by dotted key, that options do not have."""
     usual = flat_values(options)
-    found = {}
-    for key, value in values.items():
-        if key not in usual or value != usual[key]:
-            found[key] = value
-    return found
+    return {key: value for key, value in values.items() if key not in usual or value != usual[key]}
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
