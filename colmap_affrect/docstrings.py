@@ -3,7 +3,7 @@
 import ast
 import inspect
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import pairwise
 from typing import get_args
@@ -35,6 +35,29 @@ def below_fields(cls: type) -> dict[str, str]:
     return found
 
 
+class DocstringWithFields:
+    """Docstring of a class with what its fields mean, which is looked up when it is asked for.
+
+    Commands, which show no docstrings, would wait for that.
+    """
+
+    def __init__(self, docstring: str | None, texts: Callable[[], Mapping[str, str]]) -> None:
+        """Take what the class says, and what returns the text of each field."""
+        self._docstring = docstring
+        self._texts = texts
+        self._whole: str | None = None
+
+    def __get__(self, instance: object, owner: type) -> str:
+        """Return the whole docstring."""
+        if self._whole is None:
+            self._whole = with_attributes(self._docstring, self._texts())
+        return self._whole
+
+    def set_of(self, cls: type) -> None:
+        """Become the docstring of a class."""
+        type.__setattr__(cls, "__doc__", self)
+
+
 def with_attributes(docstring: str | None, texts: Mapping[str, str]) -> str:
     """Return a docstring with a section that says what each attribute is."""
     head = inspect.cleandoc(docstring or "")
@@ -51,7 +74,7 @@ def with_attributes(docstring: str | None, texts: Mapping[str, str]) -> str:
 def field_text(options: type[BaseModel], name: str) -> str:
     """Say what a field of options means, which values it takes, and its default."""
     field = options.model_fields[name]
-    text = _description(options, name)
+    text = field_meaning(options, name)
     values = [repr(value) for value in get_args(field.annotation) if isinstance(value, str)]
     if len(values) > 1:
         text += f" One of {', '.join(values)}."
@@ -63,13 +86,12 @@ def field_text(options: type[BaseModel], name: str) -> str:
     return text
 
 
-def _description(options: type[BaseModel], name: str) -> str:
+def field_meaning(options: type[BaseModel], name: str) -> str:
     """Return what stands below a field in its class, or in a base that has the same field."""
     for base in options.__mro__:
-        if issubclass(base, BaseModel) and name in base.model_fields:
-            description = base.model_fields[name].description
-            if description:
-                return description
+        text = below_fields(base).get(name)
+        if text:
+            return text
     return ""
 
 

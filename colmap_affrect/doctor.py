@@ -18,6 +18,7 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import has_model, model_folder, read_given_model
+from colmap_affrect.colmap.tables import NoDatabaseError
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
@@ -174,6 +175,9 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         version = refuse_newer(path)
         newest = newest_schema_version()
         tables, problems = check_database(path)
+    except NoDatabaseError as error:
+        diagnosis.add("error", path, _without_path(path, error), advice or "give a database")
+        return False
     except DatabaseError as error:
         recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
         diagnosis.add("error", path, _without_path(path, error), advice or recover)

@@ -31,7 +31,7 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from colmap_affrect.docstrings import ATTRIBUTES, below_fields, field_text, with_attributes
+from colmap_affrect.docstrings import DocstringWithFields, below_fields, field_meaning, field_text
 from colmap_affrect.errors import (
     OptionError,
     clipped,
@@ -62,12 +62,14 @@ Documented = TypeVar("Documented", bound=type)
 
 def documented(cls: Documented) -> Documented:
     """Add what stands below each field of a dataclass to its docstring, for ``help()``."""
-    found: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        found |= below_fields(base)
-    texts = {field.name: found.get(field.name, "") for field in fields(cls)}
-    own, _, _ = inspect.cleandoc(cls.__doc__ or "").partition(ATTRIBUTES)
-    cls.__doc__ = with_attributes(own, texts)
+
+    def texts() -> dict[str, str]:
+        found: dict[str, str] = {}
+        for base in reversed(cls.__mro__):
+            found |= below_fields(base)
+        return {field.name: found.get(field.name, "") for field in fields(cls)}
+
+    DocstringWithFields(cls.__doc__, texts).set_of(cls)
     return cls
 
 
@@ -88,9 +90,7 @@ class Summarized:
 class Options(BaseModel):
     """Base of all options."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     if not TYPE_CHECKING:  # editors and type checkers see the fields as arguments
 
@@ -107,8 +107,11 @@ class Options(BaseModel):
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         """Add the fields to the docstring, so that ``help()`` shows what each of them means."""
-        texts = {name: field_text(cls, name) for name in cls.model_fields}
-        cls.__doc__ = with_attributes(cls.__doc__, texts)
+
+        def texts() -> dict[str, str]:
+            return {name: field_text(cls, name) for name in cls.model_fields}
+
+        DocstringWithFields(cls.__doc__, texts).set_of(cls)
 
     @classmethod
     def given(cls, options: Any, argument: str) -> Self:
@@ -404,7 +407,7 @@ def described_toml(options: Options, path: str = "") -> str:
         elif isinstance(value, dict):
             sections.append(tomli_w.dumps({name: value}) if value else "")
         else:
-            text = type(options).model_fields[name].description or ""
+            text = field_meaning(type(options), name)
             for line in textwrap.wrap(text.replace("``", "'"), MAX_COMMENT):
                 lines.append(f"# {line}\n")
             lines.append(tomli_w.dumps({name: value}))

@@ -149,9 +149,12 @@ def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problem
 
 
 def _check_image_names(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
-    for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
-        name = (raw or b"").decode("utf-8", "replace")
-        if not name or "\0" in name or name.encode() != raw:
+    (encoding,) = connection.execute("PRAGMA encoding").fetchone()  # of all its texts
+    rows = connection.execute("SELECT image_id, CAST(name AS BLOB), typeof(name) FROM images")
+    for image_id, raw, kind in rows:
+        codec = encoding if kind == "text" else "utf-8"
+        name = (raw or b"").decode(codec, "replace")
+        if not name or "\0" in name or name.encode(codec) != raw:
             found["bad-name"].append(f"image {image_id}: {name!r}")
     for name, count in Counter(tables.names.values()).items():
         if count > 1:

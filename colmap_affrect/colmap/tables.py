@@ -10,9 +10,15 @@ from typing import Any, NamedTuple
 
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.project.paths import resolved
-from colmap_affrect.project.regular_files import NotAFileError, read_regular, require_regular
+from colmap_affrect.project.regular_files import (
+    NotAFileError,
+    open_regular,
+    read_regular,
+    require_regular,
+)
 
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
+MAGIC = b"SQLite format 3\0"  # begins each file of SQLite's that is not empty
 HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
 DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # what sqlite3 raises, also quoting odd bytes
 MAX_NUM_IMAGES = 2**31 - 1  # an id of a pair is the smaller image id times this, plus the larger
@@ -24,6 +30,10 @@ DIGESTED = (  # tables that decide what is mapped
 )  # fmt: skip
 
 
+class NoDatabaseError(DatabaseError):
+    """A file that has never been one of SQLite's, or whose beginning is lost."""
+
+
 @contextmanager
 def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a COLMAP database so that nothing can change it.
@@ -33,6 +43,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     wal = Path(f"{path}-wal")
     journal = Path(f"{path}-journal")
     _require_regular_files((path, wal, journal, Path(f"{path}-shm")))
+    _require_sqlite(path)
     mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
     address = f"{resolved(path).as_uri()}?{mode}"
     try:
@@ -48,6 +59,19 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
                 f"may write, e.g. sqlite3 {path.name} .tables"
             ) from error
         raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error
+
+
+def _require_sqlite(path: Path) -> None:
+    """Refuse a file that is none of SQLite's, text perhaps, or a model; NoDatabaseError."""
+    try:
+        with open_regular(path) as file:
+            start = file.read(len(MAGIC))
+    except OSError:
+        return  # SQLite says why
+    if start and start != MAGIC and not MAGIC.startswith(start):
+        raise NoDatabaseError(
+            f"{path}: not a usable COLMAP database (it does not begin as files of SQLite do)"
+        )
 
 
 def _require_regular_files(paths: Sequence[Path]) -> None:

@@ -1,5 +1,6 @@
 """Geometric verification of raw matches by pycolmap, and its significance."""
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -7,7 +8,6 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
-import networkx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -387,6 +387,8 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
 
 def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
     """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
+    import networkx  # which takes as long to load as numpy and OpenCV together
+
     graph: networkx.Graph[T] = networkx.Graph()
     graph.add_nodes_from(images)
     graph.add_edges_from(pairs)
@@ -395,11 +397,20 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     """Return, smaller image first, the pairs that alone tie two parts of two images or more."""
+    listed = list(pairs)
+    partners = defaultdict[T, set[T]](set)
+    for first, second in listed:
+        partners[first].add(second)
+        partners[second].add(first)
+    if not any(partners[first].isdisjoint(partners[second]) for first, second in listed):
+        return []  # a third image ties each pair, too
+    import networkx
+
     graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_edges_from(pairs)
+    graph.add_edges_from(listed)
     found = []
     for first, second in networkx.bridges(graph):
-        if graph.degree(first) > 1 and graph.degree(second) > 1:
+        if len(partners[first]) > 1 and len(partners[second]) > 1:
             found.append((min(first, second), max(first, second)))
     return found
 

@@ -2,6 +2,7 @@
 
 import io
 import math
+import os
 import re
 import struct
 import warnings
@@ -24,6 +25,7 @@ from PIL.TiffImagePlugin import TiffImageFile
 from colmap_affrect.data import ColorImage, GrayImage, Mask
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
+from colmap_affrect.images.pnm import MAX_HEADER, ended, pnm_header, with_usual_white
 from colmap_affrect.project.regular_files import (
     NotAFileError,
     open_regular,
@@ -32,10 +34,13 @@ from colmap_affrect.project.regular_files import (
 
 MAX_NUM_PX = 1 << 29  # of a photograph; those of the largest cameras have 400 megapixels
 MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
+USUAL_BYTES = 1 << 26
+"""Of a photograph, with all that cameras put beside its pixels, as short films; 64 MiB. Only longer
+files are compared with their pixels."""
+MAX_BYTES_PER_PX = 16  # four channels of four bytes
 ONE_AT_A_TIME = Lock()  # filters of warnings are of the process: threads would mix them up
 PNG = b"\x89PNG\r\n\x1a\n"
 PNM = b"P"
-MAX_PNM_HEADER = 1 << 16  # bytes, with comments; the pixels follow
 READERS = {
     b"\xff\xd8": jpeg_factory,
     PNG: PngImageFile,
@@ -65,7 +70,7 @@ def opened(file: BinaryIO) -> Image.Image:
     start = file.read(len(PNG))
     file.seek(0)
     if start.startswith(PNM):  # whose header Pillow reads byte by byte
-        file = io.BytesIO(file.read(MAX_PNM_HEADER))
+        file = io.BytesIO(file.read(MAX_HEADER))
     return next(read for magic, read in READERS.items() if start.startswith(magic))(file, "")
 
 
@@ -135,6 +140,41 @@ def _require_photograph(path: Path) -> int:
     return num_bytes
 
 
+def _require_plausible(path: Path, num_bytes: int) -> None:
+    """Refuse a long file that is no picture, or far longer than its pixels need; ImageError.
+
+    Its header says so: the file need not be read for that.
+    """
+    if num_bytes <= USUAL_BYTES or path.suffix.lower() not in IMAGE_SUFFIXES:
+        return
+    try:
+        with open_regular(path) as file:
+            is_foreign = bool(foreign_format(np.frombuffer(file.read(16), np.uint8)))
+    except OSError as error:
+        raise cannot_read(path, error) from error
+    if is_foreign:
+        return
+    num_px = read_header(path, _num_px_of_pages)
+    if num_px is None:
+        raise ImageError(f"{path}: {UNREADABLE}")
+    if num_bytes > USUAL_BYTES + MAX_BYTES_PER_PX * num_px:
+        raise ImageError(
+            f"{path}: is {num_bytes / 1e9:.1f} GB long, which its {num_px / 1e6:.1f} megapixels do "
+            "not need; it is damaged, or something else hangs on it: save it again"
+        )
+
+
+def _num_px_of_pages(file: BinaryIO) -> int:
+    """Return the number of pixels of a picture, of a TIFF those of all its pages."""
+    image = opened(file)
+    num = 0
+    for page in range(getattr(image, "n_frames", 1)):
+        image.seek(page)
+        width, height = stored_size(image)
+        num += width * height
+    return num
+
+
 def may_be_photograph(path: Path) -> bool:
     """Return whether a regular file is there that is not longer than those of photographs."""
     try:
@@ -147,6 +187,7 @@ def may_be_photograph(path: Path) -> bool:
 def read_photograph(path: Path) -> Bytes:
     """Return the bytes of a file, (N,) uint8; ImageError for what cannot be one of a photograph."""
     num_bytes = _require_photograph(path)
+    _require_plausible(path, num_bytes)
     data = np.empty(num_bytes, np.uint8)
     try:
         with open_regular(path) as file:
@@ -177,6 +218,9 @@ def require_possible(path: Path) -> None:
         )
 
 
+UNREADABLE = "not a readable image (damaged, empty, or of an unknown format)"
+LIMITS_OF_OPENCV = tuple(f"OPENCV_IO_MAX_IMAGE_{what}" for what in ("PIXELS", "WIDTH", "HEIGHT"))
+OPENCV_CHECKS_SIZE = "validateInputImageSize"  # its function that compares a header with these
 IMAGE_SUFFIXES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pbm", ".pgm", ".pnm",
     ".ppm",
@@ -295,13 +339,27 @@ def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
     return cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
-    """Read an image, by default as gray in the type it is stored in; ImageError if it is none."""
+def decode(path: Path, flags: int = GRAY_AS_STORED, *, keeps_numbers: bool = False) -> NDArray[Any]:
+    """Read an image, by default as gray in the type it is stored in.
+
+    Args:
+        path: the file.
+        flags: OpenCV's.
+        keeps_numbers: numbers are no tones, but depths: white is not made that of the type.
+
+    Returns:
+        (H, W) or (H, W, channels).
+
+    Raises:
+        ImageError: it is no image.
+    """
     require_possible(path)
-    return decoded(read_photograph(path), path, flags)
+    return decoded(read_photograph(path), path, flags, keeps_numbers=keeps_numbers)
 
 
-def decoded(data: Bytes, path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
+def decoded(
+    data: Bytes, path: Path, flags: int = GRAY_AS_STORED, *, keeps_numbers: bool = False
+) -> NDArray[Any]:
     """Decode the bytes of a photograph, which may change them; see :func:`decode`."""
     if name := foreign_format(data):
         raise ImageError(
@@ -309,13 +367,28 @@ def decoded(data: Bytes, path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any
             "JPEG (colmap-affrect convert)"
         )
     stand_upright(data)
+    header = pnm_header(data)
+    if header and header.is_text:
+        data = ended(data)
     try:
         image = cv2.imdecode(data, flags) if data.size else None
-    except cv2.error:  # for one, of more pixels than OpenCV takes
-        image = None
+    except cv2.error as error:
+        raise ImageError(f"{path}: {_why_not_decoded(error)}") from error
     if image is None:
-        raise ImageError(f"{path}: not a readable image (damaged, empty, or of an unknown format)")
-    return np.asarray(image)
+        raise ImageError(f"{path}: {UNREADABLE}")
+    image = np.asarray(image)
+    if header and not (header.is_scaled or keeps_numbers):
+        image = with_usual_white(image, header.white)
+    return image
+
+
+def _why_not_decoded(error: cv2.error) -> str:
+    """Say why OpenCV refuses an image: the system's settings may let it read fewer pixels."""
+    limits = [name for name in LIMITS_OF_OPENCV if name in os.environ]
+    if error.func == OPENCV_CHECKS_SIZE and limits:
+        settings = ", ".join(f"{name}={os.environ[name]}" for name in limits)
+        return f"is larger than OpenCV may read here, by {settings} of the environment; unset it"
+    return UNREADABLE
 
 
 def foreign_format(data: Bytes) -> str:

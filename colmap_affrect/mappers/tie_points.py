@@ -15,7 +15,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX, triangulated
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.pair_graph import PairGraph, sampling_step
 from colmap_affrect.project.report import Residual
 
 AGREEING_PX = 4.0 * SIGMA_PX  # residuals up to which a tie point agrees with a pose
@@ -30,6 +30,7 @@ NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P)
 # A tie point that one image alone sees has the median depth of the points near its mark (judged).
 NEIGHBOR_RADIUS = 0.1  # of the longer side of the image
 NUM_NEIGHBORS = 5
+MAX_NUM_OBSERVED = 2_000  # of an image, among which neighbours are looked for, to save time
 
 
 class ImageResidual(NamedTuple):
@@ -48,9 +49,10 @@ class TiePoints:
 
     def observe(self, model: pycolmap.Reconstruction) -> None:
         """Give a model a point for each tie point that two of its images see, with all of them."""
+        surroundings = _Surroundings(model)
         for seen in self._seen(model).values():
             if len(seen) > 1 and not _is_observed(model, seen):
-                position = _position(model, _marks(model, seen))
+                position = _position(surroundings, _marks(model, seen))
                 if position is not None:
                     _replace_point(model, seen, position)
 
@@ -84,8 +86,9 @@ class TiePoints:
     def positions(self, model: pycolmap.Reconstruction) -> dict[str, Array]:
         """Return the (3,) positions in a model, by two images or else by depths near a mark."""
         found = {}
+        surroundings = _Surroundings(model)
         for name, seen in self._seen(model).items():
-            position = _position(model, _marks(model, seen)) if seen else None
+            position = _position(surroundings, _marks(model, seen)) if seen else None
             if position is not None:
                 found[name] = position
         return found
@@ -187,14 +190,14 @@ def _replace_point(
     model.add_point3D(position, track)
 
 
-def _position(model: pycolmap.Reconstruction, marks: Mapping[int, Array]) -> Array | None:
+def _position(surroundings: "_Surroundings", marks: Mapping[int, Array]) -> Array | None:
     """Return the position of a point with marks in some images, None where they do not tell it."""
-    position = triangulated(model, marks) if len(marks) > 1 else None
+    position = triangulated(surroundings.model, marks) if len(marks) > 1 else None
     if position is not None:
         return position
     # Where rays do not meet, the residuals will say so.
     image_id, xy = next(iter(marks.items()))
-    return _position_by_neighbors(model, image_id, xy)
+    return surroundings.position(image_id, xy)
 
 
 def _error_px(model: pycolmap.Reconstruction, image_id: int, xy: Array, position: Array) -> float:
@@ -212,20 +215,49 @@ def _max_error_px(
     return max(_error_px(model, image_id, xy, position) for image_id, xy in marks.items())
 
 
-def _position_by_neighbors(
-    model: pycolmap.Reconstruction, image_id: int, xy: Array
-) -> Array | None:
-    """Return where the ray of a mark is as deep as the points that the image sees around it."""
-    image = model.images[image_id]
-    camera = model.cameras[image.camera_id]
-    seen = image.get_observation_points2D()
-    distances = np.array([np.linalg.norm(point.xy - xy) for point in seen])
-    nearest = np.argsort(distances)[:NUM_NEIGHBORS]
-    if len(nearest) < NUM_NEIGHBORS:
-        return None
-    if distances[nearest[-1]] > NEIGHBOR_RADIUS * max(camera.width, camera.height):
-        return None
-    pose = image.cam_from_world()
-    depths = [(pose * model.points3D[seen[i].point3D_id].xyz)[2] for i in nearest]
-    ray = np.append(np.asarray(camera.cam_from_img(xy)).ravel(), 1.0)
-    return np.asarray(pose.inverse() * (np.median(depths) * ray))
+@dataclass(frozen=True)
+class _Observed:
+    """Points that an image sees."""
+
+    places: Array  # (N, 2) px
+    depths: Array  # (N,)
+
+
+class _Surroundings:
+    """Tells where the ray of a mark is as deep as the points that its image sees around it.
+
+    What an image sees is looked up once, so that many marks take no longer each than few.
+    """
+
+    def __init__(self, model: pycolmap.Reconstruction) -> None:
+        self.model = model
+        self._observed = dict[int, _Observed]()
+
+    def position(self, image_id: int, xy: Array) -> Array | None:
+        """Return the (3,) position of a mark at (2,) px; None where few points are near it."""
+        if image_id not in self._observed:
+            self._observed[image_id] = self._observed_by(image_id)
+        observed = self._observed[image_id]
+        distances = np.linalg.norm(observed.places - xy, axis=1)
+        nearest = np.argsort(distances)[:NUM_NEIGHBORS]
+        if len(nearest) < NUM_NEIGHBORS:
+            return None
+        image = self.model.images[image_id]
+        camera = self.model.cameras[image.camera_id]
+        if distances[nearest[-1]] > NEIGHBOR_RADIUS * max(camera.width, camera.height):
+            return None
+        depth = np.median(observed.depths[nearest])
+        ray = np.append(np.asarray(camera.cam_from_img(xy)).ravel(), 1.0)
+        return np.asarray(image.cam_from_world().inverse() * (depth * ray))
+
+    def _observed_by(self, image_id: int) -> _Observed:
+        image = self.model.images[image_id]
+        seen = image.get_observation_points2D()
+        step = sampling_step(len(seen), MAX_NUM_OBSERVED)
+        pose = image.cam_from_world()
+        places = list[Array]()
+        depths = list[float]()
+        for point in seen[::step]:
+            places.append(point.xy)
+            depths.append((pose * self.model.points3D[point.point3D_id].xyz)[2])
+        return _Observed(np.array(places).reshape(-1, 2), np.array(depths))

@@ -4,6 +4,7 @@ It changes together with matches, all or nothing, so that an interrupted run res
 rest of what is done tell the matches themselves: a pair is matched when it is there.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from pydantic import TypeAdapter
@@ -54,6 +55,10 @@ class MatchState:
     """Digest of a list, and whether all features tie its pairs no better than some."""
     stationary: tuple[tuple[Size, tuple[Cell, ...]], ...] = ()
     """Places where nothing moves, by size of the photographs."""
+    still_cameras: tuple[Size, ...] = ()
+    """Sizes of photographs whose camera stood still, while something turned before it."""
+    backgrounds: tuple[tuple[str, str], ...] = ()
+    """Places of each photograph that show what never moves: its name, and a bit for each cell."""
     modelled: str = ""
     """Digest of the list of which there was a model before pairs were matched again."""
     effort: EffortName | None = None
@@ -69,9 +74,18 @@ class MatchState:
     follows: str = ""
     """Folder of better models whose matches these are already, while ``sparse/`` has others."""
 
-    def without_pairs(self) -> "MatchState":
-        """Return what is left where pairs have gone: which ones escalate depends on all others."""
-        return MatchState(stationary=self.stationary, effort=self.effort)
+    def without_pairs(self, images: Collection[str] = ()) -> "MatchState":
+        """Return what is left where pairs have gone: which ones escalate depends on all others.
+
+        Of images that have gone nothing is left; others may get their names.
+        """
+        backgrounds = tuple(known for known in self.backgrounds if known[0] not in images)
+        return MatchState(
+            stationary=self.stationary,
+            still_cameras=self.still_cameras,
+            backgrounds=backgrounds,
+            effort=self.effort,
+        )
 
 
 STATE_JSON = TypeAdapter(MatchState)

@@ -75,10 +75,11 @@ def _or_empty(read: Callable[[Path], str], path: Path) -> str:
 
 Stage = Literal["copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"]
 STAGES: tuple[str, ...] = get_args(Stage)
-FORMAT_VERSION = 12  # counts up when a stage records other options than before
+FORMAT_VERSION = 13  # counts up when a stage records other options than before
 MADE_FROM = "made_from"  # digests of given files
 MAPPED = "mapped"  # what the models that are there were made from, and how many they are
-KEYS = ("recipe", "begun", *STAGES, MADE_FROM, MAPPED)
+PLANNED = "planned"  # options of stages that have not begun
+KEYS = ("recipe", *STAGES, PLANNED, MADE_FROM, MAPPED)
 
 PLACES = {
     "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",
@@ -121,13 +122,13 @@ class _Record(BaseModel):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, dict[str, Any]]  # options by stage
     recipe: str = ""
-    begun: list[Stage] = []
+    planned: dict[Stage, dict[str, Any]] = {}
     made_from: dict[str, str] = {}
     mapped: Mapped | None = None
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Return the options by stage, and under ``begun`` the stages that have been run with them.
+    """Return the options of the stages that have begun, and under ``planned`` those of others.
 
     Raises WorkspaceError when the record is damaged or of another version of this package.
     """
@@ -144,9 +145,19 @@ def read_record(path: Path) -> dict[str, Any]:
         record = _Record(**values).model_dump(exclude_unset=True)
         if unknown := record.keys() - set(KEYS):
             raise ValueError(f"unknown {min(unknown)!r}")
-        if lacking := set(record.get("begun", [])) - record.keys():
-            raise ValueError(f"options of {min(lacking)} are missing")
     return record
+
+
+def rewound(record: Mapping[str, Any], stage: str) -> dict[str, Any]:
+    """Return a record in which a stage and those after it are only planned, with their options."""
+    planned = dict(record.get(PLANNED, {}))
+    kept = dict(record)
+    for later in STAGES[STAGES.index(stage) :]:
+        if later in kept:
+            planned[later] = kept.pop(later)
+    if planned:
+        kept[PLANNED] = planned
+    return kept
 
 
 def record_text(record: Mapping[str, Any]) -> str:

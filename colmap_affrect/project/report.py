@@ -52,6 +52,12 @@ def probability_text(probability: float) -> str:
     return ">99%" if percent >= 99 and probability > 0.99 else f"{percent}%"
 
 
+CONTRADICTED: Mapping[str, tuple[Sequence[str], str, str]] = {
+    "EXIF": (("exif", "exif-rescaled"), "by EXIF", "--ignore-exif leaves it out"),
+    "the given focal length": (("given",), "given", "--cameras-path takes another one"),
+}
+"""What may be wrong of a camera: its sources, where its number is from, and what helps. What the
+user gives is usually held; that of a database only has a prior."""
 MAX_EXIF_ERROR = 1.27  # of a focal length: three standard deviations of what EXIF usually has
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
@@ -81,20 +87,21 @@ def _some(lines: Iterable[str]) -> list[str]:
 
 
 def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say where a model contradicts EXIF, and what would tell focal lengths that EXIF has in mm.
+    """Say where a model contradicts what was known of cameras, and what would tell lenses in mm.
 
     Args:
         cameras: entries of ``report.json``.
     """
     notes = []
-    wrong = [camera for camera in cameras if _contradicts_exif(camera)]
-    if wrong:
-        first = wrong[0]
-        more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
-        notes.append(
-            f"EXIF may be wrong: {first['focal_px']:.0f} px by EXIF, {first['refined_px']:.0f} px "
-            f"in the model{more}; --ignore-exif leaves it out"
-        )
+    for what, (sources, by, remedy) in CONTRADICTED.items():
+        wrong = [camera for camera in cameras if _is_contradicted(camera, sources)]
+        if wrong:
+            first = wrong[0]
+            more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
+            notes.append(
+                f"{what} may be wrong: {first['focal_px']:.0f} px {by}, "
+                f"{first['refined_px']:.0f} px in the model{more}; {remedy}"
+            )
     lenses_mm = sorted({camera["lens_mm"] for camera in cameras if camera.get("lens_mm")})
     shared = [camera for camera in cameras if _is_found(camera)]
     num_found = len({camera["refined_px"] for camera in shared})
@@ -132,8 +139,9 @@ def _is_found(camera: Mapping[str, Any]) -> bool:
     return camera["source"] == "guess" and bool(camera.get("refined_px"))
 
 
-def _contradicts_exif(camera: Mapping[str, Any]) -> bool:
-    if camera["source"] not in ("exif", "exif-rescaled") or not camera.get("refined_px"):
+def _is_contradicted(camera: Mapping[str, Any], sources: Sequence[str]) -> bool:
+    """Tell whether a model is far from a focal length that is known from one of some sources."""
+    if camera["source"] not in sources or not camera.get("refined_px"):
         return False
     ratio = camera["refined_px"] / camera["focal_px"]
     return not 1 / MAX_EXIF_ERROR <= ratio <= MAX_EXIF_ERROR

@@ -385,10 +385,11 @@ class MatchStore(GroupStore):
         """
         if not self.path.exists():
             return
-        names = {pair_key(name, "")[:-1] for name in images}
+        gone = set(images)
+        names = {pair_key(name, "")[:-1] for name in gone}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            _write_state(file, _read_state(file).without_pairs())
+            _write_state(file, _read_state(file).without_pairs(gone))
             for key, group in list(entries_of(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
                 is_escalated = group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs

@@ -19,6 +19,7 @@ from colmap_affrect.project.record import (
     MADE_FROM,
     MAPPED,
     OF_DATABASE,
+    PLANNED,
     STAGES,
     WEIGHTS,
     Mapped,
@@ -26,6 +27,7 @@ from colmap_affrect.project.record import (
     first_difference,
     read_record,
     record_text,
+    rewound,
 )
 
 logger = logging.getLogger(__name__)
@@ -91,7 +93,7 @@ class Workspace:
                 if source.exists():
                     shutil.copy(source, path / source.name)
         made = Workspace(path)
-        made._write_record({**self.recorded(), "begun": self._begun_before("verify")})
+        made._write_record(rewound(self.recorded(), "verify"))
         return made
 
     def refuse_run(self) -> None:
@@ -197,10 +199,7 @@ class Workspace:
     @property
     def begun(self) -> list[str]:
         """The stages that have been run, in their order."""
-        return list(self.recorded().get("begun", []))
-
-    def _begun_before(self, stage: str) -> list[str]:
-        return [name for name in self.begun if STAGES.index(name) < STAGES.index(stage)]
+        return [stage for stage in STAGES if stage in self.recorded()]
 
     @property
     def is_foreign(self) -> bool:
@@ -213,7 +212,8 @@ class Workspace:
 
     def planned(self, stage: str) -> dict[str, Any] | None:
         """Return the options on record for a stage, begun or not; None if there are none."""
-        options = self.recorded().get(stage)
+        record = self.recorded()
+        options = record.get(stage, record.get(PLANNED, {}).get(stage))
         return None if options is None else {k: v for k, v in options.items() if k != WEIGHTS}
 
     def require(self, stage: str) -> dict[str, Any]:
@@ -294,22 +294,22 @@ class Workspace:
         self._refuse_foreign_results(stage)
         outputs.remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
         record = self.recorded()
-        begun = self.begun
         if overwrite:
             self.refuse_foreign_models()
             outputs.remove_own(self._results(stage))
-            begun = self._begun_before(stage)
-            record = record if begun else {}
-        if stage in begun:
+            record = rewound(record, stage)
+            if not any(name in record for name in STAGES):
+                record = {}
+        if stage in record:
             why = first_difference(record[stage], options, OF_DATABASE.get(stage, ()))
             if why:
                 raise ConflictError(
                     f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
                 )
-        begun = [name for name in STAGES if name in begun or name == stage]
-        later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
-        changed = {**record, **later, stage: dict(options), "begun": begun}
-        self._write_record({**changed, "recipe": recipe or record.get("recipe", "")})
+        changed = {**record, stage: dict(options), "recipe": recipe or record.get("recipe", "")}
+        planned = {**changed.pop(PLANNED, {}), **(plan or {})}
+        later = {name: dict(values) for name, values in planned.items() if name not in changed}
+        self._write_record({**changed, PLANNED: later} if later else changed)
 
     def rewind(self, why: str = "what it was made from has changed") -> None:
         """Remove the database and what was made from it, for inputs that have changed.
@@ -321,7 +321,7 @@ class Workspace:
             raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
         self.record_mapped(None)
         outputs.remove_own(path for path in self._results("verify") if path != self.sparse)
-        self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
+        self._write_record(rewound(self.recorded(), "verify"))
 
     @property
     def _remedy(self) -> str:

@@ -69,6 +69,7 @@ def map_images(
     before = list[MappedModel]()
     if goes_on and said_before == inputs.by_hand:
         before = _models_before(workspace.sparse, known_models)
+    context.graph.close()  # mappers open the database, and SQLite's own copy copies it
     task = _task(context, extend, before)
     workspace.record_mapped(None)  # a run that is killed begins anew
     with context.progress.stage("map", len(context.graph.ids), "images") as advance:
@@ -97,7 +98,6 @@ def _task(context: Context, extend: Extension | None, before: Sequence[MappedMod
     tie_points: Mapping[str, Mapping[str, int]] = {}
     if by_hand != NOTHING:
         path = workspace.mapped_database
-        context.graph.close()  # SQLite's own copy reads it
         tie_points = by_hand.copy_database(workspace.database, path)
     return MappingTask(
         path,

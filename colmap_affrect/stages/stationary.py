@@ -47,6 +47,10 @@ MAX_SHARE_BESIDE = 0.2
 out only where these cells are so few: one in 25 of the scene's goes with them then, and of a
 watermark all over, or before a background, all would."""
 
+MIN_SHARE_OF_BACKGROUND = 0.8
+"""Matches that stand still, of all matches of one photograph in a cell that shows the background
+there, four in five: where something turns before it, they move (judged)."""
+
 WHAT = "a caption, a frame, a watermark, or the background of something that turns"
 CAMERA_STANDS_STILL = (
     "nothing moves between most photographs, so that matches tell nothing of depth: the camera "
@@ -61,6 +65,25 @@ class _Places:
 
     still: Mask  # nothing moves there, to the pixel
     is_most: bool  # nothing moves far in most of what is matched
+    is_most_exact: bool  # nothing moves there, to the pixel
+
+
+@dataclass(frozen=True)
+class _Votes:
+    """Matches of one photograph by cell, in which it shows what stands still, or something else."""
+
+    still: Indices
+    moving: Indices
+
+    @classmethod
+    def none(cls) -> "_Votes":
+        """Return no votes."""
+        return cls(*np.zeros((2, NUM_CELLS, NUM_CELLS), np.int64))
+
+    def background(self, places: Mask) -> Mask:
+        """Return the cells, of places where nothing moves, that show what stands still."""
+        is_most = self.still >= MIN_SHARE_OF_BACKGROUND * (self.still + self.moving)
+        return places & is_most & (self.still >= MIN_NUM_PAIRS)
 
 
 class StationaryFilter:
@@ -75,8 +98,12 @@ class StationaryFilter:
         self._matches = matches
         self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
         self._places = dict[Size, Mask]()
+        self._of_still_cameras = set(matches.state.still_cameras)
         for size, cells in matches.state.stationary:
             self._places[size] = _mask(np.array(cells, np.int64).reshape(-1, 2))
+        self._backgrounds = dict[str, Mask]()
+        for name, packed in matches.state.backgrounds:
+            self._backgrounds[name] = _unpacked(packed)
 
     @cached_property
     def _sizes(self) -> dict[str, Size]:
@@ -91,7 +118,9 @@ class StationaryFilter:
         """Return which (M, 2) matches of a pair are kept.
 
         Left out is what does not move at a place where nothing does, or beside it, since what is
-        faint matches less; and what goes from one such place to another, as of equal letters.
+        faint matches less; and what goes from one such place to another, as of equal letters. Of a
+        pair that shows the same background, also what begins or ends on it, as of equal windows;
+        and what does not move to the pixel, where the camera stood still.
         """
         size = self._common_size(names) if self._places else None
         if size is None or size not in self._places:
@@ -102,7 +131,23 @@ class StationaryFilter:
         both = near if near.mean() <= MAX_SHARE_BESIDE else places
         if both.mean() > MAX_SHARE_BESIDE:
             both = np.zeros_like(places)
-        return ~(still & _at(near, first) | _at(both, first) & _at(both, second))
+        dropped = still & _at(near, first) | _at(both, first) & _at(both, second)
+        of_background = self._of_background(names, first, second)
+        at_rest = still & of_background
+        if np.count_nonzero(at_rest) > np.count_nonzero(of_background & ~still):
+            dropped |= of_background
+            if size in self._of_still_cameras:
+                dropped |= self._motions(names, indices) <= _tolerance_px(size)
+        return ~dropped
+
+    def _of_background(self, names: Pair, first: Indices, second: Indices) -> Mask:
+        """Return which matches have an end where its photograph shows what stands still."""
+        found = np.zeros(len(first), bool)
+        for name, cells in zip(names, (first, second), strict=True):
+            background = self._backgrounds.get(name)
+            if background is not None:
+                found |= _at(background, cells)
+        return found
 
     def learn(self, pairs: Sequence[Pair]) -> str:
         """Look for places in all matches, and drop those there; return a line, empty if none.
@@ -118,12 +163,12 @@ class StationaryFilter:
                 idle = CAMERA_STANDS_STILL
             else:
                 self._places[size] = places.still | self._places.get(size, places.still)
+                if places.is_most_exact:
+                    self._of_still_cameras.add(size)
         if not self._places:
             return idle
-        kept = []
-        for size, mask in self._places.items():
-            kept.append((size, tuple(map(tuple, np.argwhere(mask.T).tolist()))))
-        self._matches.keep(stationary=tuple(kept))
+        self._learn_backgrounds(pairs)
+        self._keep()
         num_pairs = num_matches = 0
         for pair in pairs:
             (before,) = self._matches.read([pair])
@@ -137,6 +182,34 @@ class StationaryFilter:
         return (
             f"{num_matches} matches of {num_pairs} pairs never move ({WHAT}?) and were left out "
             "(--set matching.filter_stationary_matches=false keeps them)"
+        )
+
+    def _learn_backgrounds(self, pairs: Sequence[Pair]) -> None:
+        """Find where each photograph shows what stands still, and nothing that hides it."""
+        votes: dict[str, _Votes] = defaultdict(_Votes.none)
+        for found in self._matches.read([p for p in pairs if self._common_size(p) in self._places]):
+            size = self._sizes[found.names[0]]
+            are_still, first, second = self._still(found.names, found.indices, size)
+            for name, cells in zip(found.names, (first, second), strict=True):
+                votes[name].still[:] += _counts(cells[are_still])
+                votes[name].moving[:] += _counts(cells[~are_still])
+        for name, of_image in votes.items():
+            background = of_image.background(self._places[self._sizes[name]])
+            if background.any():
+                self._backgrounds[name] = background | self._backgrounds.get(name, background)
+
+    def _keep(self) -> None:
+        """Put what is known on record."""
+        kept = []
+        for size, mask in self._places.items():
+            kept.append((size, tuple(map(tuple, np.argwhere(mask.T).tolist()))))
+        packed = []
+        for name, background in self._backgrounds.items():
+            packed.append((name, _packed(background)))
+        self._matches.keep(
+            stationary=tuple(kept),
+            still_cameras=tuple(sorted(self._of_still_cameras)),
+            backgrounds=tuple(packed),
         )
 
     def _find(self, pairs: Sequence[Pair]) -> dict[Size, "_Places"]:
@@ -163,8 +236,10 @@ class StationaryFilter:
                 exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
                 num_likely = likely.sum()
                 num_matched = (counts >= MIN_NUM_PAIRS).sum()
+                num_exact = (likely & exact).sum()
                 is_most = bool(num_likely > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
-                places[size] = _Places(likely & exact, is_most)
+                is_most_exact = bool(num_exact > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
+                places[size] = _Places(likely & exact, is_most, is_most_exact)
         return places
 
     def _evidence(self, pairs: Sequence[Pair], size: Size, likely: Mask) -> Array:
@@ -175,7 +250,7 @@ class StationaryFilter:
         what moves more and more. Each counts once in a pair: matches there err together.
         """
         limit_px = MAX_MOTION_FRAC * max(size)
-        tolerance_px = max(MIN_PX, MIN_FRAC * max(size))
+        tolerance_px = _tolerance_px(size)
         own, connected = np.zeros((2, NUM_CELLS, NUM_CELLS))
         for found in self._matches.read([p for p in pairs if self._common_size(p) == size]):
             are_still, first, _ = self._still(found.names, found.indices, size)
@@ -205,8 +280,13 @@ class StationaryFilter:
     def _still(self, names: Pair, indices: Indices, size: Size) -> tuple[Mask, Indices, Indices]:
         """Return which matches do not move; also the (M, 2) cells, column and row, of both ends."""
         first, second = self._ends(names, indices)
-        motion = np.linalg.norm(second - first, axis=1)
-        return motion <= MAX_MOTION_FRAC * max(size), _cells(first, size), _cells(second, size)
+        motions = self._motions(names, indices)
+        return motions <= MAX_MOTION_FRAC * max(size), _cells(first, size), _cells(second, size)
+
+    def _motions(self, names: Pair, indices: Indices) -> Array:
+        """Return the (M,) px by which matches move."""
+        first, second = self._ends(names, indices)
+        return np.asarray(np.linalg.norm(second - first, axis=1))
 
     def _ends(self, names: Pair, indices: Indices) -> tuple[Floats, Floats]:
         """Return the (M, 2) px of matches in both images."""
@@ -216,6 +296,11 @@ class StationaryFilter:
     def _common_size(self, pair: Pair) -> Size | None:
         size = self._sizes[pair[0]]
         return size if size == self._sizes[pair[1]] else None
+
+
+def _tolerance_px(size: Size) -> float:
+    """Return the error of what stands still."""
+    return max(MIN_PX, MIN_FRAC * max(size))
 
 
 def _cells(points: Floats, size: Size) -> Indices:
@@ -233,6 +318,24 @@ def _means(cells: Indices, values: Array) -> Array:
     sums = np.bincount(numbers, values, minlength=NUM_CELLS**2)
     counts = np.bincount(numbers, minlength=NUM_CELLS**2)
     return np.asarray((sums / np.maximum(counts, 1)).reshape(NUM_CELLS, NUM_CELLS))
+
+
+def _counts(cells: Indices) -> Indices:
+    """Return how many of (N, 2) cells, column and row, are the same; a row and column for each."""
+    numbers = cells[:, 1] * NUM_CELLS + cells[:, 0]
+    return np.bincount(numbers, minlength=NUM_CELLS**2).reshape(NUM_CELLS, NUM_CELLS)
+
+
+def _packed(mask: Mask) -> str:
+    """Return a mask as hexadecimal digits, a bit for each cell."""
+    return np.packbits(mask).tobytes().hex()
+
+
+def _unpacked(digits: str) -> Mask:
+    """Return what :func:`_packed` made into digits."""
+    packed = np.frombuffer(bytes.fromhex(digits), np.uint8)
+    bits = np.unpackbits(packed, count=NUM_CELLS**2)
+    return bits.astype(bool).reshape(NUM_CELLS, NUM_CELLS)
 
 
 def _mask(cells: Indices) -> Mask:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import random
+import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from mapping_tasks import write_images
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import check_database, refuse_unusable
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
 from colmap_affrect.doctor import Diagnosis, examine_database
 from colmap_affrect.errors import DatabaseError
@@ -46,6 +49,44 @@ def write_database(path: Path) -> Path:
 @pytest.fixture
 def database_path(tmp_path: Path) -> Path:
     return write_database(tmp_path / "database.db")
+
+
+def test_database_whose_texts_are_utf_16_is_copied_with_its_names(
+    database_path: Path, tmp_path: Path
+) -> None:
+    utf_16 = tmp_path / "utf-16.db"
+    with (
+        closing(sqlite3.connect(database_path)) as source,
+        closing(sqlite3.connect(utf_16)) as target,
+    ):
+        target.execute("PRAGMA encoding = 'UTF-16'")
+        for statement in source.iterdump():
+            if "sqlite_sequence" not in statement:
+                target.execute(statement)
+        (version,) = source.execute("PRAGMA user_version").fetchone()
+        target.execute(f"PRAGMA user_version = {version}")
+        target.commit()
+    refuse_unusable(utf_16)
+    copy_database(utf_16, tmp_path / "copy.db")
+    with open_database(tmp_path / "copy.db") as database:
+        assert sorted(image.name for image in database.read_all_images()) == NAMES
+
+
+def test_name_that_is_no_utf_8_is_found(database_path: Path) -> None:
+    no_utf_8 = "UPDATE images SET name = CAST(X'61ff62' AS TEXT) WHERE image_id = 1"
+    execute(database_path, no_utf_8)
+    _, problems = check_database(database_path)
+    assert "bad-name" in problems
+
+
+def test_text_in_the_place_of_a_database_is_not_called_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.db"
+    path.write_text("a.png b.png\n" * 50, encoding="utf-16")
+    diagnosis = Diagnosis()
+    assert not examine_database(diagnosis, path)
+    (found,) = diagnosis.findings
+    assert "does not begin as files of SQLite do" in found.what
+    assert ".recover" not in found.advice
 
 
 def pair_id(first: int, second: int) -> int:

@@ -12,7 +12,7 @@ from PIL import Image, TiffImagePlugin
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import ImageError, OptionError
-from colmap_affrect.images import conversion
+from colmap_affrect.images import conversion, reading
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.reading import decode
 
@@ -179,3 +179,39 @@ def test_converted_photographs_with_long_names_get_shorter_ones(tmp_path: Path) 
     (new,) = report.written[name]
     assert len(new) == 255
     assert (tmp_path / "photos" / new).is_file()
+
+
+@pytest.mark.parametrize("is_picture", [True, False], ids=["a picture and a hole", "a hole"])
+def test_long_file_that_is_not_what_it_says_is_named_and_not_read(
+    tmp_path: Path, is_picture: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    picture(1).save(folder / "a.png")
+    long = folder / "b.jpg"
+    if is_picture:
+        picture(2).save(long)
+    with long.open("ab") as file:
+        file.truncate(3_000_000_000)
+    read = list[int]()
+    empty = np.empty
+
+    def counted(shape: int, *args: object) -> object:
+        read.append(shape)
+        return empty(shape, *args)
+
+    monkeypatch.setattr(reading.np, "empty", counted)
+    report = convert_images(folder, tmp_path / "photos")
+    assert report.copied == ["a.png"]
+    why = "is 3.0 GB long, which its 0.0 megapixels do not need" if is_picture else "not a readable"
+    assert why in report.failures["b.jpg"]
+    assert max(read) < 1_000_000
+
+
+def test_long_file_whose_pixels_need_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "USUAL_BYTES", 1000)
+    path = tmp_path / "a.png"
+    picture(1).save(path)
+    assert len(reading.read_photograph(path)) == path.stat().st_size > 1000

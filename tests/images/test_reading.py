@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import re
+import subprocess
+import sys
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +23,7 @@ from synthetic import blobs, centroid, png_of_size, write_image
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.conventions import resized_from_original
+from colmap_affrect.images.pnm import pnm_header
 from colmap_affrect.images.reading import (
     IMAGE_SUFFIXES,
     decode,
@@ -162,3 +165,51 @@ def test_a_file_whose_content_cannot_be_read_is_an_image_that_cannot(
     monkeypatch.setattr("colmap_affrect.images.reading.open_regular", fail)
     with pytest.raises(ImageError, match=r"y\.jpg: cannot be read \(Input/output error\)"):
         decode(tmp_path / "y.jpg")
+
+
+@pytest.mark.parametrize("white", [1, 15, 100, 255, 300, 4095, 65535])
+@pytest.mark.parametrize("kind", [2, 3, 5, 6])
+def test_white_of_pnm_is_any_number(tmp_path: Path, kind: int, white: int) -> None:
+    """Of text, too, that ends with its last number."""
+    channels = 1 if kind in (2, 5) else 3
+    values = np.random.default_rng(0).integers(0, white + 1, (9, 11))
+    values[0, :2] = (0, white)
+    numbers = np.repeat(values[:, :, None], channels, axis=2).ravel()
+    if kind in (2, 3):
+        content = " ".join(map(str, numbers)).encode()
+    else:
+        content = numbers.astype(">u2" if white > 255 else "u1").tobytes()
+    path = tmp_path / "a.pnm"
+    path.write_bytes(f"P{kind} # {white}\n11 9\n{white}\n".encode() + content)
+    expected = values * (255.0 / white)
+    assert np.abs(read_gray(path) - expected).max() <= 1.0
+
+
+def test_numbers_that_are_no_tones_stay(tmp_path: Path) -> None:
+    path = tmp_path / "depth.pgm"
+    path.write_bytes(b"P5 2 1 5000\n" + np.array([1200, 5000], ">u2").tobytes())
+    assert decode(path, cv2.IMREAD_UNCHANGED, keeps_numbers=True).tolist() == [[1200, 5000]]
+
+
+@pytest.mark.parametrize("header", [b"P5 2 2 0\n", b"P5 2 2 70000\n", b"P4 16 2\n", b"P5 2 2"])
+def test_header_without_a_possible_white_changes_nothing(header: bytes) -> None:
+    assert pnm_header(np.frombuffer(header + bytes(8), np.uint8)) is None
+
+
+def test_limit_of_the_environment_is_named(tmp_path: Path) -> None:
+    """OpenCV reads it once, so that another process must be asked."""
+    path = tmp_path / "a.png"
+    path.write_bytes(cv2.imencode(".png", np.zeros((20, 30), np.uint8))[1].tobytes())
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom colmap_affrect.images.reading import decode\n"
+        "try:\n    decode(Path(sys.argv[1]))\nexcept Exception as error:\n    print(error)"
+    )
+    limit = {"OPENCV_IO_MAX_IMAGE_PIXELS": "100"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, path],
+        env={**os.environ, **limit},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "is larger than OpenCV may read here, by OPENCV_IO_MAX_IMAGE_PIXELS=100" in done.stdout

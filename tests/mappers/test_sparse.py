@@ -23,7 +23,13 @@ from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
 from colmap_affrect.mappers.reliability import score_images
 from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
 from colmap_affrect.mappers.tie_joining import BY_HAND
-from colmap_affrect.mappers.tie_points import ImageResidual, tie_point_log_odds, tie_points_of
+from colmap_affrect.mappers.tie_points import (
+    ImageResidual,
+    TiePoints,
+    _Surroundings,
+    tie_point_log_odds,
+    tie_points_of,
+)
 from colmap_affrect.project.report import DOUBTFUL, SURE
 
 MAX_SCALE_ERROR = 0.03
@@ -230,3 +236,36 @@ def test_many_tie_points_make_a_pose_hardly_surer_than_six_do() -> None:
 
 def test_two_photographs_alone_prove_nothing() -> None:
     assert tie_point_log_odds(marked("abcdefgh", (1, 2), 0.0)) == {}
+
+
+def test_what_an_image_sees_is_looked_up_once_for_all_its_marks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=2, num_points3D=400
+    )
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    image_id = min(model.reg_image_ids())
+    keypoints = {}
+    places = {}
+    for number, point in enumerate(model.images[image_id].points2D):
+        if point.has_point3D():
+            keypoints[f"p{number}"] = {image_id: number}
+            places[f"p{number}"] = model.points3D[point.point3D_id].xyz
+    look_up = _Surroundings._observed_by
+    looked_up = list[int]()
+
+    def counted(surroundings: _Surroundings, image_id: int) -> object:
+        looked_up.append(image_id)
+        return look_up(surroundings, image_id)
+
+    monkeypatch.setattr(_Surroundings, "_observed_by", counted)
+    found = TiePoints(keypoints).positions(model)
+    assert looked_up == [image_id]
+    assert len(found) > 0.9 * len(keypoints) > 100
+    pose = model.images[image_id].cam_from_world()
+    for name, place in found.items():
+        ray = (pose * place) / np.linalg.norm(pose * place)
+        true_ray = (pose * places[name]) / np.linalg.norm(pose * places[name])
+        assert ray @ true_ray > 0.999999

@@ -154,7 +154,7 @@ CHANGING = {
 
 BY_THE_DOOR = {
     "align.py", "pycolmap_api.py", "export.py", "hdf5.py",
-    "conversion.py", "method_run.py",
+    "conversion.py", "line_pictures.py", "method_run.py",
 }  # fmt: skip
 """Write where the door lets them."""
 

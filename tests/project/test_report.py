@@ -144,6 +144,11 @@ def test_summary_says_where_exif_is_wrong_or_needs_the_size_of_the_sensor() -> N
     text = replace(REPORT, cameras=(right, {**right, "refined_px": None})).summary()
     assert "EXIF may be wrong" not in text
     assert "sensor" not in text
+    database = {**camera, "source": "given", "focal_px": 2560.0, "refined_px": 1279.0}
+    text = replace(REPORT, cameras=(database, {**right, "source": "given"})).summary()
+    line = "the given focal length may be wrong: 2560 px given, 1279 px in the model; --cameras"
+    assert line in text
+    assert "EXIF" not in text
 
 
 def test_summary_says_what_cannot_be_trusted() -> None:

@@ -46,8 +46,7 @@ def test_record_options_puts_the_options_on_record(workspace: Workspace) -> None
     workspace.record_options("pairs", {"match_list_path": ""})
     assert workspace.recorded() == {
         "recipe": "default",
-        "begun": ["extract", "pairs"],
-        "match": {"max_ratio": 0.8},
+        "planned": {"match": {"max_ratio": 0.8}},
         "extract": {**OPTIONS, "sigmas": [8.0, 16.0]},
         "pairs": {"match_list_path": ""},
     }
@@ -100,13 +99,11 @@ def test_record_options_with_overwrite_discards_this_stage_and_later_ones(
     record = finished.recorded()
     earlier = STAGES[: STAGES.index(stage)]
     assert record.pop("recipe") == "default"
-    assert record.pop("begun") == [*earlier, stage]
     # What was chosen for later stages is kept, unless everything begins anew.
     later = STAGES[len(earlier) + 1 :] if earlier else ()
-    assert record == {
-        **{name: {"by": name} for name in (*earlier, *later)},
-        stage: {"by": "somebody else"},
-    }
+    assert record.pop("planned", {}) == {name: {"by": name} for name in later}
+    assert record == {**{name: {"by": name} for name in earlier}, stage: {"by": "somebody else"}}
+    assert finished.begun == [*earlier, stage]
 
 
 def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
@@ -120,7 +117,7 @@ def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
     for stage in stages:
         copied.record_options(stage, {"by": stage})
     copied.database.write_bytes(b"copy")
-    assert copied.recorded()["begun"] == stages
+    assert copied.begun == stages
     with pytest.raises(StoreError, match="the copy stage was run there, which extract cannot"):
         copied.record_options("extract", {})
     copied.snapshots.mkdir()
@@ -254,9 +251,9 @@ def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path
     names = ["cameras.json", "config.toml", "features.h5", "matches.h5", "pairs.txt"]
     assert sorted(path.name for path in branch.path.iterdir()) == names
     assert branch.features.read_bytes() == b"features.h5"
-    assert branch.recorded() == {
-        **finished.recorded(), "begun": ["extract", "pairs", "match"],
-    }  # fmt: skip
+    assert branch.begun == ["extract", "pairs", "match"]
+    record = branch.recorded()
+    assert {**record, **record["planned"]} == {**finished.recorded(), "planned": record["planned"]}
     with pytest.raises(OptionError, match="the verify stage has not been run"):
         branch.require("verify")
     branch.record_options("verify", {"by": "another seed"})

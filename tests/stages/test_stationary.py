@@ -143,10 +143,10 @@ def test_what_a_camera_turns_about_is_kept(tmp_path: Path, depth: float) -> None
     assert all(len(found.indices) == 1200 for found in matches.read(pairs))
 
 
-def turntable(count: int) -> tuple[list[NDArray[np.float64]], int]:
+def turntable(count: int, num_behind: int = 600) -> tuple[list[NDArray[np.float64]], int]:
     """Photographs of an object that turns before a still camera; how many points it has."""
     shape = np.random.default_rng(5).uniform(-0.6, 0.6, (200, 3))
-    behind = np.random.default_rng(6).uniform((0, 0), SIZE, (600, 2))
+    behind = np.random.default_rng(6).uniform((0, 0), SIZE, (num_behind, 2))
     behind = behind[np.linalg.norm(behind - (480, 320), axis=1) > 300]
     jitter = np.random.default_rng(7).normal(0.0, 0.2, (count, *behind.shape))
     views = [turned(shape, 12.0 * k) for k in range(count)]
@@ -164,6 +164,63 @@ def test_background_of_an_object_that_turns_before_a_still_camera_is_left_out(
         of_object = found.indices[:, 0] < num
         assert np.count_nonzero(of_object) > 0.9 * num
         assert np.count_nonzero(~of_object) < 0.02 * len(points[0])
+
+
+def test_what_begins_or_ends_on_the_background_of_a_pair_is_left_out(tmp_path: Path) -> None:
+    """As of windows that look alike, or of something on the object that looks like one."""
+    points, num = turntable(6, 2000)
+    features, matches, pairs = stores(tmp_path, points)
+    random = np.random.default_rng(10)
+    for found in list(matches.read(pairs)):
+        behind = random.choice(np.arange(num, len(points[0])), (60, 2), replace=False)
+        behind[:20, 1] = random.choice(num, 20, replace=False)
+        indices = np.concatenate([found.indices, behind])
+        scores = np.full(len(indices), 0.5, np.float32)
+        matches.write([replace(found, indices=indices, scores=scores)])
+    StationaryFilter(features, matches).learn(pairs)
+    for found in matches.read(pairs):
+        are_of_object = (found.indices < num).all(axis=1)
+        assert np.count_nonzero(are_of_object) > 0.9 * num
+        assert np.count_nonzero(~are_of_object) < 0.2 * 60
+
+
+def test_what_stands_still_is_left_out_of_later_matches_anywhere(tmp_path: Path) -> None:
+    """Other features lie at other places, where nothing was seen that does not move."""
+    points, num = turntable(6)
+    hidden = np.array([[470.0, 30.0], [300.0, 610.0]])
+    points = [np.concatenate([one, hidden]) for one in points]
+    features, matches, pairs = stores(tmp_path, points)
+    all_matched = list(matches.read(pairs))
+    for found in all_matched:
+        matches.write([replace(found, indices=found.indices[:-2], scores=found.scores[:-2])])
+    StationaryFilter(features, matches).learn(pairs)
+    again = StationaryFilter(features, MatchStore(matches.path))
+    for found in all_matched:
+        left = again.filtered(found).indices[:, 0]
+        assert left.max() < num
+        assert len(left) > 0.9 * num
+
+
+def test_background_of_a_photograph_that_is_gone_is_forgotten(tmp_path: Path) -> None:
+    points, _ = turntable(6)
+    features, matches, pairs = stores(tmp_path, points)
+    StationaryFilter(features, matches).learn(pairs)
+    known = [name for name, _ in matches.state.backgrounds]
+    matches.remove(images=["2.jpg"])
+    left = [name for name, _ in matches.state.backgrounds]
+    assert set(known) - set(left) == {"2.jpg"}
+    assert matches.state.still_cameras == (SIZE,)
+
+
+def test_background_ties_photographs_from_elsewhere(tmp_path: Path) -> None:
+    """Something turns before a tripod, and the same background is seen from another place."""
+    points, _ = turntable(6, 2000)
+    elsewhere = points[0] * (1.05, 1.0) + SCENE_MOTION_PX
+    features, matches, pairs = stores(tmp_path, [*points, elsewhere])
+    StationaryFilter(features, matches).learn(pairs)
+    for found in matches.read(pairs):
+        if found.names[1] == "6.jpg":
+            assert len(found.indices) == len(points[0])
 
 
 def test_where_nothing_else_moves_nothing_is_left_out_and_the_line_says_what_to_do(
