@@ -62,7 +62,8 @@ class MappingTask:
     # pairs of image names that only affine frames verify which were not measured one by one
     unmeasured_pairs: frozenset[tuple[str, str]] = frozenset()
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)  # what is known, by id
-    # what the straight lines of images say of their cameras, by image name
+    # what the straight lines of images say of their cameras, by image name; runs leave it empty,
+    # as far as it is not measured that models of stored lines (FeatureStore.lines) are better
     lines: Mapping[str, LineCamera] = field(default_factory=dict)
     may_share: bool = False  # images of one size may turn out to share an uncalibrated camera
     # keypoints of the tie points, by point and image name

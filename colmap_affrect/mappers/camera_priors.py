@@ -144,13 +144,11 @@ def with_distortion_of(
         priors: By camera id.
         cameras: Of the model.
     """
-    found = dict(priors)
-    for camera in cameras:
-        prior = priors[camera.camera_id]
-        if prior.is_unknown:
-            has_distortion = not camera.is_undistorted()
-            found[camera.camera_id] = replace(prior, has_distortion=has_distortion)
-    return found
+    is_straight = {camera.camera_id: camera.is_undistorted() for camera in cameras}
+    return {
+        key: replace(prior, has_distortion=not (prior.is_unknown and is_straight.get(key, False)))
+        for key, prior in priors.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -253,17 +251,15 @@ def _principal_point(
     ):
         return None
     longer_px = max(camera.width, camera.height)
-    across = Normal(0.0, MIDDLE_SIGMA)
+    across_sigma = SHIFTED_SIGMA if record.uncropped_px else MIDDLE_SIGMA
     down = _shift(lines)
-    if record.uncropped_px:
-        across = Normal(0.0, SHIFTED_SIGMA)
-        down = down or Normal(0.0, SHIFTED_SIGMA)
     if down is None:
-        return None
-    middle_px = (camera.width / 2.0, camera.height / 2.0)
+        if not record.uncropped_px:
+            return None
+        down = Normal(0.0, SHIFTED_SIGMA)
     return PrincipalPointPrior(
-        (middle_px[0] + across.mean * longer_px, middle_px[1] + down.mean * longer_px),
-        (across.sigma * longer_px, down.sigma * longer_px),
+        (camera.width / 2.0, camera.height / 2.0 + down.mean * longer_px),
+        (across_sigma * longer_px, down.sigma * longer_px),
     )
 
 
