@@ -16,7 +16,9 @@ __version__ = "0.1.0"
 # The wheels of pycolmap 4.2 export zlib's symbols: if libz is first loaded by
 # "import pycolmap", the process dies or hangs when it compresses. Loading it before, as numpy does
 # too, keeps both working; after, it must not be touched.
-_first = next(n for n in sys.modules if n.partition(".")[0] in {"numpy", "pycolmap", "zlib"})
+_first = next(
+    n for n in sys.modules if n.partition(".")[0] in {"numpy", "pycolmap", "zlib"}
+)
 PYCOLMAP_CAME_FIRST = _first.startswith("pycolmap")
 if not PYCOLMAP_CAME_FIRST:
     zlib.decompress(zlib.compress(b"warm"))
@@ -92,7 +94,9 @@ _NAMES_OF_MODULES = {
     ),
     "stages.descriptors": ("match_descriptors", "match_feature_sets"),
 }
-_MODULES = {name: module for module, names in _NAMES_OF_MODULES.items() for name in names}
+_MODULES = {
+    name: module for module, names in _NAMES_OF_MODULES.items() for name in names
+}
 
 __all__ = ["__version__", *_MODULES, "pycolmap"]  # noqa: PLE0604 (all are strings)
 

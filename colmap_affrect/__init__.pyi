@@ -3,7 +3,9 @@
 from colmap_affrect import pycolmap as pycolmap
 from colmap_affrect.colmap.by_hand import ByHand as ByHand
 from colmap_affrect.colmap.old_databases import export_database as export_database
-from colmap_affrect.colmap.verification import VerificationOptions as VerificationOptions
+from colmap_affrect.colmap.verification import (
+    VerificationOptions as VerificationOptions,
+)
 from colmap_affrect.comparison.compare import compare as compare
 from colmap_affrect.comparison.method_run import CompareOptions as CompareOptions
 from colmap_affrect.comparison.results import Comparison as Comparison
@@ -34,9 +36,13 @@ from colmap_affrect.interop.align import align as align
 from colmap_affrect.interop.export import export as export
 from colmap_affrect.interop.hdf5 import export_h5 as export_h5
 from colmap_affrect.interop.hdf5 import import_h5 as import_h5
-from colmap_affrect.interop.panoramas import reconstruct_panoramas as reconstruct_panoramas
+from colmap_affrect.interop.panoramas import (
+    reconstruct_panoramas as reconstruct_panoramas,
+)
 from colmap_affrect.interop.pycolmap_api import extract_features as extract_features
-from colmap_affrect.interop.pycolmap_api import incremental_mapping as incremental_mapping
+from colmap_affrect.interop.pycolmap_api import (
+    incremental_mapping as incremental_mapping,
+)
 from colmap_affrect.interop.pycolmap_api import match_exhaustive as match_exhaustive
 from colmap_affrect.interop.pycolmap_api import match_image_pairs as match_image_pairs
 from colmap_affrect.interop.pycolmap_api import match_sequential as match_sequential

@@ -29,7 +29,9 @@ class Photograph:
     gray: GrayImage  # (H, W) uint8 at the size of processing, at most ``max_image_size_px``
     name: str  # relative POSIX path below the image folder, the key of depth maps
     path: Path | None  # the file; None for an image that was never one
-    camera_matrix: Array  # (3, 3) float64 pinhole intrinsics in pixel-centre px of ``gray``
+    camera_matrix: (
+        Array  # (3, 3) float64 pinhole intrinsics in pixel-centre px of ``gray``
+    )
     mask: Mask | None = None  # (H, W) bool, where features may be; None: everywhere
     color: ColorImage | None = None  # (H, W, 3) uint8, for extractors that ask for it
     stretched: bool = False  # its contrast was low, and its tones have been stretched
@@ -53,7 +55,9 @@ class ShapeGrid:
     """Affine shapes on a regular grid over an image; what every dense shape source returns."""
 
     metrics: Floats  # (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps
-    textured: Mask  # (R, C) bool, False where the image has no structure to read a shape from
+    textured: (
+        Mask  # (R, C) bool, False where the image has no structure to read a shape from
+    )
     origin_px: float  # centre of cell (0, 0) in x and in y, pixel-centre px
     step_px: int  # distance of neighbouring cells in px
 
@@ -85,7 +89,9 @@ class LocalFeatures:
     lafs: Array
     responses: Singles
     descriptors: Singles
-    rectification_ids: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    rectification_ids: NDArray[np.int32] = field(
+        default_factory=lambda: np.zeros(0, np.int32)
+    )
 
     def __post_init__(self) -> None:
         count = len(self.lafs)
@@ -93,11 +99,15 @@ class LocalFeatures:
             object.__setattr__(self, "rectification_ids", np.zeros(count, np.int32))
         shapes = (self.lafs.shape, self.responses.shape, self.rectification_ids.shape)
         _require(
-            shapes == ((count, 2, 3), (count,), (count,)) and len(self.descriptors) == count,
+            shapes == ((count, 2, 3), (count,), (count,))
+            and len(self.descriptors) == count,
             f"shapes of frames, responses, ids {shapes} and {self.descriptors.shape=} do not fit",
         )
         _require(
-            bool(np.isfinite(self.lafs).all() and (determinants(self.lafs[:, :, :2]) > 0).all()),
+            bool(
+                np.isfinite(self.lafs).all()
+                and (determinants(self.lafs[:, :, :2]) > 0).all()
+            ),
             "frames must be finite and of positive determinant",
         )
 
@@ -126,14 +136,19 @@ class LocalFeatures:
 
     def with_rectification_id(self, rectification_id: int) -> Self:
         """Say which rectification all features come from."""
-        return replace(self, rectification_ids=np.full(len(self), rectification_id, np.int32))
+        return replace(
+            self, rectification_ids=np.full(len(self), rectification_id, np.int32)
+        )
 
 
 def of_one_size(parts: list[LocalFeatures]) -> list[LocalFeatures]:
     """Fill up shorter descriptors with zeros, so that features of two kinds can be united."""
     widths = [part.descriptors.shape[1] for part in parts]
     return [
-        replace(part, descriptors=np.pad(part.descriptors, ((0, 0), (0, max(widths) - width))))
+        replace(
+            part,
+            descriptors=np.pad(part.descriptors, ((0, 0), (0, max(widths) - width))),
+        )
         for part, width in zip(parts, widths, strict=True)
     ]
 
@@ -141,7 +156,9 @@ def of_one_size(parts: list[LocalFeatures]) -> list[LocalFeatures]:
 def union(parts: list[LocalFeatures]) -> LocalFeatures:
     """Concatenate features in the order given; at least one part."""
     names = [item.name for item in fields(LocalFeatures)]
-    return LocalFeatures(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    return LocalFeatures(
+        *(np.concatenate([getattr(p, name) for p in parts]) for name in names)
+    )
 
 
 @dataclass(frozen=True)
@@ -155,7 +172,10 @@ class Rectification:
     # class of the map in the space of tilts; of a homography that of its Jacobian in the middle
     tilt: float
     tilt_angle_rad: float
-    region_origin: tuple[int, int] = (0, 0)  # (x, y) image pixel of the mask's first pixel
+    region_origin: tuple[int, int] = (
+        0,
+        0,
+    )  # (x, y) image pixel of the mask's first pixel
     segment_id: int = 0  # the segment of the image, from 0; several warps may share one
 
     def in_region(self, points: Floats) -> Mask:
@@ -199,7 +219,9 @@ class RectificationPlan:
 
     image_size: tuple[int, int]  # (width, height) in px
     items: tuple[Rectification, ...] = ()  # the warps
-    original_region: Mask | None = None  # (H, W) where features of the image stay; None: all
+    original_region: Mask | None = (
+        None  # (H, W) where features of the image stay; None: all
+    )
     # a feature of a warp takes the place of one of the image itself at the same place and scale:
     # for disjoint regions, each with the map that suits it best
     replaces_original: bool = False

@@ -41,7 +41,9 @@ class DocstringWithFields:
     Commands, which show no docstrings, would wait for that.
     """
 
-    def __init__(self, docstring: str | None, texts: Callable[[], Mapping[str, str]]) -> None:
+    def __init__(
+        self, docstring: str | None, texts: Callable[[], Mapping[str, str]]
+    ) -> None:
         """Take what the class says, and what returns the text of each field."""
         self._docstring = docstring
         self._texts = texts
@@ -75,7 +77,9 @@ def field_text(options: type[BaseModel], name: str) -> str:
     """Say what a field of options means, which values it takes, and its default."""
     field = options.model_fields[name]
     text = field_meaning(options, name)
-    values = [repr(value) for value in get_args(field.annotation) if isinstance(value, str)]
+    values = [
+        repr(value) for value in get_args(field.annotation) if isinstance(value, str)
+    ]
     if len(values) > 1:
         text += f" One of {', '.join(values)}."
     limits = _limits(field)

@@ -19,7 +19,13 @@ from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import has_model, model_folder, read_given_model
 from colmap_affrect.colmap.tables import NoDatabaseError
-from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
+from colmap_affrect.errors import (
+    AffrectError,
+    DatabaseError,
+    OptionError,
+    WorkspaceError,
+    such_as,
+)
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
 from colmap_affrect.options import Summarized, documented
@@ -35,7 +41,9 @@ Severity = Literal["error", "warning", "note"]
 """A program fails, or results are wrong; something is missing from results; worth knowing."""
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 MAX_ITEMS_SHOWN = 5
-HARMLESS = WARNED | {"camera-panorama"}  # problems of databases that may be of use to COLMAP
+HARMLESS = WARNED | {
+    "camera-panorama"
+}  # problems of databases that may be of use to COLMAP
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
@@ -64,7 +72,9 @@ class Diagnosis(Summarized):
     findings: list[Finding] = field(default_factory=list)
     """What was found, the worst first."""
 
-    def add(self, severity: Severity, where: Path | str, what: str, advice: str) -> None:
+    def add(
+        self, severity: Severity, where: Path | str, what: str, advice: str
+    ) -> None:
         """Add a finding.
 
         Args:
@@ -110,7 +120,9 @@ class Diagnosis(Summarized):
 
 
 @checks_arguments
-def diagnose(path: PathLike | None = None, *, weights_path: PathLike | None = None) -> Diagnosis:
+def diagnose(
+    path: PathLike | None = None, *, weights_path: PathLike | None = None
+) -> Diagnosis:
     """Examine the installation and, if a path is given, an output folder, a database or a model.
 
     OptionError when something that is given is not there.
@@ -139,7 +151,10 @@ def _examine_installation(diagnosis: Diagnosis, weights_path: Path | None) -> No
     except (ImportError, OSError) as error:
         advice = "install them again; recipes with RootSIFT work without"
         diagnosis.add(
-            "error", "installation", f"torch or kornia cannot be loaded ({error})", advice
+            "error",
+            "installation",
+            f"torch or kornia cannot be loaded ({error})",
+            advice,
         )
         return
     diagnosis.checked.append(f"networks: run on {resolve_device('auto')}")
@@ -157,7 +172,9 @@ def _examine_weights(diagnosis: Diagnosis, weights_path: Path | None) -> None:
     for key, path in found.items():
         if is_published(key, path) is False:
             what = f"not the published file of {key}"
-            diagnosis.add("warning", path, what, f"unless it is your own, {remedy(path)}")
+            diagnosis.add(
+                "warning", path, what, f"unless it is your own, {remedy(path)}"
+            )
 
 
 def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool:
@@ -176,7 +193,9 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         newest = newest_schema_version()
         tables, problems = check_database(path)
     except NoDatabaseError as error:
-        diagnosis.add("error", path, _without_path(path, error), advice or "give a database")
+        diagnosis.add(
+            "error", path, _without_path(path, error), advice or "give a database"
+        )
         return False
     except DatabaseError as error:
         recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
@@ -197,7 +216,9 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         usual = CHECKS[kind]["advice"]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
         severity: Severity = "warning" if kind in HARMLESS else "error"
-        diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
+        diagnosis.add(
+            severity, path, f"{what}{items}", advice or usual.format(path=quoted)
+        )
     return True
 
 
@@ -243,7 +264,9 @@ def _examine_model(diagnosis: Diagnosis, path: Path) -> None:
         return
     registered = model.num_reg_images()
     points = model.num_points3D()
-    diagnosis.checked.append(f"{path}: a model of {registered} images and {points} points")
+    diagnosis.checked.append(
+        f"{path}: a model of {registered} images and {points} points"
+    )
 
 
 @dataclass(frozen=True)
@@ -253,7 +276,9 @@ class _OutputFolder:
     diagnosis: Diagnosis
     workspace: Workspace
 
-    def read(self, path: Path, reader: Callable[[], Read], advice: str = "") -> Read | None:
+    def read(
+        self, path: Path, reader: Callable[[], Read], advice: str = ""
+    ) -> Read | None:
         """Read a file; what is wrong with it is a finding, and None is returned.
 
         Args:
@@ -274,7 +299,9 @@ class _OutputFolder:
         """Read every file, that of one stage after the other."""
         workspace = self.workspace
         context = Context(workspace)
-        done = self.read(workspace.config, lambda: _stages(self.diagnosis, context)) or []
+        done = (
+            self.read(workspace.config, lambda: _stages(self.diagnosis, context)) or []
+        )
         self.read(workspace.cameras, lambda: read_camera_records(workspace.cameras))
         if done:
             self._examine_stores(context)
@@ -295,7 +322,9 @@ class _OutputFolder:
     def _require(self, path: Path) -> None:
         """Find a file that is missing."""
         if not path.exists():
-            self.diagnosis.add("error", path, "is missing", f"{SAME_RUN} to make it anew")
+            self.diagnosis.add(
+                "error", path, "is missing", f"{SAME_RUN} to make it anew"
+            )
 
     def _examine_stores(self, context: Context) -> None:
         """Read all features and matches."""
@@ -341,4 +370,7 @@ def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:
 
 
 def _without_path(path: Path, error: Exception) -> str:
-    return str(error).removeprefix(f"{path}: ").removeprefix(f"{path}/") or type(error).__name__
+    return (
+        str(error).removeprefix(f"{path}: ").removeprefix(f"{path}/")
+        or type(error).__name__
+    )

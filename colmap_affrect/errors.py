@@ -41,7 +41,9 @@ NO_MEMORY = (
 
 def lacks_memory(error: BaseException) -> bool:
     """Return whether Python, numpy, OpenCV, torch or COLMAP has found no memory."""
-    return isinstance(error, MemoryError) or any(t in str(error).lower() for t in NO_MEMORY)
+    return isinstance(error, MemoryError) or any(
+        t in str(error).lower() for t in NO_MEMORY
+    )
 
 
 ARGUMENTS = {
@@ -58,14 +60,18 @@ ARGUMENTS = {
     "tie-points": "by_hand.tie_points_path", "weights": "resources.weights_path",
 }  # fmt: skip
 """What functions call the flags whose argument has another name; a dot leads to a field."""
-FLAG = re.compile(r"(?:colmap-affrect|colmap|pip) [^';)]*|--([a-z][a-z-]*)")  # not of a command
+FLAG = re.compile(
+    r"(?:colmap-affrect|colmap|pip) [^';)]*|--([a-z][a-z-]*)"
+)  # not of a command
 
 
 class AffrectError(Exception):
     """Base of all errors that the command line prints as one line."""
 
     exit_code = 1
-    names_flags: ClassVar[bool] = False  # as the command line does; else arguments of functions
+    names_flags: ClassVar[bool] = (
+        False  # as the command line does; else arguments of functions
+    )
 
     def __str__(self) -> str:
         text = super().__str__()
@@ -127,7 +133,9 @@ class PartError(AffrectError):
 
 
 @contextmanager
-def damage(path: Path, mend: str, error_class: type[AffrectError] = StoreError) -> Iterator[None]:
+def damage(
+    path: Path, mend: str, error_class: type[AffrectError] = StoreError
+) -> Iterator[None]:
     """Say of a file that cannot be read in one line that it is damaged, and what mends it."""
     try:
         yield
@@ -154,7 +162,9 @@ def reason(error: BaseException) -> str:
 def made_again(stage: str, folder: Path) -> str:
     """Say how what a stage has left in an output folder is made again."""
     if stage == "extract":
-        return "run the same 'extract' or 'run' with --overwrite (run.log has the command)"
+        return (
+            "run the same 'extract' or 'run' with --overwrite (run.log has the command)"
+        )
     again = f"run 'colmap-affrect {stage} --output-path {shlex.quote(str(folder))} --overwrite'"
     return again if stage == "map" else f"{again}, then the same 'run' again"
 
@@ -252,7 +262,9 @@ def heedless_stream(descriptor: int, encoding: str, *, closes: bool) -> TextIO:
 
 def say(line: str) -> None:
     """Print a line on stderr, which nobody may read any more."""
-    with suppress(OSError, RuntimeError):  # the latter of a handler that a signal calls meanwhile
+    with suppress(
+        OSError, RuntimeError
+    ):  # the latter of a handler that a signal calls meanwhile
         if sys.stderr:  # it may have been closed
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()

@@ -37,7 +37,11 @@ CHANGED = "was changed since the last run"
 
 @contextmanager
 def watched(
-    context: Context, *, follows: bool = True, maps: bool = False, discards: bool = False
+    context: Context,
+    *,
+    follows: bool = True,
+    maps: bool = False,
+    discards: bool = False,
 ) -> Iterator[None]:
     """Mend the database before a command works in a folder, keep it open, and seal it in the end.
 
@@ -77,7 +81,9 @@ def _seal(context: Context) -> None:
     workspace = context.workspace
     path = workspace.database
     if path.exists() and workspace.begun:
-        with suppress(AffrectError):  # one that is not sealed is looked through next time
+        with suppress(
+            AffrectError
+        ):  # one that is not sealed is looked through next time
             replace_text(workspace.seal, f"{context.graph.digest()}\n{_stamp(path)}\n")
 
 
@@ -101,7 +107,9 @@ def _why_lost(workspace: Workspace) -> str:
             return f"cannot be used ({fault})"
         if sealed:
             return "" if rows_digest(path) in sealed else CHANGED
-        refuse_unusable(path, FATAL_AS_IT_IS)  # a command was killed, and what it wrote is good
+        refuse_unusable(
+            path, FATAL_AS_IT_IS
+        )  # a command was killed, and what it wrote is good
     except AffrectError as error:
         reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
         return CHANGED if sealed else f"cannot be used ({reason})"
@@ -114,12 +122,18 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
     foreign = None
     if workspace.is_foreign:
         foreign = ForeignDatabase.of_record(workspace.require("copy"))
-    source = foreign.path if foreign else f"{workspace.features.name} and {workspace.matches.name}"
+    source = (
+        foreign.path
+        if foreign
+        else f"{workspace.features.name} and {workspace.matches.name}"
+    )
     hint = ""
     if kept := _put_aside(workspace.database):
         again = f"map --from-database {shlex.quote(str(kept))} --output-path OTHER"
         hint = f"; 'colmap-affrect {again}' maps what was there"
-    logger.warning("%s: %s; it is made again from %s%s", workspace.database, why, source, hint)
+    logger.warning(
+        "%s: %s; it is made again from %s%s", workspace.database, why, source, hint
+    )
     workspace.rewind()
     context.graph.forget()
     if not (follows and "verify" in begun):

@@ -31,7 +31,12 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from colmap_affrect.docstrings import DocstringWithFields, below_fields, field_meaning, field_text
+from colmap_affrect.docstrings import (
+    DocstringWithFields,
+    below_fields,
+    field_meaning,
+    field_text,
+)
 from colmap_affrect.errors import (
     OptionError,
     clipped,
@@ -42,7 +47,9 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.parts_of_others import PartOfOthers, methods_of, told_of
 
-EffortName = Literal["low", "normal", "high"]  # how much is tried for photographs in need
+EffortName = Literal[
+    "low", "normal", "high"
+]  # how much is tried for photographs in need
 EFFORT_NAMES: tuple[EffortName, ...] = get_args(EffortName)
 PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
 MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
@@ -135,7 +142,11 @@ class Options(BaseModel):
 
     @classmethod
     def with_keywords(
-        cls, options: Any, keywords: Mapping[str, Any], argument: str = "options", hint: str = ""
+        cls,
+        options: Any,
+        keywords: Mapping[str, Any],
+        argument: str = "options",
+        hint: str = "",
     ) -> Self:
         """Return what a function is given as options, changed by its keywords.
 
@@ -200,7 +211,9 @@ class Options(BaseModel):
             case "value_error":
                 said = error["ctx"]["error"]
                 return f"{place}: {said}" if place else str(said)
-        return f"{place}={_given(error['input'])}: {error['msg'].removeprefix('Input ')}"
+        return (
+            f"{place}={_given(error['input'])}: {error['msg'].removeprefix('Input ')}"
+        )
 
 
 def _given(value: Any) -> str:
@@ -271,19 +284,28 @@ class Registry(Generic[Part]):
         Raises OptionError for an unknown name, and for a part that another package provides and
         that does not load, or lacks what parts of this kind must have. It names that package.
         """
-        if name in self.built_in:  # do not ask for the entry points of all installed packages
+        if (
+            name in self.built_in
+        ):  # do not ask for the entry points of all installed packages
             return metadata.EntryPoint(name, self.built_in[name], self.group).load()
         points = self._points(name)
         where = self._named(points)
         if len(points) > 1:
-            raise OptionError(f"{where}: several packages have that name; uninstall all but one")
+            raise OptionError(
+                f"{where}: several packages have that name; uninstall all but one"
+            )
         try:
             part = points[0].load()
-        except (Exception, SystemExit) as error:  # of any kind: it is the code of others
+        except (
+            Exception,
+            SystemExit,
+        ) as error:  # of any kind: it is the code of others
             if lacks_memory(error):
                 raise
             why = f"cannot be loaded ({type(error).__name__}: {reason(error)})"
-            raise OptionError(f"{where}: {why}; mend or uninstall that package") from error
+            raise OptionError(
+                f"{where}: {why}; mend or uninstall that package"
+            ) from error
         problem = self.problem(part, name)
         if problem:
             raise OptionError(f"{where}: {problem}; mend or uninstall that package")
@@ -293,11 +315,15 @@ class Registry(Generic[Part]):
         """Return the entry points of a part of other packages; OptionError if there is none."""
         points = [point for point in self._entry_points() if point.name == name]
         if not points:
-            raise OptionError(f"unknown {self.kind} '{name}'{suggestion(name, self.names())}")
+            raise OptionError(
+                f"unknown {self.kind} '{name}'{suggestion(name, self.names())}"
+            )
         return points
 
     def _named(self, points: list[metadata.EntryPoint]) -> str:
-        return f"{self.kind} '{points[0].name}' of {', '.join(map(_package_of, points))}"
+        return (
+            f"{self.kind} '{points[0].name}' of {', '.join(map(_package_of, points))}"
+        )
 
     def problem(self, part: Any, name: str) -> str:
         """Say what a class lacks to be a part of this kind; empty if it lacks nothing.
@@ -310,7 +336,9 @@ class Registry(Generic[Part]):
         if not (isinstance(options, type) and issubclass(options, self.options_base)):
             return f"has no class 'Options' with the base {self.options_base.__name__}"
         if options.model_fields["name"].default != name:
-            return f"the name in its options is {options.model_fields['name'].default!r}"
+            return (
+                f"the name in its options is {options.model_fields['name'].default!r}"
+            )
         for declared in sorted(options.__class_vars__):
             if not hasattr(options, declared):
                 return f"{options.__name__} must say what its '{declared}' are"
@@ -375,7 +403,9 @@ def takes_fields_of(options: type[Options]) -> Callable[[Function], Function]:
         signature = inspect.signature(function)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
         fields = inspect.signature(options).parameters.values()
-        keywords = [p.replace(default=_Shown("..."), annotation=p.empty) for p in fields]
+        keywords = [
+            p.replace(default=_Shown("..."), annotation=p.empty) for p in fields
+        ]
         shown = signature.replace(parameters=[*own, *keywords])
         function.__signature__ = shown  # type: ignore[attr-defined]
         return function

@@ -42,9 +42,13 @@ class PartOfOthers:
         items: list[Any] = found if isinstance(found, list) else []
         if not isinstance(found, expected):
             wanted = expected.__name__
-            raise PartError(f"{self._name}: {method} returned {type(found).__name__}, not {wanted}")
+            raise PartError(
+                f"{self._name}: {method} returned {type(found).__name__}, not {wanted}"
+            )
         if inner and not all(isinstance(item, inner) for item in items):
-            raise PartError(f"{self._name}: {method} returned no list of {inner.__name__} alone")
+            raise PartError(
+                f"{self._name}: {method} returned no list of {inner.__name__} alone"
+            )
         return found
 
 
@@ -66,7 +70,9 @@ def told_of(name: str) -> Iterator[None]:
 def methods_of(protocol: type) -> tuple[str, ...]:
     """Return the names of the methods of a protocol."""
     named = vars(protocol).items()
-    return tuple(key for key, value in named if inspect.isfunction(value) and key[0] != "_")
+    return tuple(
+        key for key, value in named if inspect.isfunction(value) and key[0] != "_"
+    )
 
 
 @cache

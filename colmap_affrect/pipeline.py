@@ -40,7 +40,11 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.advice import advice
 from colmap_affrect.report.pairs import draw_pairs_to_check
 from colmap_affrect.report.run_page import RunContent, write_run_page
-from colmap_affrect.report.run_report import RunReport, cameras_of_report, lines_of_report
+from colmap_affrect.report.run_report import (
+    RunReport,
+    cameras_of_report,
+    lines_of_report,
+)
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
@@ -102,7 +106,12 @@ def run(
 
 
 def _run(
-    context: Context, image_path: Path, options: RunOptions, *, overwrite: bool, page: bool
+    context: Context,
+    image_path: Path,
+    options: RunOptions,
+    *,
+    overwrite: bool,
+    page: bool,
 ) -> RunReport:
     """Run all stages in the folder of a context, after everything that can be has been checked."""
     recipe = options.recipe
@@ -111,7 +120,9 @@ def _run(
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
     _check_extension(options.extend, mapper, workspace.path, overwrite=overwrite)
-    _check_by_hand(options.by_hand, names, mapper, lambda name: header_size(image_path / name))
+    _check_by_hand(
+        options.by_hand, names, mapper, lambda name: header_size(image_path / name)
+    )
     forecast = Forecast(len(names), _num_pairs(names, options.pairs, image_path))
     context = replace(context, progress=replace(context.progress, forecast=forecast))
     if options.extend:
@@ -131,18 +142,25 @@ def _run(
         if not recipe.extraction.escalation:
             reports.append(guide(context, recipe.guided))
         elif options.extend:
-            reports += [escalate(context, recipe.escalate), guide(context, recipe.guided)]
+            reports += [
+                escalate(context, recipe.escalate),
+                guide(context, recipe.guided),
+            ]
         else:
             reports += climb(context, mapper, recipe)
         if options.database_descriptors:
             fill_descriptors(workspace.database, context.features)
-        return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
+        return map_and_report(
+            context, mapper, options.extend, earlier=reports, page=page
+        )
 
 
 def _check_by_hand(
     by_hand: ByHand, names: Collection[str], mapper: Mapper, size_of: SizeOf
 ) -> Marks:
-    marks = by_hand.marks(names, size_of)  # refuses what names other photographs, or lies outside
+    marks = by_hand.marks(
+        names, size_of
+    )  # refuses what names other photographs, or lies outside
     if by_hand.tie_points_path and mapper.options.name != MAPPERS.default:
         raise OptionError(
             f"--tie-points: the {mapper.options.name} mapper takes none; use --mapper sparse"
@@ -157,7 +175,9 @@ def _check_extension(
     if not extend:
         return
     if not mapper.options.can_extend:
-        raise OptionError(f"--extend: the {mapper.options.name} mapper cannot; use --mapper sparse")
+        raise OptionError(
+            f"--extend: the {mapper.options.name} mapper cannot; use --mapper sparse"
+        )
     if overwrite:
         extend.refuse_discarding(output_path)
 
@@ -175,7 +195,9 @@ def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> 
 
 
 @contextmanager
-def one_stage(name: str, context: Context, *, overwrite: bool = False) -> Iterator[Context]:
+def one_stage(
+    name: str, context: Context, *, overwrite: bool = False
+) -> Iterator[Context]:
     """Lock the folder of a context for one stage, and bring its database up to date before."""
     is_first = name == "extract"
     discards = is_first and overwrite
@@ -196,7 +218,9 @@ def _context(
     """Return where a stage works and with what."""
     path = as_path(output_path, "output_path")
     if not (executor is None or callable(getattr(executor, "map", None))):
-        raise OptionError(f"executor={executor!r}: has no method 'map'; give an Executor")
+        raise OptionError(
+            f"executor={executor!r}: has no method 'map'; give an Executor"
+        )
     if path.is_file():
         wanted = "give the output folder of a run; map_database and verify_matches take databases"
         raise OptionError(f"output_path={str(path)!r}: is a file; {wanted}")
@@ -234,7 +258,9 @@ def extract(
     later = options.later_stages()
     context = _context(output_path, progress, options.resources, executor)
     with one_stage("extract", context, overwrite=overwrite):
-        report = extract_features(context, inputs, options.recipe, later=later, overwrite=overwrite)
+        report = extract_features(
+            context, inputs, options.recipe, later=later, overwrite=overwrite
+        )
         if options.database_descriptors:
             fill_descriptors(context.workspace.database, context.features)
     return report
@@ -339,7 +365,9 @@ def map_images(
     chosen = None if mapping is None else _mapper_of(mapping)
     with one_stage("map", _context(output_path, progress, by_hand=by_hand)) as context:
         mapper = chosen or MAPPERS.make(context.mapping)
-        return map_and_report(context, mapper, extension, overwrite=overwrite, page=page)
+        return map_and_report(
+            context, mapper, extension, overwrite=overwrite, page=page
+        )
 
 
 def map_database(  # noqa: PLR0913 (all but two are keywords)
@@ -397,7 +425,10 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
     chosen = VerificationOptions.given(verification, "verification")
     extension = as_extension(extend)
     _check_foreign(context, foreign, mapper, extension, overwrite=overwrite)
-    with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
+    with (
+        context.workspace.locked(),
+        watched(context, follows=False, discards=overwrite),
+    ):
         report = copy_verified(context, foreign, chosen, overwrite=overwrite)
         return map_and_report(context, mapper, extension, earlier=[report], page=page)
 
@@ -440,15 +471,21 @@ def map_and_report(
     options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
-    sizes = {name: (one.width, one.height) for name, one in context.graph.cameras.items()}
+    sizes = {
+        name: (one.width, one.height) for name, one in context.graph.cameras.items()
+    }
     marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
-    lost = dict.fromkeys(gone, "is gone since its features were extracted; these are used")
+    lost = dict.fromkeys(
+        gone, "is gone since its features were extracted; these are used"
+    )
     report = replace(report, warnings={**report.warnings, **lost})
     copied = workspace.is_foreign
     verified = context.num_verified_inliers()
-    pair_inliers = {pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)}
+    pair_inliers = {
+        pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)
+    }
     missing = unregistered(context, names, models, pair_inliers)
     again = matched_again(context)
     strongest = max(pair_inliers.values(), default=0)
@@ -457,7 +494,9 @@ def map_and_report(
         images_total=len(names),
         unregistered=missing,
         models=tuple(models),
-        num_pairs=num_matched_pairs(workspace.database) if copied else len(context.listed_pairs()),
+        num_pairs=num_matched_pairs(workspace.database)
+        if copied
+        else len(context.listed_pairs()),
         num_verified_pairs=len(pair_inliers),
         stages=summed((*earlier, report)),
         recipe="" if copied else workspace.recipe(),
@@ -480,12 +519,16 @@ def map_and_report(
     if page:
         pictures = draw_pairs_to_check(context, result, pair_inliers)
         cameras = context.graph.cameras
-        content = RunContent(names, pair_inliers, workspace.photographs(), marks, pictures, cameras)
+        content = RunContent(
+            names, pair_inliers, workspace.photographs(), marks, pictures, cameras
+        )
         write_run_page(workspace, result, content, context.progress)
     return result
 
 
-def _names_and_gone(context: Context, *, may_be_gone: bool) -> tuple[list[str], list[str]]:
+def _names_and_gone(
+    context: Context, *, may_be_gone: bool
+) -> tuple[list[str], list[str]]:
     """Return the names of all photographs, and which are gone since they had features.
 
     ImageError where none may be gone.
@@ -496,5 +539,7 @@ def _names_and_gone(context: Context, *, may_be_gone: bool) -> tuple[list[str], 
     gone = sorted(set(context.features.names()) - set(names))
     if gone and not may_be_gone:
         path = context.inputs.image_path
-        raise ImageError(f"{path}: {gone[0]} has features, and is gone; run extract again")
+        raise ImageError(
+            f"{path}: {gone[0]} has features, and is gone; run extract again"
+        )
     return sorted({*names, *gone}), gone

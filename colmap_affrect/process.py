@@ -24,7 +24,9 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.parallel.subprocesses import end_with
 
-PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
+PATIENCE_S = (
+    4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
+)
 WITHOUT_MEMORY = " (perhaps for want of memory)"
 KEPT = (
     "run.log may say why, and what was done before is kept: run the same command again, or "
@@ -39,8 +41,12 @@ ENDED = b"e"
 def run_command() -> NoReturn:
     """Run the command line in a process of its own, where the system can do that, and end."""
     _open_standard_streams()
-    os.umask(os.umask(0) & 0o077)  # of one that takes rights from the owner, results are lost
-    if sys.platform != "linux":  # elsewhere libraries of the system do not survive a fork
+    os.umask(
+        os.umask(0) & 0o077
+    )  # of one that takes rights from the owner, results are lost
+    if (
+        sys.platform != "linux"
+    ):  # elsewhere libraries of the system do not survive a fork
         _work()
     signals: list[int] = []
 
@@ -55,7 +61,9 @@ def run_command() -> NoReturn:
         signals.append(number)
 
     parent = os.getpid()
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # else nobody could wait for the worker
+    signal.signal(
+        signal.SIGCHLD, signal.SIG_DFL
+    )  # else nobody could wait for the worker
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     news = _News()
     try:
@@ -71,8 +79,15 @@ def run_command() -> NoReturn:
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     code = os.waitstatus_to_exitcode(status)
-    if code > 0 and code != EXIT_INTERRUPTED and not signals and ENDED not in news.heard():
-        say(f"error: native code ended the command with exit code {code}{WITHOUT_MEMORY}; {KEPT}")
+    if (
+        code > 0
+        and code != EXIT_INTERRUPTED
+        and not signals
+        and ENDED not in news.heard()
+    ):
+        say(
+            f"error: native code ended the command with exit code {code}{WITHOUT_MEMORY}; {KEPT}"
+        )
     sys.exit(_exit_code(code, signals))
 
 
@@ -211,7 +226,9 @@ def _end(code: int | str | None) -> NoReturn:
         if sys.stdout:  # it may have been closed
             sys.stdout.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it again
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # Python flushes it again
         if not code and not isinstance(error, BrokenPipeError):
             say(f"error: what the command prints cannot be written ({error.strerror})")
             code = 1

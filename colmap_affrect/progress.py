@@ -18,19 +18,28 @@ NUM_PLAIN_LINES = 10
 COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 """Of an image or a pair in a stage, in the time of an image in ``extract``: measured on runs
 of 8 to 1000 photographs, good for a factor of 2."""
-MIN_ELAPSED_S = 3.0  # of a stage: before, it has loaded files and networks, and says too little
+MIN_ELAPSED_S = (
+    3.0  # of a stage: before, it has loaded files and networks, and says too little
+)
 
 
 class Forecast:
     """What is left of a row of stages: the one that runs is measured, others guessed from it."""
 
     def __init__(
-        self, num_images: int, num_pairs: int, clock: Callable[[], float] = time.monotonic
+        self,
+        num_images: int,
+        num_pairs: int,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Take what is ahead if all images are new."""
         units = {"extract": num_images, "match": num_pairs, "verify": num_pairs}
-        units["map"] = num_images + num_images**2 // 50  # adjustments grow with the model
-        self._costs = {name: COSTS[name] * count for name, count in units.items()}  # ahead
+        units["map"] = (
+            num_images + num_images**2 // 50
+        )  # adjustments grow with the model
+        self._costs = {
+            name: COSTS[name] * count for name, count in units.items()
+        }  # ahead
         self._cost = self._start_s = 0.0  # of the stage that runs
         self._clock = clock
 
@@ -48,7 +57,9 @@ class Forecast:
         elapsed_s = self._clock() - self._start_s
         if not (frac and self._cost and self._costs) or elapsed_s < MIN_ELAPSED_S:
             return ""
-        left = (1 - frac) + sum(self._costs.values()) / self._cost  # in units of this stage
+        left = (1 - frac) + sum(
+            self._costs.values()
+        ) / self._cost  # in units of this stage
         minutes = elapsed_s / frac * left / 60
         if minutes < 1:
             return ""
@@ -131,7 +142,10 @@ class Progress:
         if stream is None or total == 0:
             yield lambda _: None
         elif self.takes_bars:
-            with tqdm(total=total, desc=title, unit=unit, file=stream) as bar, _ticking(bar):
+            with (
+                tqdm(total=total, desc=title, unit=unit, file=stream) as bar,
+                _ticking(bar),
+            ):
 
                 def advance(count: int) -> None:
                     bar.set_postfix_str(left(count), refresh=False)
@@ -191,4 +205,6 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            self.seconds[name] = (
+                self.seconds.get(name, 0.0) + time.perf_counter() - start
+            )

@@ -27,9 +27,15 @@ from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions, IdentityOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
 
-AnyRectifier = Annotated[SerializeAsAny[RectifierOptions], BeforeValidator(RECTIFIERS.options)]
-AnyFeatures = Annotated[SerializeAsAny[FeatureOptions], BeforeValidator(EXTRACTORS.options)]
-AnyMatcher = Annotated[SerializeAsAny[MatcherOptions], BeforeValidator(MATCHERS.options)]
+AnyRectifier = Annotated[
+    SerializeAsAny[RectifierOptions], BeforeValidator(RECTIFIERS.options)
+]
+AnyFeatures = Annotated[
+    SerializeAsAny[FeatureOptions], BeforeValidator(EXTRACTORS.options)
+]
+AnyMatcher = Annotated[
+    SerializeAsAny[MatcherOptions], BeforeValidator(MATCHERS.options)
+]
 AnyMapper = Annotated[SerializeAsAny[MapperOptions], BeforeValidator(MAPPERS.options)]
 ImageSize = Annotated[int, within(16, 1_000_000)]
 
@@ -142,7 +148,9 @@ class ExtractionOptions(Options):
         for level in self.levels:
             if level.rectifier.uses_depth:
                 name = level.rectifier.name
-                raise OptionError(f"rectifier {name} needs depth maps: give --depth-path FOLDER")
+                raise OptionError(
+                    f"rectifier {name} needs depth maps: give --depth-path FOLDER"
+                )
 
     def matchers(self, matching: MatcherOptions) -> tuple[MatcherOptions, ...]:
         """Return the matcher of each level, ``matching`` where it has none of its own.
@@ -162,7 +170,9 @@ class ExtractionOptions(Options):
     @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights of all levels, sorted."""
-        return tuple(sorted(set[str]().union(*(level.weights for level in self.levels))))
+        return tuple(
+            sorted(set[str]().union(*(level.weights for level in self.levels)))
+        )
 
 
 class EscalateOptions(Options):
@@ -200,7 +210,9 @@ class Recipe(ExtractionOptions):
     def extraction(self) -> ExtractionOptions:
         """The options that decide the features of an image."""
         values = dict(self)
-        return ExtractionOptions(**{name: values[name] for name in ExtractionOptions.model_fields})
+        return ExtractionOptions(
+            **{name: values[name] for name in ExtractionOptions.model_fields}
+        )
 
     @property
     def required_weights(self) -> tuple[str, ...]:
@@ -222,7 +234,9 @@ class Recipe(ExtractionOptions):
             found["map"] = self.mapper_options("sparse")
         return found
 
-    def mapper_options(self, preset: str, name: str = "", **values: Any) -> MapperOptions:
+    def mapper_options(
+        self, preset: str, name: str = "", **values: Any
+    ) -> MapperOptions:
         """Return the options of a mapper.
 
         Args:
@@ -259,7 +273,9 @@ def as_recipe(given: Any) -> Recipe:
         return load_recipe(str(given))
     if isinstance(given, Mapping):
         return Recipe(**given)
-    raise OptionError(f"recipe={given!r}: give a Recipe, a name, a path or a dictionary")
+    raise OptionError(
+        f"recipe={given!r}: give a Recipe, a name, a path or a dictionary"
+    )
 
 
 GivenRecipe = Annotated[Recipe, BeforeValidator(as_recipe)]
@@ -267,7 +283,9 @@ GivenRecipe = Annotated[Recipe, BeforeValidator(as_recipe)]
 
 
 @checks_arguments
-def load_recipe(name: str | PathLike[str], settings: str | Sequence[str] = ()) -> Recipe:
+def load_recipe(
+    name: str | PathLike[str], settings: str | Sequence[str] = ()
+) -> Recipe:
     """Load a recipe by its name or the path of a TOML file, and change single options.
 
     ``settings`` are ``section.option=value`` with a TOML value; strings may go without quotes.
@@ -276,7 +294,9 @@ def load_recipe(name: str | PathLike[str], settings: str | Sequence[str] = ()) -
     """
     name = name if isinstance(name, str) else str(as_path(name))
     values = _read_recipe(name)
-    changed = with_settings(values, [settings] if isinstance(settings, str) else settings)
+    changed = with_settings(
+        values, [settings] if isinstance(settings, str) else settings
+    )
     return Recipe.from_mapping({**changed, "name": name}, f"recipe {name}")
 
 
@@ -292,7 +312,11 @@ def _read_recipe(name: str) -> dict[str, Any]:
         return tomllib.loads(read_regular_text(path, "utf-8-sig"))
     except FileNotFoundError as error:
         raise OptionError(f"recipe {name}: no such file") from error
-    except (OSError, ValueError, RecursionError) as error:  # what tomllib raises on odd files
+    except (
+        OSError,
+        ValueError,
+        RecursionError,
+    ) as error:  # what tomllib raises on odd files
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
 
 

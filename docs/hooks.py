@@ -18,7 +18,8 @@ from colmap_affrect.stages.one_image import prepare
 
 OUTSIDE = {"README.md": "index.md"}
 OUTSIDE |= {
-    name: name for name in ("ARCHITECTURE.md", "BENCHMARKS.md", "CHANGELOG.md", "CONTRIBUTING.md")
+    name: name
+    for name in ("ARCHITECTURE.md", "BENCHMARKS.md", "CHANGELOG.md", "CONTRIBUTING.md")
 }
 PHOTOGRAPH = "sample_scenes/facade/images/view_3_tilt45.jpg"
 """One plane, seen at 45 degrees."""
@@ -29,8 +30,13 @@ def on_files(files: Files, config: Any) -> Files:
     root = Path(config.config_file_path).parent
     for source, target in OUTSIDE.items():
         text = (root / source).read_text(encoding="utf-8")
-        files.append(File.generated(config, target, content=text.replace("](docs/", "](")))
-    for name, text in {"commands.md": commands_page(), "functions.md": functions_page()}.items():
+        files.append(
+            File.generated(config, target, content=text.replace("](docs/", "]("))
+        )
+    for name, text in {
+        "commands.md": commands_page(),
+        "functions.md": functions_page(),
+    }.items():
         files.append(File.generated(config, name, content=text))
     page, pictures = recipes_page(root / PHOTOGRAPH)
     files.append(File.generated(config, "recipes.md", content=page))
@@ -49,8 +55,12 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 def commands_page() -> str:
     """Return what each command says with --help."""
     os.environ["COLUMNS"] = "100"
-    (choices,) = (a.choices for a in build_parser()._actions if isinstance(a.choices, dict))
-    parts = [f"## {name}\n\n```text\n{choices[name].format_help()}```\n" for name in COMMANDS]
+    (choices,) = (
+        a.choices for a in build_parser()._actions if isinstance(a.choices, dict)
+    )
+    parts = [
+        f"## {name}\n\n```text\n{choices[name].format_help()}```\n" for name in COMMANDS
+    ]
     return "# Commands\n\n" + "\n".join(parts)
 
 

@@ -24,10 +24,15 @@ FOUND, LOST = "#2a9d4b", "#e8710a"
 
 def main() -> None:
     models = {
-        name: pycolmap.Reconstruction(Path(sys.argv[1], "methods", name, "seed-0", "sparse", "0"))
+        name: pycolmap.Reconstruction(
+            Path(sys.argv[1], "methods", name, "seed-0", "sparse", "0")
+        )
         for name in ("sift-colmap", "default")
     }
-    names = {key: {image.name for image in model.images.values()} for key, model in models.items()}
+    names = {
+        key: {image.name for image in model.images.values()}
+        for key, model in models.items()
+    }
     photographs = sorted((ROOT / "sample_scenes/courtyard/images").glob("*.jpg"))
     figure = plt.figure(figsize=(10, 5.2), dpi=110)
     figure.subplots_adjust(0.01, 0.0, 0.99, 0.94, wspace=0.06, hspace=0.25)
@@ -37,7 +42,9 @@ def main() -> None:
     ):
         for column, path in enumerate(photographs):
             axes = figure.add_subplot(grid[row, column], xticks=[], yticks=[])
-            axes.imshow(plt.imread(path), alpha=1.0 if path.name in names[key] else 0.45)
+            axes.imshow(
+                plt.imread(path), alpha=1.0 if path.name in names[key] else 0.45
+            )
             color = FOUND if path.name in names[key] else LOST
             plt.setp(axes.spines.values(), color=color, linewidth=3)
             if not column:
@@ -47,11 +54,17 @@ def main() -> None:
     figure.savefig(ROOT / "docs/picture.jpg", pil_kwargs={"quality": 85})
 
 
-def draw_model(axes: plt.Axes, model: pycolmap.Reconstruction, by_sift: set[str]) -> None:
+def draw_model(
+    axes: plt.Axes, model: pycolmap.Reconstruction, by_sift: set[str]
+) -> None:
     """Draw points and cameras, seen from behind the photographers and above."""
     images = list(model.images.values())
-    down = np.mean([image.cam_from_world().rotation.matrix()[1] for image in images], axis=0)
-    ahead = np.mean([image.cam_from_world().rotation.matrix()[2] for image in images], axis=0)
+    down = np.mean(
+        [image.cam_from_world().rotation.matrix()[1] for image in images], axis=0
+    )
+    ahead = np.mean(
+        [image.cam_from_world().rotation.matrix()[2] for image in images], axis=0
+    )
     down /= np.linalg.norm(down)
     ahead -= (ahead @ down) * down
     ahead /= np.linalg.norm(ahead)
@@ -62,12 +75,21 @@ def draw_model(axes: plt.Axes, model: pycolmap.Reconstruction, by_sift: set[str]
     axes.scatter(*places.T, s=2.5, c=colors, linewidths=0)
     depth = np.median([np.linalg.norm(image.projection_center()) for image in images])
     for image in images:
-        rotation, center = image.cam_from_world().rotation.matrix(), image.projection_center()
-        x, y = np.array([[-1, 1, 1, -1, -1], [-0.75, -0.75, 0.75, 0.75, -0.75]]) * 0.05 * depth
+        rotation, center = (
+            image.cam_from_world().rotation.matrix(),
+            image.projection_center(),
+        )
+        x, y = (
+            np.array([[-1, 1, 1, -1, -1], [-0.75, -0.75, 0.75, 0.75, -0.75]])
+            * 0.05
+            * depth
+        )
         corners = center + np.stack([x, y, np.full(5, 0.14 * depth)], axis=1) @ rotation
         lines = np.concatenate([[point, center, point] for point in corners])
         shown = np.concatenate([corners, lines]) @ plane.T
-        axes.plot(*shown.T, color=FOUND if image.name in by_sift else "#d21f3c", linewidth=1.3)
+        axes.plot(
+            *shown.T, color=FOUND if image.name in by_sift else "#d21f3c", linewidth=1.3
+        )
     cameras = np.array([image.projection_center() for image in images]) @ plane.T
     low = np.minimum(np.percentile(places, 2, axis=0), cameras.min(axis=0))
     high = np.maximum(np.percentile(places, 98, axis=0), cameras.max(axis=0))

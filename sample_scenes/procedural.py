@@ -183,9 +183,14 @@ def masonry(
     wobble_y = (noise(rng, shape, 0.25 * ppm) * 0.005 * ppm).astype(np.float32)
     map_y, map_x = np.indices(shape, dtype=np.float32)
     maps = (map_x + wobble_x, map_y + wobble_y)
-    distance = cv2.remap(distance, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    distance = cv2.remap(
+        distance, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     labels = cv2.remap(
-        labels.astype(np.float32), *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+        labels.astype(np.float32),
+        *maps,
+        cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_REPLICATE,
     ).astype(np.int32)
 
     count = int(labels.max()) + 1
@@ -230,8 +235,13 @@ def plaster(
     shape = under.color.shape[:2]
     cloud = noise(rng, shape, 1.6 * ppm, gain=0.65)
     fine = noise(rng, shape, 0.1 * ppm, gain=0.85)
-    tint = noise(rng, shape, 0.8 * ppm)[..., None] * np.array([0.03, 0.008, -0.02], np.float32)
-    coat = np.asarray(base, np.float32) * (1 + (0.07 * cloud + 0.022 * fine)[..., None]) + tint
+    tint = noise(rng, shape, 0.8 * ppm)[..., None] * np.array(
+        [0.03, 0.008, -0.02], np.float32
+    )
+    coat = (
+        np.asarray(base, np.float32) * (1 + (0.07 * cloud + 0.022 * fine)[..., None])
+        + tint
+    )
     repair = smoothstep(noise(rng, shape, 1.2 * ppm, gain=0.5), 1.25, 1.32)[..., None]
     coat = coat * (1 - repair * np.array([0.12, 0.14, 0.16], np.float32))
     edge = noise(rng, shape, 1.3 * ppm, gain=0.62)
@@ -242,11 +252,19 @@ def plaster(
     return Surface(np.clip(color, 0, 1).astype(np.float32), ppm)
 
 
-def _cracks(rng: np.random.Generator, shape: tuple[int, int], ppm: float, count: int) -> Array:
+def _cracks(
+    rng: np.random.Generator, shape: tuple[int, int], ppm: float, count: int
+) -> Array:
     """Draw random walks with branches; return their opacity in 0..1."""
     canvas = np.zeros(shape, np.uint8)
     for _ in range(count):
-        walks = [(rng.uniform(0, shape[1]), rng.uniform(0, shape[0]), rng.uniform(0, 2 * np.pi))]
+        walks = [
+            (
+                rng.uniform(0, shape[1]),
+                rng.uniform(0, shape[0]),
+                rng.uniform(0, 2 * np.pi),
+            )
+        ]
         for branch in range(3):
             if branch >= len(walks):
                 break
@@ -308,7 +326,9 @@ class Painter:
 
     def tone(self, color: Color, spread: float = 0.08) -> Color:
         """Vary a colour (0..1) randomly and scale it to 0..255."""
-        b, g, r = np.clip(np.asarray(color) * (1 + spread * self.rng.standard_normal()), 0, 1)
+        b, g, r = np.clip(
+            np.asarray(color) * (1 + spread * self.rng.standard_normal()), 0, 1
+        )
         return float(b * 255), float(g * 255), float(r * 255)
 
     def polygon(self, points: Sequence[tuple[float, float]], color: Color) -> None:
@@ -321,7 +341,11 @@ class Painter:
         self.polygon([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], color)
 
     def line(
-        self, start: tuple[float, float], end: tuple[float, float], color: Color, width: float
+        self,
+        start: tuple[float, float],
+        end: tuple[float, float],
+        color: Color,
+        width: float,
     ) -> None:
         """Draw a line with a width in metres."""
         cv2.line(
@@ -346,7 +370,11 @@ class Painter:
 
     def text(self, text: str, x: float, y: float, height: float, color: Color) -> None:
         """Write text with its baseline at (x, y) in metres."""
-        fonts = (cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX)
+        fonts = (
+            cv2.FONT_HERSHEY_TRIPLEX,
+            cv2.FONT_HERSHEY_DUPLEX,
+            cv2.FONT_HERSHEY_COMPLEX,
+        )
         font = fonts[int(self.rng.integers(len(fonts)))]
         size = height * self.surface.ppm
         cv2.putText(
@@ -368,10 +396,14 @@ class Painter:
         after = self.canvas.astype(np.float32) / 255
         changed = np.abs(after - before).max(axis=2, keepdims=True) > 2 / 255
         grain = 1 + 0.05 * noise(self.rng, shape, 0.08 * ppm, gain=0.8)[..., None]
-        worn = smoothstep(noise(self.rng, shape, 0.4 * ppm, gain=0.75), 1.5, 2.0)[..., None]
+        worn = smoothstep(noise(self.rng, shape, 0.4 * ppm, gain=0.75), 1.5, 2.0)[
+            ..., None
+        ]
         keep = np.clip(wear + 0.7 * worn, 0, 1)
         painted = after * grain * (1 - keep) + before * keep
-        self.surface.color = np.where(changed, np.clip(painted, 0, 1), before).astype(np.float32)
+        self.surface.color = np.where(changed, np.clip(painted, 0, 1), before).astype(
+            np.float32
+        )
 
 
 def rosette(painter: Painter, x: float, y: float, radius: float, color: Color) -> None:
@@ -386,7 +418,9 @@ def rosette(painter: Painter, x: float, y: float, radius: float, color: Color) -
         angle = start + 2 * np.pi * petal / petals
         reach = radius * rng.uniform(0.5, 0.6)
         px, py = x + reach * np.cos(angle), y + reach * np.sin(angle)
-        painter.disc(px, py, radius * rng.uniform(0.16, 0.27), painter.tone(color, 0.12))
+        painter.disc(
+            px, py, radius * rng.uniform(0.16, 0.27), painter.tone(color, 0.12)
+        )
         painter.disc(px, py, radius * 0.08, painter.tone(dark))
     painter.disc(x, y, radius * rng.uniform(0.15, 0.3), painter.tone(color))
     painter.disc(x, y, radius * 0.09, painter.tone(dark))
@@ -421,12 +455,20 @@ def window(
             bottom = min(top + rng.uniform(0.16, 0.34), y + height)
             reach = half + jamb + rng.choice([0.0, 0.09])
             painter.box(
-                x + side * half, top, x + side * reach, bottom - 0.012, painter.tone(stone, 0.13)
+                x + side * half,
+                top,
+                x + side * reach,
+                bottom - 0.012,
+                painter.tone(stone, 0.13),
             )
             top = bottom
     _lintel(painter, x, y, half + jamb, stone, arched)
     painter.box(
-        x - half - 0.25, y + height, x + half + 0.25, y + height + 0.12, painter.tone(stone)
+        x - half - 0.25,
+        y + height,
+        x + half + 0.25,
+        y + height + 0.12,
+        painter.tone(stone),
     )
     painter.box(
         x - half - 0.2,
@@ -444,7 +486,13 @@ def window(
             left = x - half + 0.04 + column * pane_w
             top = y + 0.04 + line * pane_h
             glass = painter.tone((0.2, 0.17, 0.14), 0.35)
-            painter.box(left + 0.02, top + 0.02, left + pane_w - 0.02, top + pane_h - 0.02, glass)
+            painter.box(
+                left + 0.02,
+                top + 0.02,
+                left + pane_w - 0.02,
+                top + pane_h - 0.02,
+                glass,
+            )
             if rng.random() < 0.45:
                 drop = rng.uniform(0.3, 0.9)
                 painter.polygon(
@@ -458,7 +506,9 @@ def window(
     painter.box(x - half, y, x + half, y + 0.05, painter.tone((0.08, 0.08, 0.08)))
 
 
-def _lintel(painter: Painter, x: float, y: float, reach: float, stone: Color, arched: bool) -> None:
+def _lintel(
+    painter: Painter, x: float, y: float, reach: float, stone: Color, arched: bool
+) -> None:
     """Paint the stones above an opening, straight or as an arch around a carved field."""
     rng = painter.rng
     if not arched:
@@ -476,21 +526,35 @@ def _lintel(painter: Painter, x: float, y: float, reach: float, stone: Color, ar
             )
             left = right
         return
-    borders = np.sort(np.concatenate([[np.pi, 2 * np.pi], rng.uniform(np.pi, 2 * np.pi, 9)]))
+    borders = np.sort(
+        np.concatenate([[np.pi, 2 * np.pi], rng.uniform(np.pi, 2 * np.pi, 9)])
+    )
     painter.polygon(
-        [(x + reach * np.cos(a), y + reach * np.sin(a)) for a in np.linspace(np.pi, 2 * np.pi, 40)],
+        [
+            (x + reach * np.cos(a), y + reach * np.sin(a))
+            for a in np.linspace(np.pi, 2 * np.pi, 40)
+        ],
         painter.tone(stone, 0.05),
     )
     for start, end in itertools.pairwise(borders):
         angles = np.linspace(start, max(start, end - 0.015), 8)
         outer = [(x + reach * np.cos(a), y + reach * np.sin(a)) for a in angles]
-        inner = [(x + reach * 0.74 * np.cos(a), y + reach * 0.74 * np.sin(a)) for a in angles[::-1]]
+        inner = [
+            (x + reach * 0.74 * np.cos(a), y + reach * 0.74 * np.sin(a))
+            for a in angles[::-1]
+        ]
         painter.polygon(outer + inner, painter.tone(stone, 0.15))
     rosette(painter, x, y - reach * 0.36, reach * 0.31, stone)
 
 
 def door(
-    painter: Painter, x: float, y: float, width: float, height: float, wood: Color, stone: Color
+    painter: Painter,
+    x: float,
+    y: float,
+    width: float,
+    height: float,
+    wood: Color,
+    stone: Color,
 ) -> None:
     """Paint an arched door of uneven planks with iron bands and nails."""
     rng = painter.rng
@@ -502,7 +566,11 @@ def door(
             bottom = min(top + rng.uniform(0.2, 0.45), y + height)
             reach = half + 0.2 + rng.choice([0.0, 0.12])
             painter.box(
-                x + side * half, top, x + side * reach, bottom - 0.015, painter.tone(stone, 0.14)
+                x + side * half,
+                top,
+                x + side * reach,
+                bottom - 0.015,
+                painter.tone(stone, 0.14),
             )
             top = bottom
     _lintel(painter, x, y, half + 0.2, stone, True)
@@ -531,7 +599,9 @@ def door(
         )
         for nail in np.arange(x - half + 0.06, x + half * 0.5, 0.11):
             painter.disc(nail, band + 0.035, 0.015, painter.tone((0.4, 0.42, 0.45)))
-    painter.disc(x + half * 0.7, y + height * 0.52, 0.06, painter.tone((0.15, 0.3, 0.4)))
+    painter.disc(
+        x + half * 0.7, y + height * 0.52, 0.06, painter.tone((0.15, 0.3, 0.4))
+    )
 
 
 POSTER_WORDS = (
@@ -556,7 +626,9 @@ POSTER_WORDS = (
 )
 
 
-def poster(painter: Painter, x: float, y: float, width: float, height: float, word: str) -> None:
+def poster(
+    painter: Painter, x: float, y: float, width: float, height: float, word: str
+) -> None:
     """Paint a poster with a headline, random shapes and lines of small print."""
     rng = painter.rng
     paper = tuple(rng.uniform(0.45, 0.92, 3))
@@ -578,7 +650,9 @@ def poster(painter: Painter, x: float, y: float, width: float, height: float, wo
         size = width * rng.uniform(0.06, 0.2)
         corners = int(rng.integers(3, 12))
         angles = np.sort(rng.uniform(0, 2 * np.pi, corners))
-        painter.polygon([(cx + size * np.cos(a), cy + size * np.sin(a)) for a in angles], ink)
+        painter.polygon(
+            [(cx + size * np.cos(a), cy + size * np.sin(a)) for a in angles], ink
+        )
     ink = painter.tone(tuple(rng.uniform(0.02, 0.35, 3)))
     letter = min(0.22 * height, 1.15 * width / max(len(word), 4))
     painter.text(word, x + 0.06 * width, y + 0.08 * height + letter, letter, ink)
@@ -587,11 +661,15 @@ def poster(painter: Painter, x: float, y: float, width: float, height: float, wo
         left = x + 0.1 * width
         while left < x + 0.85 * width:
             right = left + width * rng.uniform(0.03, 0.16)
-            painter.line((left, level), (min(right, x + 0.9 * width), level), ink, 0.012)
+            painter.line(
+                (left, level), (min(right, x + 0.9 * width), level), ink, 0.012
+            )
             left = right + 0.03 * width
 
 
-def frieze(painter: Painter, x0: float, x1: float, y: float, height: float, stone: Color) -> None:
+def frieze(
+    painter: Painter, x0: float, x1: float, y: float, height: float, stone: Color
+) -> None:
     """Paint a band of carved panels, each with another ornament."""
     rng = painter.rng
     painter.box(x0, y - 0.06, x1, y, painter.tone(stone, 0.03))
@@ -628,7 +706,11 @@ def frieze(painter: Painter, x0: float, x1: float, y: float, height: float, ston
         else:
             angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 8))))
             painter.polygon(
-                [(middle + size * np.cos(a), centre + size * np.sin(a)) for a in angles], dark
+                [
+                    (middle + size * np.cos(a), centre + size * np.sin(a))
+                    for a in angles
+                ],
+                dark,
             )
             painter.disc(middle, centre, size * 0.3, tone)
         left = right
@@ -666,11 +748,17 @@ def leaves(
             upwards = np.cumsum(rng.uniform(0.02, 0.11, steps))
             stems.append(np.stack([root_x + sideways, root_y - upwards], axis=1))
         places = np.concatenate(stems)
-        chosen = places[rng.integers(0, len(places), count)] + rng.normal(0, 0.06, (count, 2))
+        chosen = places[rng.integers(0, len(places), count)] + rng.normal(
+            0, 0.06, (count, 2)
+        )
         for order, (x, y) in enumerate(chosen):
             depth = 0.45 + 0.75 * order / count
-            color = painter.tone((base[0] * depth, base[1] * depth, base[2] * depth), 0.22)
-            axes = np.round(rng.uniform(0.02, 0.05, 2) * painter.surface.ppm).astype(int)
+            color = painter.tone(
+                (base[0] * depth, base[1] * depth, base[2] * depth), 0.22
+            )
+            axes = np.round(rng.uniform(0.02, 0.05, 2) * painter.surface.ppm).astype(
+                int
+            )
             cv2.ellipse(
                 painter.canvas,
                 painter.surface.pixel(x, y),

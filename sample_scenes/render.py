@@ -98,7 +98,9 @@ class View:
     def calibration(self) -> Array:
         """Return the calibration matrix; (0, 0) is the corner of the first pixel."""
         width, height = self.size
-        return np.array([[self.focal, 0, width / 2], [0, self.focal, height / 2], [0, 0, 1.0]])
+        return np.array(
+            [[self.focal, 0, width / 2], [0, self.focal, height / 2], [0, 0, 1.0]]
+        )
 
     def from_plane(self, plane: Plane) -> Array:
         """Return the homography from (metres right, metres down, 1) to the image."""
@@ -158,7 +160,9 @@ def prepare(planes: Sequence[Plane], sun: Array = SUN) -> None:
 def _sample(plane: Plane, u: Array, v: Array, footprint: Array) -> Array:
     """Look up a plane's texture at positions in metres, blurred to a footprint in metres."""
     ppm = plane.surface.ppm
-    level = np.clip(np.log2(np.maximum(footprint * ppm, 1e-6)), 0, len(plane.pyramid) - 1)
+    level = np.clip(
+        np.log2(np.maximum(footprint * ppm, 1e-6)), 0, len(plane.pyramid) - 1
+    )
     result = np.zeros((len(u), 4), np.float32)
     for index in range(int(level.min()), min(int(level.max()) + 2, len(plane.pyramid))):
         weight = 1 - np.abs(level - index)
@@ -190,7 +194,9 @@ def _sky(view: View, x: Array, y: Array) -> Array:
     return np.asarray(low + blend * (high - low))
 
 
-def trace(view: View, planes: Sequence[Plane], xs: Array, ys: Array) -> tuple[Array, Array]:
+def trace(
+    view: View, planes: Sequence[Plane], xs: Array, ys: Array
+) -> tuple[Array, Array]:
     """Find the nearest plane along the rays through a grid of image positions.
 
     Args:
@@ -234,7 +240,8 @@ def _shade(view: View, planes: Sequence[Plane], xs: Array, ys: Array) -> Array:
         u, v, w = (h[row, 0] * px + h[row, 1] * py + h[row, 2] for row in range(3))
         u, v = u / w, v / w
         steps = [
-            np.hypot((h[0, k] - u * h[2, k]) / w, (h[1, k] - v * h[2, k]) / w) for k in range(2)
+            np.hypot((h[0, k] - u * h[2, k]) / w, (h[1, k] - v * h[2, k]) / w)
+            for k in range(2)
         ]
         footprint = spacing * np.maximum(*steps)
         result[chosen] = _sample(planes[number], u, v, footprint)
@@ -301,7 +308,10 @@ def _scratched(gray: Array, rng: np.random.Generator) -> Array:
         x, y = rng.uniform(0, cols), rng.uniform(0, rows)
         bend = rng.normal(0, 12, 2)
         length = rng.uniform(30, 220)
-        curve = [(x + bend[0] * t + bend[1] * t * t, y + length * t) for t in np.linspace(0, 1, 9)]
+        curve = [
+            (x + bend[0] * t + bend[1] * t * t, y + length * t)
+            for t in np.linspace(0, 1, 9)
+        ]
         cv2.polylines(
             marks,
             [np.round(np.array(curve) * 16).astype(np.int32)],
@@ -314,7 +324,12 @@ def _scratched(gray: Array, rng: np.random.Generator) -> Array:
     for _ in range(int(rng.integers(15, 40))):
         center = int(rng.integers(0, cols)), int(rng.integers(0, rows))
         cv2.circle(
-            marks, center, int(rng.integers(0, 2)), int(rng.integers(60, 200)), -1, cv2.LINE_AA
+            marks,
+            center,
+            int(rng.integers(0, 2)),
+            int(rng.integers(60, 200)),
+            -1,
+            cv2.LINE_AA,
         )
     opacity = marks.astype(np.float32) / 255
     return gray + opacity * (0.95 - gray)
@@ -348,7 +363,9 @@ def _quaternion(rotation: Array) -> Array:
     return quaternion if w >= 0 else -quaternion
 
 
-def write_model(path: Path, views: Sequence[View], planes: Sequence[Plane], single: bool) -> None:
+def write_model(
+    path: Path, views: Sequence[View], planes: Sequence[Plane], single: bool
+) -> None:
     """Write cameras, poses and a few surface points as a COLMAP text model.
 
     Args:
@@ -367,11 +384,13 @@ def write_model(path: Path, views: Sequence[View], planes: Sequence[Plane], sing
                 f"{width / 2:.6f} {height / 2:.6f}\n"
             )
         pose = " ".join(
-            f"{value:.12f}" for value in [*_quaternion(view.rotation), *view.translation]
+            f"{value:.12f}"
+            for value in [*_quaternion(view.rotation), *view.translation]
         )
         images.append(f"{number} {pose} {1 if single else number} {view.name}\n\n")
     (path / "cameras.txt").write_text(
-        "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + "".join(cameras), encoding="utf-8"
+        "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + "".join(cameras),
+        encoding="utf-8",
     )
     (path / "images.txt").write_text(
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# (no observations)\n"
@@ -393,7 +412,9 @@ def _surface_points(view: View, planes: Sequence[Plane]) -> list[str]:
     index, inverse = trace(view, planes, xs, ys)
     colors = _shade(view, planes, xs, ys)[..., 2::-1] * 255
     x, y = np.meshgrid(xs, ys)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(view.calibration).T
+    rays = (
+        np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(view.calibration).T
+    )
     lines = []
     for ray, depth, color in zip(
         rays[index >= 0], 1 / inverse[index >= 0], colors[index >= 0], strict=True
@@ -401,7 +422,9 @@ def _surface_points(view: View, planes: Sequence[Plane]) -> list[str]:
         if depth < 25:
             world = view.rotation.T @ (ray * depth) + view.center
             lines.append(
-                " ".join([*(f"{c:.4f}" for c in world), *(f"{c:.0f}" for c in color), "0"])
+                " ".join(
+                    [*(f"{c:.4f}" for c in world), *(f"{c:.0f}" for c in color), "0"]
+                )
             )
     return lines
 
@@ -430,7 +453,9 @@ def facade_planes() -> list[Plane]:
     rng = np.random.default_rng(11)
     width, height, ppm = 12.0, 8.0, 240.0
     shape = materials.texture_shape(width, height, ppm)
-    wall = materials.masonry(rng, shape, ppm, ASHLAR, course=(0.2, 0.36), stone=(0.3, 0.75))
+    wall = materials.masonry(
+        rng, shape, ppm, ASHLAR, course=(0.2, 0.36), stone=(0.3, 0.75)
+    )
     coat = materials.plaster(rng, wall, (0.56, 0.71, 0.8), fallen=0.85, cracks=16)
     plinth = round(5.6 * ppm)
     wall.color[:plinth] = coat.color[:plinth]
@@ -460,7 +485,9 @@ def facade_planes() -> list[Plane]:
         )
     ):
         materials.poster(painter, x, y, wide, high, materials.POSTER_WORDS[order])
-    materials.leaves(painter, [(9.6, 7.6), (11.6, 8.0), (1.7, 7.4), (0.2, 8.0)], 3.4, 650)
+    materials.leaves(
+        painter, [(9.6, 7.6), (11.6, 8.0), (1.7, 7.4), (0.2, 8.0)], 3.4, 650
+    )
     painter.finish()
     materials.weather(rng, wall)
     plane = Plane(
@@ -477,13 +504,22 @@ def facade_planes() -> list[Plane]:
 
 def facade_views() -> list[View]:
     """Return a frontal view of the facade and views with growing tilt from several sides."""
-    poses = [(0, 0, 0), (30, 10, 2), (45, 205, -3), (60, -25, 4), (70, 168, 0), (75, 8, -2)]
+    poses = [
+        (0, 0, 0),
+        (30, 10, 2),
+        (45, 205, -3),
+        (60, -25, 4),
+        (70, 168, 0),
+        (75, 8, -2),
+    ]
     views = []
     for number, (tilt, side, roll) in enumerate(poses, 1):
         sine, cosine = math.sin(math.radians(tilt)), math.cos(math.radians(tilt))
         around = math.radians(side)
         distance = 7.5 if tilt < 65 else 6.5
-        center = distance * np.array([sine * math.cos(around), -cosine, sine * math.sin(around)])
+        center = distance * np.array(
+            [sine * math.cos(around), -cosine, sine * math.sin(around)]
+        )
         views.append(
             View(
                 f"view_{number}_tilt{tilt:02d}.jpg",
@@ -509,7 +545,9 @@ def render_facade(path: Path) -> None:
     first = to_center @ views[0].from_plane(planes[0])
     for number, view in enumerate(views[1:], 2):
         homography = to_center @ view.from_plane(planes[0]) @ np.linalg.inv(first)
-        np.savetxt(path / f"H_1_{number}.txt", homography / homography[2, 2], fmt="%.12g")
+        np.savetxt(
+            path / f"H_1_{number}.txt", homography / homography[2, 2], fmt="%.12g"
+        )
     write_model(path / "ground_truth", views, planes, single=True)
 
 
@@ -566,7 +604,9 @@ def _plain_painter(
     return paint
 
 
-def _main_wall(rng: np.random.Generator, width: float, height: float) -> materials.Surface:
+def _main_wall(
+    rng: np.random.Generator, width: float, height: float
+) -> materials.Surface:
     """Build the long wall: brick under plaster, windows, a door, posters, ivy, a plinth."""
     ppm = 230.0
     shape = materials.texture_shape(width, height, ppm)
@@ -581,12 +621,21 @@ def _main_wall(rng: np.random.Generator, width: float, height: float) -> materia
         variation=0.13,
     )
     wall = materials.plaster(rng, brick, (0.58, 0.72, 0.79), fallen=0.55, cracks=26)
-    plinth = materials.masonry(rng, shape, ppm, ASHLAR, course=(0.25, 0.4), stone=(0.35, 0.9))
+    plinth = materials.masonry(
+        rng, shape, ppm, ASHLAR, course=(0.25, 0.4), stone=(0.35, 0.9)
+    )
     foot = round((height - 0.95) * ppm)
     wall.color[foot:] = plinth.color[foot:]
     painter = materials.Painter(rng, wall)
     materials.frieze(painter, 0, width, 2.35, 0.36, CARVED)
-    windows = ((1.1, True), (3.3, False), (5.6, True), (7.7, True), (10.0, False), (12.3, True))
+    windows = (
+        (1.1, True),
+        (3.3, False),
+        (5.6, True),
+        (7.7, True),
+        (10.0, False),
+        (12.3, True),
+    )
     for x, arched in windows:
         materials.window(painter, x, 0.85, 0.9, 1.2, CARVED, arched=arched)
     for x, arched in ((1.6, False), (4.3, False), (9.3, False), (12.5, False)):
@@ -650,7 +699,9 @@ def courtyard_planes() -> list[Plane]:
     planes += _box((-0.1, -0.35, 0), (2.0, 0.7, 0.17), 0, stone)
     planes += _box((-0.1, -0.2, 0), (1.7, 0.4, 0.34), 0, stone)
     planes += _box((-4.0, -2.2, 0), (0.45, 0.45, 1.1), -10, stone)
-    planes += _box((3.6, -2.6, 0), (1.3, 0.6, 0.5), 7, _plain_painter(rng, (0.3, 0.4, 0.48)))
+    planes += _box(
+        (3.6, -2.6, 0), (1.3, 0.6, 0.5), 7, _plain_painter(rng, (0.3, 0.4, 0.48))
+    )
     prepare(planes)
     return planes
 
@@ -678,7 +729,9 @@ def _walk_view(
     """
     azimuth, distance, height, aim = pose
     around = math.radians(azimuth)
-    center = np.array([aim + distance * math.sin(around), -distance * math.cos(around), height])
+    center = np.array(
+        [aim + distance * math.sin(around), -distance * math.cos(around), height]
+    )
     rotation = look_at(center, np.array([aim, 0.0, 1.6]), roll)
     return View(name, rotation, center, focal, size)
 
@@ -699,7 +752,9 @@ def courtyard_views() -> list[View]:
     views = []
     for number, pose in enumerate(poses, 1):
         roll = 1.5 * math.sin(3 * number)
-        view = _walk_view(f"court_{number}.jpg", pose, roll, focal=1080.0, size=(720, 540))
+        view = _walk_view(
+            f"court_{number}.jpg", pose, roll, focal=1080.0, size=(720, 540)
+        )
         views.append(
             replace(
                 view,
@@ -722,7 +777,9 @@ def historical_views() -> list[View]:
     sizes = [(704, 528), (680, 540), (720, 520), (640, 540), (720, 500), (680, 540), (700, 520),
              (720, 540)]  # fmt: skip
     views = []
-    for number, (pose, focal, size) in enumerate(zip(poses, focals, sizes, strict=True), 1):
+    for number, (pose, focal, size) in enumerate(
+        zip(poses, focals, sizes, strict=True), 1
+    ):
         roll = 1.5 * math.sin(2 * number)
         view = _walk_view(f"plate_{number}.jpg", pose, roll, focal, size)
         views.append(
@@ -742,7 +799,8 @@ def render_courtyard(path: Path) -> None:
         image = photograph(view, planes, np.random.default_rng([31, number]))
         write_jpeg(path / "courtyard" / "images" / view.name, image)
         write_depth(
-            path / "courtyard" / "depth" / f"{Path(view.name).stem}.png", depth_map(view, planes)
+            path / "courtyard" / "depth" / f"{Path(view.name).stem}.png",
+            depth_map(view, planes),
         )
     write_model(path / "courtyard" / "ground_truth", views, planes, single=True)
     views = historical_views()
@@ -750,12 +808,16 @@ def render_courtyard(path: Path) -> None:
         rng = np.random.default_rng([41, number])
         image = age(photograph(view, planes, rng), rng)
         write_jpeg(path / "courtyard_historical" / "images" / view.name, image)
-    write_model(path / "courtyard_historical" / "ground_truth", views, planes, single=False)
+    write_model(
+        path / "courtyard_historical" / "ground_truth", views, planes, single=False
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and render."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0] if __doc__ else None
+    )
     parser.add_argument(
         "--output-path",
         type=Path,

@@ -18,10 +18,12 @@ ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
 """Key of an element in WebDriver's JSON."""
 
 CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
+    "",
 )
 needs_chromium = pytest.mark.skipif(
-    not (CHROMIUM and shutil.which("chromedriver")), reason="Chromium or chromedriver is missing"
+    not (CHROMIUM and shutil.which("chromedriver")),
+    reason="Chromium or chromedriver is missing",
 )
 
 
@@ -45,7 +47,9 @@ class Browser:
 
     def run(self, script: str, *arguments: Any) -> Any:
         """Run a function body in the page and return what it returns."""
-        return _call(f"{self._address}/execute/sync", script=script, args=list(arguments))
+        return _call(
+            f"{self._address}/execute/sync", script=script, args=list(arguments)
+        )
 
     def click(self, selector: str) -> None:
         """Click as a person would: fails if the element is not visible."""
@@ -59,13 +63,20 @@ class Browser:
         """Click at a place of the window, px."""
         for kind in ("mousePressed", "mouseReleased"):
             self.command(
-                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=y,
+                button="left",
+                clickCount=1,
             )
 
     def key(self, name: str, *, is_ctrl: bool = False) -> None:
         """Press a key, called as in JavaScript."""
         for kind in ("rawKeyDown", "keyUp"):
-            self.command("Input.dispatchKeyEvent", type=kind, key=name, modifiers=2 * is_ctrl)
+            self.command(
+                "Input.dispatchKeyEvent", type=kind, key=name, modifiers=2 * is_ctrl
+            )
 
     def give_files(self, selector: str, *paths: Path) -> None:
         """Give files to an input, as if they had been chosen."""
@@ -87,14 +98,20 @@ class Browser:
 
     def log(self) -> list[str]:
         """What the console has said since the last call."""
-        return [entry["message"] for entry in _call(f"{self._address}/se/log", type="browser")]
+        return [
+            entry["message"]
+            for entry in _call(f"{self._address}/se/log", type="browser")
+        ]
 
 
 @contextmanager
 def chromium(profile: Path) -> Iterator[Browser]:
     """Start Chromium with a new profile folder, and end it."""
     driver = subprocess.Popen(
-        ["chromedriver", "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        ["chromedriver", "--port=0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
     )
     try:
         assert driver.stdout is not None

@@ -13,7 +13,14 @@ from typing import Any, NamedTuple
 
 from small_scene import INTRINSICS
 
-CAMERA = ["--camera-mode", "per-image", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS]
+CAMERA = [
+    "--camera-mode",
+    "per-image",
+    "--camera-model",
+    "PINHOLE",
+    "--camera-params",
+    INTRINSICS,
+]
 FAST = ["--recipe", "unrectified-rootsift", *CAMERA]
 
 

@@ -31,7 +31,9 @@ settings.register_profile(
     database=None,
     suppress_health_check=[HealthCheck.too_slow],
 )
-settings.register_profile("nightly", parent=settings.get_profile("ci"), max_examples=1000)
+settings.register_profile(
+    "nightly", parent=settings.get_profile("ci"), max_examples=1000
+)
 settings.load_profile("ci")
 
 

@@ -67,7 +67,10 @@ HARMS: tuple[Harm, ...] = (bits, header, zeros, noise, exchanged, spliced, cut, 
 
 
 def damage(
-    path: Path, chance: random.Random, harms: Sequence[Harm] = HARMS, others: Sequence[Path] = ()
+    path: Path,
+    chance: random.Random,
+    harms: Sequence[Harm] = HARMS,
+    others: Sequence[Path] = (),
 ) -> str:
     """Damage a file, or give it the content of another one; return what was done.
 
@@ -79,7 +82,9 @@ def damage(
     done = ""
     while data == before:
         if others and chance.randrange(len(harms) + 1) == 0:
-            other = chance.choice([other for other in others if other.name != path.name])
+            other = chance.choice(
+                [other for other in others if other.name != path.name]
+            )
             data = bytearray(other.read_bytes())
             done = f"content of {other.name}"
         else:

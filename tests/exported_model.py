@@ -13,7 +13,9 @@ SIZE = (160, 120)
 NAMES = ("a.png", "b.png", "side/c.png", "d.png")
 
 
-def write_model(folder: Path, camera_model: str = "SIMPLE_RADIAL") -> pycolmap.Reconstruction:
+def write_model(
+    folder: Path, camera_model: str = "SIMPLE_RADIAL"
+) -> pycolmap.Reconstruction:
     """Write a model of four images and sixty points, whose keypoints are exact."""
     rng = np.random.default_rng(3)
     model = pycolmap.Reconstruction()
@@ -32,7 +34,9 @@ def write_model(folder: Path, camera_model: str = "SIMPLE_RADIAL") -> pycolmap.R
         pose = pycolmap.Rigid3d(rotation, -rotation.matrix() @ center)
         poses.append(pose)
         keypoints = np.array([camera.img_from_cam(pose * point) for point in points])
-        image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=1, image_id=number)
+        image = pycolmap.Image(
+            name=name, keypoints=keypoints, camera_id=1, image_id=number
+        )
         model.add_image_with_trivial_frame(image, pose)
     for index, point in enumerate(points):
         track = pycolmap.Track()

@@ -107,12 +107,16 @@ class Files:
         self.features = folder / "features.h5"
         self.matches = folder / "matches.h5"
         self.database = folder / "new.db"
-        write_h5(self.features, {name: hloc_group(3 + n, n) for n, name in enumerate(NAMES)})
+        write_h5(
+            self.features, {name: hloc_group(3 + n, n) for n, name in enumerate(NAMES)}
+        )
         write_h5(self.matches, {"a.png/sub-b c.png": match_group([2, -1, 0])})
 
     def import_all(self, **options: Any) -> InterchangeReport:
         options = {"skip_verification": True, **options}
-        return import_h5(self.photos, self.features, self.matches, self.database, **options)
+        return import_h5(
+            self.photos, self.features, self.matches, self.database, **options
+        )
 
     def keypoints(self, name: str) -> Array:
         return read_database(self.database)[0][name]
@@ -121,11 +125,15 @@ class Files:
         return read_database(self.database)[1]
 
 
-def read_database(path: Path) -> tuple[dict[str, Array], dict[tuple[str, str], list[list[int]]]]:
+def read_database(
+    path: Path,
+) -> tuple[dict[str, Array], dict[tuple[str, str], list[list[int]]]]:
     """Keypoints by image, and matches by pair of sorted names."""
     with pycolmap.Database.open(path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        keypoints = {name: database.read_keypoints(image_id) for name, image_id in ids.items()}
+        keypoints = {
+            name: database.read_keypoints(image_id) for name, image_id in ids.items()
+        }
         pairs = {
             pair: database.read_matches(*(ids[name] for name in pair)).tolist()
             for pair in itertools.combinations(sorted(ids), 2)

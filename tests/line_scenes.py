@@ -29,7 +29,9 @@ class Building:
     focal: float = 1.0  # longer sides
     shift: float = 0.0  # of the principal point, down, longer sides
     # columns are the building's right, down and ahead in the camera's frame
-    rotation: Array = field(default_factory=lambda: turn(2, 3.0) @ turn(0, -12.0) @ turn(1, 35.0))
+    rotation: Array = field(
+        default_factory=lambda: turn(2, 3.0) @ turn(0, -12.0) @ turn(1, 35.0)
+    )
     num_each: int = 25  # edges of each direction
     noise_px: float = 0.4  # of the ends
     directions: tuple[int, ...] = (0, 1, 2)

@@ -14,7 +14,9 @@ from colmap_affrect.session.view_graph import ViewGraph
 
 SEED = 3
 
-WHOLE = CameraRecord(("a",), "given", 1300.0, size=(1024, 768), given=("focal", "distortion"))
+WHOLE = CameraRecord(
+    ("a",), "given", 1300.0, size=(1024, 768), given=("focal", "distortion")
+)
 """All of a camera is given."""
 
 NOTHING_KNOWN = MappingTask(Path("database.db"), None)
@@ -23,7 +25,9 @@ ALL_GIVEN = MappingTask(Path("database.db"), None, cameras={1: WHOLE})
 
 def task_with_given_cameras(database_path: Path, **values: Any) -> MappingTask:
     """Return a task for a database whose cameras are all given."""
-    cameras = {camera.camera_id: WHOLE for camera in ViewGraph(database_path).cameras.values()}
+    cameras = {
+        camera.camera_id: WHOLE for camera in ViewGraph(database_path).cameras.values()
+    }
     return MappingTask(database_path, database_path.parent, cameras=cameras, **values)
 
 

@@ -22,7 +22,9 @@ def write_photograph(path: Path, size: tuple[int, int], tags: dict[str, Any]) ->
     for name, value in tags.items():
         first = name in ("Make", "Model", "Orientation")
         (exif if first else exif.get_ifd(ExifTags.IFD.Exif))[ExifTags.Base[name]] = (
-            IFDRational(round(value * 10_000), 10_000) if isinstance(value, float) else value
+            IFDRational(round(value * 10_000), 10_000)
+            if isinstance(value, float)
+            else value
         )
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("L", size, 100).save(path, exif=exif)

@@ -41,7 +41,9 @@ class FixedShapes:
         raise NotImplementedError
 
     def samples(self, _: GrayImage) -> ShapeSamples:
-        return ShapeSamples(self.rows[:, :2], metrics_from_tilts(self.rows[:, 2], self.rows[:, 3]))
+        return ShapeSamples(
+            self.rows[:, :2], metrics_from_tilts(self.rows[:, 2], self.rows[:, 3])
+        )
 
 
 def unit(vector: ArrayLike) -> Array:
@@ -75,7 +77,9 @@ def nearest_planes(
     return factors.min(axis=-1), factors.argmin(axis=-1)
 
 
-def look_up(texture: GrayImage, x: NDArray[np.floating], y: NDArray[np.floating]) -> GrayImage:
+def look_up(
+    texture: GrayImage, x: NDArray[np.floating], y: NDArray[np.floating]
+) -> GrayImage:
     """Values of a texture at points of its pixel grid; its border is reflected once."""
     height, width = texture.shape
     x = np.clip(x, -width, 2 * width)
@@ -114,7 +118,9 @@ class Room:
         """Image of the room with the same texture on all planes, in plane coordinates."""
         width, height = (SUPERSAMPLING * extent for extent in self.size)
         depth, labels = self.depth((width, height))
-        directions = rays(self.camera_at((width, height)), np.arange(width), np.arange(height))
+        directions = rays(
+            self.camera_at((width, height)), np.arange(width), np.arange(height)
+        )
         points = directions * np.nan_to_num(depth)[..., None]
         maps = np.zeros((2, height, width), np.float32)
         for label, normal in enumerate(self.normals):

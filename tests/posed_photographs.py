@@ -41,7 +41,9 @@ def image_line(index: int) -> str:
     return f"{index + 1} {values} {index + 1} {NAMES[index]}.png"
 
 
-def write_svp(scene: Path, pairs: str = "a.png b.png 0\na.png d.png 2\nb.png d.png 1\n") -> Path:
+def write_svp(
+    scene: Path, pairs: str = "a.png b.png 0\na.png d.png 2\nb.png d.png 1\n"
+) -> Path:
     """Write a scene of the Strong ViewPoint Changes dataset, without lines of points."""
     write_images(scene / "images")
     (scene / f"{scene.name}_image_pairs.txt").write_text(pairs)
@@ -77,7 +79,9 @@ def write_lists(scene: Path, lists: dict[int, list[str]]) -> None:
     folder = scene / "set_100" / "new-vis-pairs"
     folder.mkdir(parents=True, exist_ok=True)
     for limit in range(1, 10):
-        np.save(folder / f"keys-th-0.{limit}.npy", np.array(lists.get(limit, []), dtype=str))
+        np.save(
+            folder / f"keys-th-0.{limit}.npy", np.array(lists.get(limit, []), dtype=str)
+        )
 
 
 def write_imc(scene: Path) -> Path:
@@ -103,7 +107,9 @@ def write_pair(path1: Path, path2: Path, seed: int) -> None:
     frontal = texture((SIZE[0], TILT * SIZE[1]), seed, FINEST_PX)
     image = cv2.resize(frontal, SIZE, interpolation=cv2.INTER_AREA)
     write_image(path1, image)
-    warped = cv2.warpPerspective(image, TRUTH, SIZE, flags=cv2.INTER_CUBIC, borderValue=128)
+    warped = cv2.warpPerspective(
+        image, TRUTH, SIZE, flags=cv2.INTER_CUBIC, borderValue=128
+    )
     write_image(path2, warped)
 
 

@@ -16,7 +16,9 @@ def randomized(network: nn.Module, seed: int, gain: float = 1.0) -> nn.Module:
         if name.endswith("running_mean"):
             buffer.copy_(0.1 * torch.rand(buffer.shape, generator=generator))
         if name.endswith("running_var"):
-            buffer.copy_((0.1 + 0.2 * torch.rand(buffer.shape, generator=generator)) / gain)
+            buffer.copy_(
+                (0.1 + 0.2 * torch.rand(buffer.shape, generator=generator)) / gain
+            )
     return network.eval()
 
 
@@ -38,7 +40,9 @@ def write_comparing_lightglue(path: Path, sharpness: float = 40.0) -> Path:
     """Write a LightGlue whose layers change nothing: it compares the descriptors it is given."""
     conf = feature.LightGlue.features["aliked"]
     network = feature.LightGlue(features=None, **{**conf, "weights": None})
-    state = {name: torch.zeros_like(value) for name, value in network.state_dict().items()}
+    state = {
+        name: torch.zeros_like(value) for name, value in network.state_dict().items()
+    }
     for name, value in state.items():
         if name.endswith(("input_proj.weight", "final_proj.weight")):
             factor = sharpness if "final" in name else 1.0

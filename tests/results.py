@@ -57,19 +57,30 @@ def database_content(path: Path) -> dict[str, Any]:
         raw = zip(*database.read_all_matches(), strict=True)
         geometries = zip(*database.read_two_view_geometries(), strict=True)
         return {
-            "keypoints": {names[i]: database.read_keypoints(i).tobytes() for i in names},
+            "keypoints": {
+                names[i]: database.read_keypoints(i).tobytes() for i in names
+            },
             "raw matches": {pair(key): len(rows) for key, rows in raw},
-            "inliers": {pair(key): found.inlier_matches.tolist() for key, found in geometries},
+            "inliers": {
+                pair(key): found.inlier_matches.tolist() for key, found in geometries
+            },
         }
 
 
 def model_names(workspace: Workspace) -> list[list[str]]:
     """Names of the registered images of every model in sparse/."""
-    models = [pycolmap.Reconstruction(path) for path in sorted(workspace.sparse.glob("[0-9]*"))]
-    return [sorted(model.images[i].name for i in model.reg_image_ids()) for model in models]
+    models = [
+        pycolmap.Reconstruction(path)
+        for path in sorted(workspace.sparse.glob("[0-9]*"))
+    ]
+    return [
+        sorted(model.images[i].name for i in model.reg_image_ids()) for model in models
+    ]
 
 
-def tree(folder: Path, *without: Path, times: bool = True) -> dict[str, tuple[object, ...]]:
+def tree(
+    folder: Path, *without: Path, times: bool = True
+) -> dict[str, tuple[object, ...]]:
     """What is in a folder, by its path there: files by digest and time; links are not followed."""
     found: dict[str, tuple[object, ...]] = {}
     for path in folder.rglob("*"):

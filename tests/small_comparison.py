@@ -11,10 +11,22 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.comparison.results import Comparison, MethodResult, PoseScores, SeedResult
+from colmap_affrect.comparison.results import (
+    Comparison,
+    MethodResult,
+    PoseScores,
+    SeedResult,
+)
 from colmap_affrect.pairs.lists import Pair
 
-NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")
+NAMES = (
+    "<img src=x onerror=alert(1)>.png",
+    "a & b.png",
+    "c.png",
+    "d.png",
+    "e.png",
+    "f.png",
+)
 IMAGE_SIZE = (160, 120)
 
 
@@ -67,7 +79,9 @@ def write_scene(
             database.update_image(image)
             model.images[image.image_id].name = name
         pairs = {}
-        for pair_id, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+        for pair_id, count in zip(
+            *database.read_two_view_geometry_num_inliers(), strict=True
+        ):
             ids = pycolmap.pair_id_to_image_pair(pair_id)
             name1, name2 = sorted(model.images[image_id].name for image_id in ids)
             pairs[name1, name2] = count
@@ -91,7 +105,9 @@ def _write_method(
 def _seed(
     seed: int, model: pycolmap.Reconstruction, num_pairs: int, wrong: Sequence[str] = ()
 ) -> SeedResult:
-    registered = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
+    registered = sorted(
+        model.images[image_id].name for image_id in model.reg_image_ids()
+    )
     correct = tuple(name for name in registered if name not in wrong)
     name = "default" if len(registered) == 5 else "sift"
     return SeedResult(

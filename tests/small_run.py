@@ -23,7 +23,14 @@ from colmap_affrect.report.pictures import Picture
 from colmap_affrect.report.run_page import RunContent, write_run_page
 from colmap_affrect.session.view_graph import ViewGraph
 
-NAMES = ("<img src=x onerror=alert(1)>.png", "b\u202egnp.c", "c.png", "d.png", "e.png", "f.png")
+NAMES = (
+    "<img src=x onerror=alert(1)>.png",
+    "b\u202egnp.c",
+    "c.png",
+    "d.png",
+    "e.png",
+    "f.png",
+)
 """The second one is shown turned round where nobody takes care."""
 
 MORE = Advice("more photographs")
@@ -47,20 +54,28 @@ def small_report(folder: Path) -> ReconstructionReport:
     failure = f"{folder / 'photographs' / 'f.png'}: not a readable image"
     return ReconstructionReport(
         images_total=6,
-        unregistered={NAMES[4]: Missing("no_verified_pair"), NAMES[5]: Missing("unreadable")},
+        unregistered={
+            NAMES[4]: Missing("no_verified_pair"),
+            NAMES[5]: Missing("unreadable"),
+        },
         models=(model,),
         num_verified_pairs=15,
         num_pairs=15,
         stages=(
             StageReport("extract", 6.5, 5, failures={NAMES[5]: failure}),
-            StageReport("map", 3.25, 1, warnings={"/home/someone/model": "an <old> one"}),
+            StageReport(
+                "map", 3.25, 1, warnings={"/home/someone/model": "an <old> one"}
+            ),
         ),
         recipe="default",
         versions={"colmap-affrect": "1.2.3"},
         preset="sparse",
         verification={"max_error_px": 3.0},
         mapping={"name": "sparse", "mapper_options": {}},
-        advice=(Advice("one camera", f"colmap-affrect run --output-path {folder}/out-2"), MORE),
+        advice=(
+            Advice("one camera", f"colmap-affrect run --output-path {folder}/out-2"),
+            MORE,
+        ),
         guided={"pairs": 2, "matches_before": 20, "matches_after": 1050},
         cameras=(camera,),
     )
@@ -89,5 +104,7 @@ def make_run_page(folder: Path) -> Path:
         picture=Picture.from_image(np.zeros((450, 900, 3), np.uint8)),
     )
     cameras = ViewGraph(workspace.database).cameras
-    content = RunContent(NAMES, pairs, photographs, pairs_to_check=[pair] * 3, cameras=cameras)
+    content = RunContent(
+        NAMES, pairs, photographs, pairs_to_check=[pair] * 3, cameras=cameras
+    )
     return write_run_page(workspace, small_report(folder), content)

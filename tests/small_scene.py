@@ -38,7 +38,9 @@ cached_texture = cache(texture)
 def world_to_camera(yaw_deg: float) -> Array:
     """(3, 3) rotation of a camera that is turned about its y axis."""
     yaw = np.deg2rad(yaw_deg)
-    return np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
+    return np.array(
+        [[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]]
+    )
 
 
 def photograph(
@@ -46,19 +48,28 @@ def photograph(
 ) -> GrayImage:
     """Render the faces, each over those before it; another seed makes another room."""
     width, height = IMAGE_SIZE
-    camera = np.array([[FOCAL_PX, 0, width / 2 - 0.5], [0, FOCAL_PX, height / 2 - 0.5], [0, 0, 1]])
+    camera = np.array(
+        [[FOCAL_PX, 0, width / 2 - 0.5], [0, FOCAL_PX, height / 2 - 0.5], [0, 0, 1]]
+    )
     image = np.full((height, width), 90, np.uint8)
     size = (TEXTURE_PX, TEXTURE_PX)
     for seed, (origin, edge1, edge2) in enumerate(FACES, first_seed):
         plane = np.column_stack([edge1, edge2, np.subtract(origin, position)])
-        plane = camera @ world_to_camera(yaw_deg) @ plane @ np.diag([1 / TEXTURE_PX] * 2 + [1])
+        plane = (
+            camera
+            @ world_to_camera(yaw_deg)
+            @ plane
+            @ np.diag([1 / TEXTURE_PX] * 2 + [1])
+        )
         warped = cv2.warpPerspective(cached_texture(size, seed), plane, IMAGE_SIZE)
         covered = cv2.warpPerspective(np.full(size, 255, np.uint8), plane, IMAGE_SIZE)
         image = np.where(covered > 127, warped, image)
     return image
 
 
-def write_photographs(folder: Path, count: int = len(NAMES), first_seed: int = 0) -> list[str]:
+def write_photographs(
+    folder: Path, count: int = len(NAMES), first_seed: int = 0
+) -> list[str]:
     """Write the first ``count`` photographs below ``folder`` and return their names."""
     for index, name in enumerate(NAMES[:count]):
         path = folder / name

@@ -23,16 +23,22 @@ scales = st.floats(0.1, 10.0)
 
 def compose_affine(scale: float, psi_rad: float, tilt: float, phi_rad: float) -> Array:
     """Return the (2, 2) map scale R(psi) diag(tilt, 1) R(phi)."""
-    return np.asarray(scale * rotation(psi_rad) @ np.diag([tilt, 1.0]) @ rotation(phi_rad))
+    return np.asarray(
+        scale * rotation(psi_rad) @ np.diag([tilt, 1.0]) @ rotation(phi_rad)
+    )
 
 
-def tilt_distance(tilt1: float, angle1_rad: float, tilt2: float, angle2_rad: float) -> float:
+def tilt_distance(
+    tilt1: float, angle1_rad: float, tilt2: float, angle2_rad: float
+) -> float:
     """Return d = log tau, the log of the transition tilt between two classes.
 
     cosh d = ((t1/t2 + t2/t1) cos^2 D + (t1 t2 + 1/(t1 t2)) sin^2 D) / 2 with D = phi1 - phi2.
     """
     metrics = metrics_from_tilts([tilt1, tilt2], [angle1_rad, angle2_rad])
-    return float(np.arccosh(np.maximum(cosh_distances(metrics[:1], metrics[1:])[0, 0], 1.0)))
+    return float(
+        np.arccosh(np.maximum(cosh_distances(metrics[:1], metrics[1:])[0, 0], 1.0))
+    )
 
 
 @st.composite
@@ -66,9 +72,13 @@ def homographies(draw: st.DrawFn) -> Array:
     The corners stay a convex quadrangle, hence no point of the image goes to infinity.
     """
     width, height = IMAGE_SIZE
-    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]])
+    corners = np.array(
+        [[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]]
+    )
     moves = draw(st.lists(st.floats(-0.2, 0.2), min_size=8, max_size=8))
     moved = corners + np.reshape(moves, (4, 2)) * IMAGE_SIZE
     return np.asarray(
-        cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32))
+        cv2.getPerspectiveTransform(
+            corners.astype(np.float32), moved.astype(np.float32)
+        )
     )

@@ -54,7 +54,9 @@ def centroid(image: NDArray[np.generic], background: float = 0.0) -> Array:
     return np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
 
 
-def texture(size: tuple[int, int], seed: int, finest_sigma_px: float = 1.2) -> GrayImage:
+def texture(
+    size: tuple[int, int], seed: int, finest_sigma_px: float = 1.2
+) -> GrayImage:
     """Isotropic noise with structure at several scales, each of the same contrast."""
     width, height = size
     rng = np.random.default_rng(seed)
@@ -64,14 +66,18 @@ def texture(size: tuple[int, int], seed: int, finest_sigma_px: float = 1.2) -> G
             rng.standard_normal((height, width)), (0, 0), finest_sigma_px * 2**octave
         )
         image += layer / max(layer.std(), 1e-9)
-    return np.clip(np.rint(128 + 32 * image / max(image.std(), 1e-9)), 0, 255).astype(np.uint8)
+    return np.clip(np.rint(128 + 32 * image / max(image.std(), 1e-9)), 0, 255).astype(
+        np.uint8
+    )
 
 
 def circles(centers: ArrayLike, sigmas_px: ArrayLike) -> LocalFeatures:
     """Upright features in order of falling response, as a detector returns them."""
     points = np.asarray(centers, float)
     sigmas = np.asarray(sigmas_px, float)
-    lafs = lafs_from_keypoints(points, MEASUREMENT_SIGMAS * sigmas, np.zeros(len(points)))
+    lafs = lafs_from_keypoints(
+        points, MEASUREMENT_SIGMAS * sigmas, np.zeros(len(points))
+    )
     responses = np.linspace(1.0, 0.5, len(points), dtype=np.float32)
     ids = np.arange(len(points), dtype=np.int32)
     return LocalFeatures(lafs, responses, np.zeros((len(points), 0), np.float32), ids)
@@ -80,7 +86,9 @@ def circles(centers: ArrayLike, sigmas_px: ArrayLike) -> LocalFeatures:
 def unit_rows(rows: ArrayLike) -> NDArray[np.float32]:
     """Rows of unit length."""
     rows = np.asarray(rows)
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
+    return np.asarray(
+        rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32
+    )
 
 
 def write_image(path: Path, image: NDArray[np.generic]) -> Path:

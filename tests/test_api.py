@@ -67,7 +67,9 @@ def test_type_checkers_read_the_names_that_are_loaded() -> None:
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     read = {alias.name: node.module for node in imports for alias in node.names}
     assert read.pop("pycolmap") == "colmap_affrect"
-    assert read == {n: f"colmap_affrect.{m}" for n, m in colmap_affrect._MODULES.items()}
+    assert read == {
+        n: f"colmap_affrect.{m}" for n, m in colmap_affrect._MODULES.items()
+    }
 
 
 SCRIPT = """
@@ -77,8 +79,13 @@ print(colmap_affrect.diagnose.__module__, colmap_affrect.pycolmap.__name__)
 
 
 def test_names_and_pycolmap_are_found_without_other_imports() -> None:
-    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, check=True)
-    assert done.stdout.decode().split() == ["colmap_affrect.doctor", "colmap_affrect.pycolmap"]
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], capture_output=True, check=True
+    )
+    assert done.stdout.decode().split() == [
+        "colmap_affrect.doctor",
+        "colmap_affrect.pycolmap",
+    ]
 
 
 # Options and keywords
@@ -89,7 +96,9 @@ PARTS = [
     for registry in (EXTRACTORS, SHAPES, RECTIFIERS, MATCHERS, MAPPERS)
     for name in registry.built_in
 ]
-OPTIONS = [v for v in PUBLIC.values() if isinstance(v, type) and issubclass(v, Options)] + PARTS
+OPTIONS = [
+    v for v in PUBLIC.values() if isinstance(v, type) and issubclass(v, Options)
+] + PARTS
 RESULTS = [v for v in PUBLIC.values() if isinstance(v, type) and is_dataclass(v)]
 
 
@@ -123,7 +132,9 @@ def test_fields_of_options_are_keywords_of_functions(
     function: str, cls: type[Options], keywords: type
 ) -> None:
     assert typing.get_type_hints(keywords).keys() == cls.model_fields.keys()
-    assert cls.model_fields.keys() <= inspect.signature(PUBLIC[function]).parameters.keys()
+    assert (
+        cls.model_fields.keys() <= inspect.signature(PUBLIC[function]).parameters.keys()
+    )
 
 
 def test_parts_of_options_are_dictionaries_names_or_paths_too(tmp_path: Path) -> None:
@@ -143,10 +154,17 @@ def test_parts_of_options_are_dictionaries_names_or_paths_too(tmp_path: Path) ->
     assert options.by_hand.rejected == (("a.jpg", "b.jpg"),)
     assert options.resources.weights_path == tmp_path
     assert options.image_list_path == Path("list.txt")
-    assert RunOptions(recipe={"rectifier": "identity"}).recipe.rectifier.name == "identity"
-    assert RunOptions(mapping="global").mapper_options() == colmap_affrect.GlobalOptions()
+    assert (
+        RunOptions(recipe={"rectifier": "identity"}).recipe.rectifier.name == "identity"
+    )
+    assert (
+        RunOptions(mapping="global").mapper_options() == colmap_affrect.GlobalOptions()
+    )
     mapped = colmap_affrect.Recipe(mapping={"name": "incremental"})
-    assert RunOptions(recipe=mapped).mapper_options() == colmap_affrect.IncrementalOptions()
+    assert (
+        RunOptions(recipe=mapped).mapper_options()
+        == colmap_affrect.IncrementalOptions()
+    )
 
 
 REFUSED: list[tuple[str, str]] = [
@@ -191,7 +209,9 @@ REFUSED: list[tuple[str, str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("call", "message"), REFUSED, ids=[call for call, _ in REFUSED])
+@pytest.mark.parametrize(
+    ("call", "message"), REFUSED, ids=[call for call, _ in REFUSED]
+)
 def test_wrong_arguments_are_refused_by_name_before_anything_is_made(
     call: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,8 +222,13 @@ def test_wrong_arguments_are_refused_by_name_before_anything_is_made(
 
 
 def test_errors_name_fields_of_options_where_flags_stand_for_them() -> None:
-    fields = {dest for settings in FLAGS.values() if "." in (dest := settings.get("dest", ""))}
-    fields -= {"cameras.model", "pairs.match_list_path"}  # of export and map_database, too
+    fields = {
+        dest for settings in FLAGS.values() if "." in (dest := settings.get("dest", ""))
+    }
+    fields -= {
+        "cameras.model",
+        "pairs.match_list_path",
+    }  # of export and map_database, too
     assert fields <= set(ARGUMENTS.values())
     arguments = {name for function in PUBLIC.values() if inspect.isfunction(function)
                  for name in inspect.signature(function).parameters}  # fmt: skip
@@ -222,9 +247,13 @@ def test_a_format_is_a_word_or_several(tmp_path: Path) -> None:
         colmap_affrect.export(tmp_path, tmp_path / "out", "ply")
 
 
-def test_a_stage_of_a_database_names_the_functions_that_take_one(tmp_path: Path) -> None:
+def test_a_stage_of_a_database_names_the_functions_that_take_one(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "any.db").touch()
-    with pytest.raises(OptionError, match=r"any.db': is a file; .*verify_matches take databases"):
+    with pytest.raises(
+        OptionError, match=r"any.db': is a file; .*verify_matches take databases"
+    ):
         colmap_affrect.verify(tmp_path / "any.db")
 
 
@@ -236,7 +265,9 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_progress_is_shown_where_somebody_looks_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_shown_where_somebody_looks_at_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     own = Progress()
     file = io.StringIO()
     terminal = Terminal()
@@ -293,7 +324,10 @@ def test_a_notebook_shows_counts_photographs_and_what_to_try(
     text = Text(page).words
     assert text[0] == "4 of 6 photographs registered"
     pairs = dict(pairwise(text))
-    shown = {key: pairs[key] for key in ("verified pairs", "sure", "unsure", "doubtful", "points")}
+    shown = {
+        key: pairs[key]
+        for key in ("verified pairs", "sure", "unsure", "doubtful", "points")
+    }
     assert shown == {
         "verified pairs": "15 of 15", "sure": "2", "unsure": "1", "doubtful": "1", "points": "90",
     }  # fmt: skip
@@ -306,7 +340,9 @@ def test_a_notebook_shows_counts_photographs_and_what_to_try(
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "report.html").touch()
     assert report.page_path == tmp_path / "out" / "report.html"
-    assert 'href="' not in report._repr_html_(), "a notebook serves files below its folder only"
+    assert 'href="' not in report._repr_html_(), (
+        "a notebook serves files below its folder only"
+    )
     monkeypatch.chdir(tmp_path)
     assert 'href="out/report.html"' in report._repr_html_()
 
@@ -319,7 +355,9 @@ def test_a_report_is_short_on_a_prompt_and_whole_when_printed(tmp_path: Path) ->
     assert str(report) == report.summary()
 
 
-def test_a_report_without_models_says_why_there_is_no_reconstruction(tmp_path: Path) -> None:
+def test_a_report_without_models_says_why_there_is_no_reconstruction(
+    tmp_path: Path,
+) -> None:
     report = report_of(tmp_path, models=(), num_verified_pairs=0)
     with pytest.raises(NoModelError, match="no pair of images is verified"):
         report.reconstruction()
@@ -341,9 +379,9 @@ def test_stage_by_stage_makes_the_model_of_a_run(photos: Path, tmp_path: Path) -
     assert report.mapping["name"] == "incremental"
     model = report.reconstruction()
     assert model.num_reg_images() == 4
-    assert colmap_affrect.pycolmap.Reconstruction(folder / "sparse" / "0").num_points3D() == (
-        model.num_points3D()
-    )
+    assert colmap_affrect.pycolmap.Reconstruction(
+        folder / "sparse" / "0"
+    ).num_points3D() == (model.num_points3D())
     with pytest.raises(OptionError, match=r"^number=1: the models are 0 to 0"):
         report.reconstruction(1)
     options = RunOptions(cameras=PINHOLE, mapping="incremental")

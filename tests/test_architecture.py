@@ -39,11 +39,15 @@ def test_pycolmap_is_imported_and_half_pixels_are_added_at_one_place() -> None:
     importing = set()
     adding = set()
     for path, node in nodes():
-        if isinstance(node, ast.Import) and any(item.name == "pycolmap" for item in node.names):
+        if isinstance(node, ast.Import) and any(
+            item.name == "pycolmap" for item in node.names
+        ):
             importing.add(path)
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
             sides = (node.left, node.right)
-            if any(isinstance(side, ast.Constant) and side.value == 0.5 for side in sides):
+            if any(
+                isinstance(side, ast.Constant) and side.value == 0.5 for side in sides
+            ):
                 adding.add(path)
     assert importing == {"colmap/__init__.py"}
     assert adding <= {"geometry/conventions.py"}

@@ -27,7 +27,9 @@ UPSCALE_BIAS_PX = 0.05
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_colmap_counts_from_the_corner_half_a_pixel_further_in_x_and_y(dtype: type) -> None:
+def test_colmap_counts_from_the_corner_half_a_pixel_further_in_x_and_y(
+    dtype: type,
+) -> None:
     points = np.array([[0.0, 7.0]], dtype=dtype)
     colmap = colmap_from_pixel(points)
     pixel = pixel_from_colmap(points)
@@ -58,12 +60,23 @@ def test_grid_origin_is_the_mean_of_the_pixels_of_the_first_cell(step_px: int) -
 
 
 def test_is_inside_accepts_whole_pixels_up_to_their_outer_edge() -> None:
-    points = np.array([[-0.5, 2.5], [4.5, -0.5], [-0.51, 0], [0, 2.51], [4.51, 0], [3, 2], [2, 3]])
-    assert is_inside(points, (5, 3)).tolist() == [True, True, False, False, False, True, False]
+    points = np.array(
+        [[-0.5, 2.5], [4.5, -0.5], [-0.51, 0], [0, 2.51], [4.51, 0], [3, 2], [2, 3]]
+    )
+    assert is_inside(points, (5, 3)).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        True,
+        False,
+    ]
 
 
 @pytest.mark.parametrize(
-    ("direction", "angle_deg"), [((1, 0), 0.0), ((0, 1), 90.0), ((-1, 0), 180.0), ((0, -1), -90.0)]
+    ("direction", "angle_deg"),
+    [((1, 0), 0.0), ((0, 1), 90.0), ((-1, 0), 180.0), ((0, -1), -90.0)],
 )
 def test_convention_sift_frame_points_towards_rising_gray_values(
     direction: tuple[int, int], angle_deg: float
@@ -80,7 +93,9 @@ def test_convention_sift_frame_points_towards_rising_gray_values(
     features = RootSift(SiftOptions()).detect((image, None))
     near = np.linalg.norm(features.keypoints - center, axis=1) < 6.0
     assert near.any()
-    x, y = features.lafs[near, :, 0].T  # the first column of each frame is its direction
+    x, y = features.lafs[
+        near, :, 0
+    ].T  # the first column of each frame is its direction
     differences = np.rad2deg(np.arctan2(y, x)) - angle_deg
     assert np.abs((differences + 180.0) % 360.0 - 180.0).min() < 10.0
 
@@ -102,7 +117,9 @@ def test_convention_sift_with_precise_upscale_has_no_bias() -> None:
 
 def test_convention_pycolmap_sift_reports_corner_origin() -> None:
     image = blobs((81, 61), [[40.0, 30.0]], 5.0 * np.eye(2))
-    extractor = pycolmap.FeatureExtractor.create(pycolmap.FeatureExtractionOptions(use_gpu=False))
+    extractor = pycolmap.FeatureExtractor.create(
+        pycolmap.FeatureExtractionOptions(use_gpu=False)
+    )
     keypoints, _ = extractor.extract(pycolmap.Bitmap.from_array(image))
     places = np.array([[keypoint.x, keypoint.y] for keypoint in keypoints])
     assert np.linalg.norm(places - [40.5, 30.5], axis=1).min() < 0.1

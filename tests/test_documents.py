@@ -38,13 +38,17 @@ MAX_WORDS = 1500
 
 PARSER = build_parser()
 (CHOICES,) = (action.choices for action in PARSER._actions if action.dest == "command")
-ALL_FLAGS = {flag for command in CHOICES.values() for flag in command._option_string_actions}
+ALL_FLAGS = {
+    flag for command in CHOICES.values() for flag in command._option_string_actions
+}
 
 each_page = pytest.mark.parametrize("name", PAGES)
 
 
 def blocks(name: str, language: str) -> list[str]:
-    return re.findall(rf"^ *```{language}\n(.*?)^ *```", TEXTS[name], re.MULTILINE | re.DOTALL)
+    return re.findall(
+        rf"^ *```{language}\n(.*?)^ *```", TEXTS[name], re.MULTILINE | re.DOTALL
+    )
 
 
 def inline(name: str) -> list[str]:
@@ -85,7 +89,10 @@ def test_stages_come_after_those_that_they_need(name: str) -> None:
         commands = re.findall(r"^colmap-affrect (\w+)", block, re.MULTILINE)
         stages = [command for command in commands if command in STAGES]
         if stages[:1] == ["extract"]:
-            assert stages == [stage for stage in STAGES if stage in COMMANDS][: len(stages)], block
+            assert (
+                stages
+                == [stage for stage in STAGES if stage in COMMANDS][: len(stages)]
+            ), block
 
 
 @each_page
@@ -94,14 +101,23 @@ def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
         words = code.split()
         if words[0] == "colmap-affrect" and len(words) > 1 and words[1].islower():
             assert words[1] in COMMANDS, code
-        for flag in (word.partition("=")[0] for word in words if re.match(r"--[a-zA-Z]", word)):
+        for flag in (
+            word.partition("=")[0] for word in words if re.match(r"--[a-zA-Z]", word)
+        ):
             script = "recipes/" in code or "tests/" in code
             assert script or flag in {*ALL_FLAGS, *FOREIGN}, code
         if re.fullmatch(r"colmap_affrect(\.\w+)+", code):
             found = pkgutil.resolve_name(code)
             is_public = code.split(".")[1] in colmap_affrect.__all__
-            assert is_public or inspect.ismodule(found), f"{code}: import colmap_affrect has none"
-        if words[0] == "--recipe" and words[1:] and not words[1].isupper() and ".toml" not in code:
+            assert is_public or inspect.ismodule(found), (
+                f"{code}: import colmap_affrect has none"
+            )
+        if (
+            words[0] == "--recipe"
+            and words[1:]
+            and not words[1].isupper()
+            and ".toml" not in code
+        ):
             load_recipe(words[1])
         if words[0] == "--set" and "=" in code:
             load_recipe("default", [words[1]])
@@ -109,11 +125,18 @@ def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
 
 @each_page
 def test_python_names_exist(name: str) -> None:
-    for node in (node for block in blocks(name, "python") for node in ast.walk(ast.parse(block))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("colmap_affrect"):
+    for node in (
+        node for block in blocks(name, "python") for node in ast.walk(ast.parse(block))
+    ):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+            "colmap_affrect"
+        ):
             for alias in node.names:
                 pkgutil.resolve_name(f"{node.module}:{alias.name}")
-        if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "colmap_affrect":
+        if (
+            isinstance(node, ast.Attribute)
+            and ast.unparse(node.value) == "colmap_affrect"
+        ):
             assert node.attr in colmap_affrect.__all__
 
 
@@ -124,8 +147,13 @@ def test_links_lead_somewhere(name: str) -> None:
         file = (ROOT / name).parent / path if path else ROOT / name
         assert file.exists(), target
         if anchor:
-            headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
-            slugs = {re.sub(r"[^\w -]", "", text).lower().replace(" ", "-") for text in headings}
+            headings = re.findall(
+                r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE
+            )
+            slugs = {
+                re.sub(r"[^\w -]", "", text).lower().replace(" ", "-")
+                for text in headings
+            }
             assert anchor in slugs, target
 
 
@@ -143,17 +171,24 @@ def said_by_the_program() -> set[str]:
 def test_lines_that_troubleshooting_quotes_are_printed() -> None:
     """Each piece between names and numbers is in a text of the code, or holds a long one of it."""
     texts = said_by_the_program()
-    for row in re.findall(r"^\| (`.*?) \| ", TEXTS["docs/troubleshooting.md"], re.MULTILINE):
+    for row in re.findall(
+        r"^\| (`.*?) \| ", TEXTS["docs/troubleshooting.md"], re.MULTILINE
+    ):
         for quoted in re.findall(r"`([^`]+)`", row):
             for piece in re.split(r"\.\.\.|[;:] |\b\w+\.jpg|\b\d+\b|sparse/", quoted):
                 words = piece.strip(" -:")
                 in_words = (text for text in texts if len(text) >= 8 and text in words)
-                assert any(words in text for text in texts) or any(in_words), (row, words)
+                assert any(words in text for text in texts) or any(in_words), (
+                    row,
+                    words,
+                )
 
 
 def test_guide_names_all_sources_of_focal_lengths() -> None:
     (sentence,) = re.findall(
-        r"where its focal length is\s+from: (.*?)\.\n", TEXTS["docs/guide.md"], re.DOTALL
+        r"where its focal length is\s+from: (.*?)\.\n",
+        TEXTS["docs/guide.md"],
+        re.DOTALL,
     )
     assert re.findall(r"`([\w-]+)`", sentence) == list(get_args(Source))
 
@@ -178,7 +213,9 @@ def test_version_and_citation_agree_and_no_address_is_invented() -> None:
     assert fields["version"] == colmap_affrect.__version__
     assert {"cff-version", "message", "title", "license"} <= fields.keys()
     assert citation.count("family-names") == citation.count("given-names") == 3
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+        "project"
+    ]
     assert all(url.startswith("https://") for url in project.get("urls", {}).values())
     extras = project["optional-dependencies"]
     assert {"dev", "docs", "test"} <= extras.keys()
@@ -186,9 +223,23 @@ def test_version_and_citation_agree_and_no_address_is_invented() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not importlib.util.find_spec("mkdocs"), reason="mkdocs is not installed")
-def test_documentation_is_built_without_warnings_and_without_the_network(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+@pytest.mark.skipif(
+    not importlib.util.find_spec("mkdocs"), reason="mkdocs is not installed"
+)
+def test_documentation_is_built_without_warnings_and_without_the_network(
+    tmp_path: Path,
+) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--site-dir",
+        str(tmp_path),
+    ]
     subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
     for page in tmp_path.glob("*.html"):
-        assert not re.findall(r'(?:src|href)="https?://[^"]+\.(?:js|css)"', page.read_text())
+        assert not re.findall(
+            r'(?:src|href)="https?://[^"]+\.(?:js|css)"', page.read_text()
+        )

@@ -17,11 +17,15 @@ from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions
 
 
-@pytest.mark.parametrize("cls", [ExtractionOptions, IncrementalOptions, VerificationOptions])
+@pytest.mark.parametrize(
+    "cls", [ExtractionOptions, IncrementalOptions, VerificationOptions]
+)
 def test_options_come_back_from_what_they_are_written_as(cls: type[Options]) -> None:
     options = cls()
     written = json.loads(json.dumps(options.to_mapping()))
-    assert cls.from_mapping(written, "recipe") == cls.from_mapping({}, "recipe") == options
+    assert (
+        cls.from_mapping(written, "recipe") == cls.from_mapping({}, "recipe") == options
+    )
     assert pickle.loads(pickle.dumps(options)) == options
 
 
@@ -32,7 +36,10 @@ def test_nested_options_are_built_and_their_mistakes_named_by_their_path() -> No
     assert options.rectifier == DenseShapesOptions(max_tilt=4.0)
     assert options.features == SiftOptions(max_num_features=100)
     for rectifier, said in (
-        ({"max_tild": 4.0}, r"^recipe: rectifier: unknown option 'max_tild' .did you mean 'max_ti"),
+        (
+            {"max_tild": 4.0},
+            r"^recipe: rectifier: unknown option 'max_tild' .did you mean 'max_ti",
+        ),
         ({"max_tilt": 99.0}, r"^recipe: rectifier: max_tilt=99\.0: should be less"),
         (3, "rectifier"),
         (None, "rectifier"),
@@ -42,6 +49,12 @@ def test_nested_options_are_built_and_their_mistakes_named_by_their_path() -> No
 
 
 def test_parts_of_this_package_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    others = [metadata.EntryPoint(name, "module:Class", "group") for name in ("theirs", "ours")]
+    others = [
+        metadata.EntryPoint(name, "module:Class", "group")
+        for name in ("theirs", "ours")
+    ]
     monkeypatch.setattr(metadata, "entry_points", lambda **_: others)
-    assert Registry("thing", "group", {"ours": "a:B"}, "ours").names() == ["ours", "theirs"]
+    assert Registry("thing", "group", {"ours": "a:B"}, "ours").names() == [
+        "ours",
+        "theirs",
+    ]

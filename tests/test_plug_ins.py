@@ -40,7 +40,9 @@ WRONG = {
         "Options = Own", "x = Own"
     ),
     "the name in its options is 'other'": RIGHT.replace('"own"', '"other"'),
-    "OwnOptions must say what its 'warps' are": RIGHT.replace("warps: ClassVar", "else_: ClassVar"),
+    "OwnOptions must say what its 'warps' are": RIGHT.replace(
+        "warps: ClassVar", "else_: ClassVar"
+    ),
     "has no method 'plan'": RIGHT.replace("def plan", "def plans"),
 }
 
@@ -49,8 +51,12 @@ def install(folder: Path, package: str, code: str, module: str = "own_part") -> 
     """Leave a package on the path as pip does."""
     info = folder / f"{package}-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[{RECTIFIERS.group}]\nown = {module}:Own\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n"
+    )
+    (info / "entry_points.txt").write_text(
+        f"[{RECTIFIERS.group}]\nown = {module}:Own\n"
+    )
     (folder / f"{module}.py").write_text(code, encoding="utf-8")
 
 
@@ -70,15 +76,21 @@ def test_wrong_part_is_named_with_its_package_and_what_is_wrong(
     with pytest.raises(OptionError, match=re.escape(said)):
         load_recipe("default", ["rectifier=own"])
     assert "own" in RECTIFIERS.names()
-    assert load_recipe("default").rectifier.name == "dense-shapes", "others are not touched"
+    assert load_recipe("default").rectifier.name == "dense-shapes", (
+        "others are not touched"
+    )
 
 
 def test_right_part_is_taken_and_one_of_two_packages_is_not(tmp_path: Path) -> None:
     install(tmp_path, "other-affrect", RIGHT)
     assert load_recipe("default", ["rectifier=own"]).rectifier.name == "own"
     install(tmp_path, "third-affrect", RIGHT)
-    packages = r"other-affrect 1\.0 \(own_part:Own\), third-affrect 1\.0 \(own_part:Own\)"
-    with pytest.raises(OptionError, match=rf"{packages}: several packages have that name"):
+    packages = (
+        r"other-affrect 1\.0 \(own_part:Own\), third-affrect 1\.0 \(own_part:Own\)"
+    )
+    with pytest.raises(
+        OptionError, match=rf"{packages}: several packages have that name"
+    ):
         load_recipe("default", ["rectifier=own"])
 
 

@@ -12,7 +12,9 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent() -> None:
+def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent() -> (
+    None
+):
     terminal = Terminal()
     file = io.StringIO()
     for kind in (Progress(terminal), Progress(file), SILENT):

@@ -22,7 +22,9 @@ SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 
 pytestmark = [
     pytest.mark.shared,
-    pytest.mark.skipif(not SCENES.is_dir(), reason="the photographs of ../shared are not here"),
+    pytest.mark.skipif(
+        not SCENES.is_dir(), reason="the photographs of ../shared are not here"
+    ),
 ]
 
 
@@ -33,7 +35,9 @@ pytestmark = [
     ("rectified", "sacre_coeur /2", 5, 2.0),
     ("on-demand", "herz 0,8,16,24", 4, 0.5),
 ])  # fmt: skip
-def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_error_deg, tmp_path):
+def test_sparse_subset_registers_correctly(
+    recipe, name, min_correct, median_error_deg, tmp_path
+):
     result = compare_subset(name, SCENES, tmp_path, [recipe], 5)["methods"][recipe]
     scores = [seed["scores"] for seed in result["seeds"]]
     assert sum(len(score["correct_names"]) >= min_correct for score in scores) >= 4
@@ -55,8 +59,12 @@ def count_distinct_inliers(path):
     return count
 
 
-@pytest.mark.parametrize("scene", ["strecha_fountain_p11", "strecha_herz_jesus_p25", "kermit"])
-def test_photographs_taken_close_together_match_in_as_many_places_as_with_sift(scene, tmp_path):
+@pytest.mark.parametrize(
+    "scene", ["strecha_fountain_p11", "strecha_herz_jesus_p25", "kermit"]
+)
+def test_photographs_taken_close_together_match_in_as_many_places_as_with_sift(
+    scene, tmp_path
+):
     images = SCENES / scene / "images"
     names = sorted(path.name for path in images.iterdir())[:3]
     all_features = "ours=rectified:matching.max_num_first=0"
@@ -84,7 +92,9 @@ print(peak_memory_bytes() // 1024)
 
 def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path):
     source = SCENES / "strecha_herz_jesus_p25" / "images" / "0008.jpg"
-    image = cv2.resize(cv2.imread(str(source)), (4000, 3000), interpolation=cv2.INTER_CUBIC)
+    image = cv2.resize(
+        cv2.imread(str(source)), (4000, 3000), interpolation=cv2.INTER_CUBIC
+    )
     cv2.imwrite(str(tmp_path / "large.jpg"), image)
     command = [sys.executable, "-c", MEMORY, str(tmp_path / "large.jpg")]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
@@ -99,7 +109,14 @@ def test_portraits_are_registered(tmp_path: Path, call: Call) -> None:
     portraits = SCENES / "nadar" / "images"
     names = sorted(path.name for path in portraits.iterdir())[:3]
     (tmp_path / "list.txt").write_text("\n".join(names))
-    given = ["--image-path", portraits, "--image-list-path", tmp_path / "list.txt", "--json", "-q"]
+    given = [
+        "--image-path",
+        portraits,
+        "--image-list-path",
+        tmp_path / "list.txt",
+        "--json",
+        "-q",
+    ]
     run = ["run", *given, "--recipe", "default", "--output-path"]
     ended = call(*run, tmp_path / "out")
     assert ended.report["registered_names"] == names

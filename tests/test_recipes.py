@@ -12,7 +12,10 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.features.second_moment import SecondMomentOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe, recipe_names
-from colmap_affrect.rectifiers.affine_warps import AffNetShapesOptions, DenseShapesOptions
+from colmap_affrect.rectifiers.affine_warps import (
+    AffNetShapesOptions,
+    DenseShapesOptions,
+)
 from colmap_affrect.rectifiers.base import CoverOptions
 
 NAMES = [
@@ -35,7 +38,9 @@ def test_recipes_have_summaries_and_options_that_survive_being_written_down() ->
         assert recipe.name == name
         assert 10 < len(recipe.summary) < 110
         written = tomllib.loads(tomli_w.dumps(recipe.extraction.to_mapping()))
-        assert ExtractionOptions.from_mapping(written, "config.toml") == recipe.extraction
+        assert (
+            ExtractionOptions.from_mapping(written, "config.toml") == recipe.extraction
+        )
 
 
 @pytest.mark.parametrize(("name", "rectifier"), OF_THE_PAPER.items())
@@ -50,7 +55,11 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
     assert (recipe.matching.max_ratio, recipe.matching.ratio_both_ways) == (0.85, False)
     if isinstance(extraction.rectifier, CoverOptions):
         cover = extraction.rectifier
-        assert (cover.tilt_radius, cover.max_tilt, cover.covered_frac) == (1.7, 5.8, 0.95)
+        assert (cover.tilt_radius, cover.max_tilt, cover.covered_frac) == (
+            1.7,
+            5.8,
+            0.95,
+        )
         assert (cover.shape_source.name, cover.area_preserving) == ("affnet", False)
 
 
@@ -59,7 +68,13 @@ def test_levels_build_on_the_lowest_one_with_their_features() -> None:
     levels = recipe.extraction.levels
     matchers = [level.matching and level.matching.name for level in levels]
     assert [level.base for level in levels] == [0, 0, 2, 3, 2]
-    assert [level.max_image_size_px for level in levels] == [2400, 2400, 1024, 2400, 1024]
+    assert [level.max_image_size_px for level in levels] == [
+        2400,
+        2400,
+        1024,
+        2400,
+        1024,
+    ]
     assert matchers == [None, None, "lightglue", None, "lightglue"]
     assert len({level.name for level in levels}) == len(levels)
     assert set(recipe.weights) == {"aliked-n16", "lightglue-aliked"}
@@ -75,8 +90,14 @@ def test_matcher_must_take_the_features() -> None:
 
 
 def test_matching_of_a_level_must_take_its_features() -> None:
-    values = {"escalation": [{"features": "affnet-hardnet", "matching": {"name": "lightglue"}}]}
-    with pytest.raises(OptionError, match="takes features of aliked, not of affnet-hardnet"):
+    values = {
+        "escalation": [
+            {"features": "affnet-hardnet", "matching": {"name": "lightglue"}}
+        ]
+    }
+    with pytest.raises(
+        OptionError, match="takes features of aliked, not of affnet-hardnet"
+    ):
         Recipe.from_mapping(values, "mine")
 
 
@@ -90,7 +111,9 @@ def test_settings_change_single_options() -> None:
     ]
     extraction = load_recipe("default", settings).extraction
     shapes = SecondMomentOptions(integration_sigmas_px=(4.0, 9.0))
-    assert extraction.rectifier == AffNetShapesOptions(tilt_radius=1.8, shape_source=shapes)
+    assert extraction.rectifier == AffNetShapesOptions(
+        tilt_radius=1.8, shape_source=shapes
+    )
     assert extraction.max_image_size_px == 1000
     assert load_recipe("default", settings).matching.max_ratio == 0.7
     assert extraction.features == load_recipe("default").extraction.features

@@ -20,20 +20,30 @@ from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.one_image import prepare
 
 SCENES = Path(__file__).parents[1] / "sample_scenes"
-COURTYARD_CAMERA = CameraOptions(mode="single", model="PINHOLE", params="1080,1080,360,270")
+COURTYARD_CAMERA = CameraOptions(
+    mode="single", model="PINHOLE", params="1080,1080,360,270"
+)
 
 
 @pytest.mark.long
 def test_courtyard_registers_every_photograph_where_it_stands(tmp_path):
     options = RunOptions(cameras=COURTYARD_CAMERA)
-    values = run(SCENES / "courtyard" / "images", tmp_path / "out", options).to_mapping()
-    assert (values["status"], values["unregistered"], values["num_pairs"]) == ("ok", {}, 36)
+    values = run(
+        SCENES / "courtyard" / "images", tmp_path / "out", options
+    ).to_mapping()
+    assert (values["status"], values["unregistered"], values["num_pairs"]) == (
+        "ok",
+        {},
+        36,
+    )
     assert 800 < values["points3D"] < 20_000
     assert 2.0 < values["mean_track_length"] < 6.0
     assert 0.1 < values["mean_reprojection_error_px"] < 1.5
     assert 12 <= values["num_verified_pairs"] <= 36
     truth = read_poses(SCENES / "courtyard" / "ground_truth")
-    scores = pose_scores(read_poses(tmp_path / "out" / "sparse" / "0"), truth, list(truth))
+    scores = pose_scores(
+        read_poses(tmp_path / "out" / "sparse" / "0"), truth, list(truth)
+    )
     assert len(scores.correct_names) == len(truth) == 9
     # Exactly 0 would mean that the ground truth leaked into the run.
     assert 1e-4 < scores.median_rotation_error_deg < 0.3
@@ -51,7 +61,9 @@ def facade_view(recipe_name, view):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("view", "low", "high"), [(4, 300, 6000), (5, 120, 3000), (6, 30, 2000)])
+@pytest.mark.parametrize(
+    ("view", "low", "high"), [(4, 300, 6000), (5, 120, 3000), (6, 30, 2000)]
+)
 def test_facade_matches_follow_the_true_homography(view, low, high):
     homography = np.loadtxt(SCENES / "facade" / f"H_1_{view}.txt")
     correct = {}
@@ -72,4 +84,7 @@ def test_scene_images_are_photographs_without_exif():
     for path in paths:
         assert b"Exif" not in path.read_bytes()[:4096]
         assert cv2.imread(str(path)).std() > 20
-    assert sum(path.stat().st_size for path in SCENES.rglob("*") if path.is_file()) < 6_000_000
+    assert (
+        sum(path.stat().st_size for path in SCENES.rglob("*") if path.is_file())
+        < 6_000_000
+    )

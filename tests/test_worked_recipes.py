@@ -37,7 +37,9 @@ def make_cluster_spec(**options):
 
 def run_script(*arguments: object, **options: object) -> str:
     command = [sys.executable, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, **options
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -58,11 +60,14 @@ def test_masks_leave_out_borders_and_captions(tmp_path: Path) -> None:
     expected = np.zeros(IMAGE_SIZE[::-1], bool)
     expected[12 : 240 - 48, 12 : 320 - 12] = True
     for name in names:
-        np.testing.assert_array_equal(read_mask(tmp_path / "masks" / f"{name}.png"), expected)
+        np.testing.assert_array_equal(
+            read_mask(tmp_path / "masks" / f"{name}.png"), expected
+        )
 
 
 @pytest.mark.parametrize(
-    ("script", "options"), [("on_slurm", []), ("on_kubernetes", ["--image=i", "--claim=c"])]
+    ("script", "options"),
+    [("on_slurm", []), ("on_kubernetes", ["--image=i", "--claim=c"])],
 )
 def test_cluster_is_started_and_its_address_handed_on(
     tmp_path: Path, script: str, options: list[str]
@@ -74,21 +79,36 @@ def test_cluster_is_started_and_its_address_handed_on(
     command = tmp_path / "colmap-affrect"
     command.write_text('#!/bin/sh\necho "$@"\n')
     command.chmod(0o755)
-    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(tmp_path)}
+    environment = {
+        "PATH": f"{tmp_path}:{os.environ['PATH']}",
+        "PYTHONPATH": str(tmp_path),
+    }
     given = [*options, "--", "--image-path", "p", "--output-path", "o"]
     printed = run_script(RECIPES / "cluster" / f"{script}.py", *given, env=environment)
-    assert printed == "run --image-path p --output-path o --scheduler tcp://there:8786\n"
+    assert (
+        printed == "run --image-path p --output-path o --scheduler tcp://there:8786\n"
+    )
 
 
 @pytest.mark.long
-def test_cells_of_the_notebook_run_in_order_and_register_all_photographs(tmp_path: Path) -> None:
+def test_cells_of_the_notebook_run_in_order_and_register_all_photographs(
+    tmp_path: Path,
+) -> None:
     notebook = ROOT / "docs" / "first_run.ipynb"
-    cells = [c for c in json.loads(notebook.read_text())["cells"] if c["cell_type"] == "code"]
+    cells = [
+        c for c in json.loads(notebook.read_text())["cells"] if c["cell_type"] == "code"
+    ]
     assert not any(cell["outputs"] for cell in cells)
     code = "\n".join("".join(cell["source"]) for cell in cells)
-    environment = {"PATH": "/usr/bin:/bin", "TMPDIR": str(tmp_path), "HOME": str(tmp_path)}
+    environment = {
+        "PATH": "/usr/bin:/bin",
+        "TMPDIR": str(tmp_path),
+        "HOME": str(tmp_path),
+    }
     environment |= {"MPLBACKEND": "agg"}
-    assert "9 of 9 photographs" in run_script("-c", code, cwd=notebook.parent, env=environment)
+    assert "9 of 9 photographs" in run_script(
+        "-c", code, cwd=notebook.parent, env=environment
+    )
 
 
 @pytest.mark.long

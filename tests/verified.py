@@ -32,7 +32,9 @@ def verified(
     workspace = Workspace(output)
     with workspace.locked():
         context = Context(workspace)
-        extract(context, Inputs.of(photos, cameras=cameras), load_recipe(recipe, settings))
+        extract(
+            context, Inputs.of(photos, cameras=cameras), load_recipe(recipe, settings)
+        )
         choose_pairs(context)
         match(context)
         verify_matches(context)

@@ -60,11 +60,15 @@ def write_scene(
         inside = np.logical_and(*(is_inside(part) for part in seen))
         starts = [sum(map(len, keypoints[i])) for i in (first, second)]
         for i, part in zip((first, second), seen, strict=True):
-            keypoints[i].append(part[inside] + random.normal(0, NOISE_PX, (inside.sum(), 2)))
+            keypoints[i].append(
+                part[inside] + random.normal(0, NOISE_PX, (inside.sum(), 2))
+            )
         rows = np.arange(inside.sum())
         matches[first, second] = np.stack([starts[0] + rows, starts[1] + rows], axis=1)
     with closing(pycolmap.Database.open(path)) as database:
-        camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT)
+        camera = pycolmap.Camera(
+            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT
+        )
         camera.params = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
         write_images(database, camera, names)
         for i, parts in keypoints.items():

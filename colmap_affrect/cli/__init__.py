@@ -45,7 +45,10 @@ def main(
 def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
     """Parse the arguments and run their command."""
     options = build_parser().parse_args(given or ["--help"])
-    options.words = ("colmap-affrect", *(word for word in given if word != "--overwrite"))
+    options.words = (
+        "colmap-affrect",
+        *(word for word in given if word != "--overwrite"),
+    )
     with _logging(options):
         from colmap_affrect.cli import commands  # not for --help
 

@@ -21,13 +21,24 @@ from colmap_affrect.comparison import tables
 from colmap_affrect.comparison.method_run import CompareOptions
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.results import Comparison
-from colmap_affrect.errors import AffrectError, ImageError, NoModelError, OptionError, such_as
+from colmap_affrect.errors import (
+    AffrectError,
+    ImageError,
+    NoModelError,
+    OptionError,
+    such_as,
+)
 from colmap_affrect.evaluation import evaluate as evaluating
 from colmap_affrect.evaluation.evaluate import EvaluateOptions
 from colmap_affrect.evaluation.truths import ScoreOptions
 from colmap_affrect.features import weights as files
 from colmap_affrect.images.conversion import convert_images
-from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs, list_images
+from colmap_affrect.images.photographs import (
+    CameraOptions,
+    MaskOptions,
+    Photographs,
+    list_images,
+)
 from colmap_affrect.interop import align as aligning
 from colmap_affrect.interop import export as exporting
 from colmap_affrect.interop import hdf5
@@ -93,11 +104,15 @@ def stage(options: argparse.Namespace) -> None:
     with given.context(options) as at:
         match options.command:
             case "pairs":
-                report = choose_pairs(at, given.over(at.pairing, options, "pairs"), **how)
+                report = choose_pairs(
+                    at, given.over(at.pairing, options, "pairs"), **how
+                )
             case "match":
                 report = match_pairs(at, given.matching(at.matching, options), **how)
             case _:
-                report = verify_matches(at, given.verification(options, at.verification), **how)
+                report = verify_matches(
+                    at, given.verification(options, at.verification), **how
+                )
         show(report.summary())
 
 
@@ -145,7 +160,9 @@ def compare(options: argparse.Namespace) -> None:
     if not options.json:
         show(f"\npictures: {options.output_path / 'report.html'}")
     _refuse_failed_methods(comparison, options.output_path / "comparison.json")
-    _refuse_failures((name for method in comparison.methods for name in method.failures), options)
+    _refuse_failures(
+        (name for method in comparison.methods for name in method.failures), options
+    )
 
 
 def _refuse_failed_methods(comparison: Comparison, where: Path) -> None:
@@ -174,7 +191,9 @@ def evaluate(options: argparse.Namespace) -> None:
     show(evaluation.to_json() if options.json else evaluation.summary())
     if not options.json:
         show(f"\nall pairs: {options.output_path / 'evaluation.json'}")
-    _refuse_failures((name for recipe in evaluation.recipes for name in recipe.failures), options)
+    _refuse_failures(
+        (name for recipe in evaluation.recipes for name in recipe.failures), options
+    )
 
 
 def import_h5(options: argparse.Namespace) -> None:
@@ -204,7 +223,9 @@ def panoramas(options: argparse.Namespace) -> None:
     for number, model in models.items():
         where = options.target_path / "sparse_equirectangular" / str(number)
         show(f"registered  {model.num_reg_images()} of {num_all} panoramas, {where}")
-    show(f"views       {options.target_path / 'sparse'}, with {options.target_path / 'images'}")
+    show(
+        f"views       {options.target_path / 'sparse'}, with {options.target_path / 'images'}"
+    )
 
 
 def export_h5(options: argparse.Namespace) -> None:
@@ -260,8 +281,14 @@ def doctor(options: argparse.Namespace) -> int | None:
     return 1 if diagnosis.num_errors else None
 
 
-def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> None:
-    show(report.to_json() if options.json else report.summary(with_warnings=options.quiet))
+def _print_reconstruction(
+    report: ReconstructionReport, options: argparse.Namespace
+) -> None:
+    show(
+        report.to_json()
+        if options.json
+        else report.summary(with_warnings=options.quiet)
+    )
     workspace = Workspace(options.output_path)
     if not (options.json or options.quiet):
         show("\n".join(_next_steps(report, workspace)))
@@ -282,7 +309,12 @@ def _next_steps(report: ReconstructionReport, workspace: Workspace) -> list[str]
     lines = [f"results     {workspace.path}{page}"]
     if report.status not in ("ok", "partial"):
         return lines
-    places = ["--model-path", str(model), "--output-path", str(workspace.path / "export")]
+    places = [
+        "--model-path",
+        str(model),
+        "--output-path",
+        str(workspace.path / "export"),
+    ]
     lines += ["next", f"            colmap-affrect export {shlex.join(places)}"]
     if shutil.which("colmap"):
         mapped = workspace.mapped_database
@@ -297,18 +329,26 @@ def _refuse_failures(failures: Iterable[str], options: argparse.Namespace) -> No
     """End with an error if more images than allowed could not be read."""
     names = list(dict.fromkeys(failures))
     if len(names) > (options.max_failures or 0):
-        rest = f"the results are of the others (--max-failures {len(names)} accepts that)"
-        raise ImageError(f"could not read {len(names)} of the images: {', '.join(names)}; {rest}")
+        rest = (
+            f"the results are of the others (--max-failures {len(names)} accepts that)"
+        )
+        raise ImageError(
+            f"could not read {len(names)} of the images: {', '.join(names)}; {rest}"
+        )
 
 
 def inspect(options: argparse.Namespace) -> None:
     recipe = given.recipe(options)
     if not options.image.is_file():
         raise OptionError(f"{options.image}: no such file; give a photograph")
-    photographs = Photographs(options.image.parent, given.over(MaskOptions(), options, "masks"))
+    photographs = Photographs(
+        options.image.parent, given.over(MaskOptions(), options, "masks")
+    )
     photographs.check()
     mask = photographs.mask(options.image.name)
-    extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])
+    extractor = prepare(
+        recipe.extraction, given.resources(options), [options.image.name]
+    )
     show(inspect_image(extractor, options.image, options.output_path, mask))
 
 
@@ -320,11 +360,15 @@ def lines(options: argparse.Namespace) -> None:
 
 def show_pair(options: argparse.Namespace) -> None:
     photographs = given.folder("--image-path", options.image_path)
-    show(draw_pair(options.path, tuple(options.pair), photographs, options.picture_path))
+    show(
+        draw_pair(options.path, tuple(options.pair), photographs, options.picture_path)
+    )
 
 
 def convert(options: argparse.Namespace) -> None:
-    report = convert_images(options.image_path, options.target_path, given.progress(options))
+    report = convert_images(
+        options.image_path, options.target_path, given.progress(options)
+    )
     show(report.summary())
     if report.failures:
         names = such_as(sorted(report.failures))
@@ -335,7 +379,9 @@ def recipes(options: argparse.Namespace) -> None:
     if options.name:
         show(described_toml(load_recipe(options.name)), end="")
         return
-    for name in sorted(recipe_names(), key=lambda name: name not in ("default", "rectified")):
+    for name in sorted(
+        recipe_names(), key=lambda name: name not in ("default", "rectified")
+    ):
         recipe = load_recipe(name)
         needs = list(recipe.required_weights)
         uses = [key for key in recipe.weights if key not in needs]
@@ -371,7 +417,11 @@ def _weights_of(names: Iterable[str]) -> list[str]:
         if name in recipe_names():
             keys |= dict.fromkeys(load_recipe(name).weights)
             continue
-        alike = [key for key in files.WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
+        alike = [
+            key
+            for key in files.WEIGHT_FILES
+            if key == name or key.startswith(f"{name}-")
+        ]
         keys |= dict.fromkeys(alike or [name])
     return list(keys)
 
@@ -381,10 +431,14 @@ def _show_weights(key: str, folder: Path | None) -> None:
     path = files.find(key, folder)
     file = files.WEIGHT_FILES[key]
     if not path:
-        where = f"not found: {files.install_hint([file])}colmap-affrect weights fetch {key}"
+        where = (
+            f"not found: {files.install_hint([file])}colmap-affrect weights fetch {key}"
+        )
     elif files.is_published(key, path) is False:
         where = f"{path}, NOT the published file: unless it is your own, {files.remedy(path)}"
     else:
         where = str(path)
     show(f"{key:32s} {file.used_for}, {file.file_name}\n    {where}")
-    show(f"    sha256 {file.sha256 or 'not known'}; licence {file.licence or 'not stated'}")
+    show(
+        f"    sha256 {file.sha256 or 'not known'}; licence {file.licence or 'not stated'}"
+    )

@@ -68,7 +68,9 @@ def inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[st
 def refuse_without_database(options: argparse.Namespace) -> None:
     """Refuse what is only for the database of another program."""
     if options.image_path:
-        raise OptionError("--image-path: only with --from-database; else that of extract is used")
+        raise OptionError(
+            "--image-path: only with --from-database; else that of extract is used"
+        )
     cameras = over(CameraOptions(), options, "cameras")
     given = options.matches_path, options.match_type, options.match_list_path
     if cameras != CameraOptions() or any(given):
@@ -83,7 +85,9 @@ def extension(options: argparse.Namespace) -> Extension | None:
         raise OptionError("--refine-existing: only with --extend MODEL")
     if not options.extend:
         return None
-    return Extension(model_path=options.extend, refine_existing=bool(options.refine_existing))
+    return Extension(
+        model_path=options.extend, refine_existing=bool(options.refine_existing)
+    )
 
 
 def by_hand(options: argparse.Namespace) -> ByHand:
@@ -95,7 +99,9 @@ def by_hand(options: argparse.Namespace) -> ByHand:
 
 
 def recipe(options: argparse.Namespace) -> Recipe:
-    return load_recipe(options.recipe or "default", [*options.set, *depth_settings(options)])
+    return load_recipe(
+        options.recipe or "default", [*options.set, *depth_settings(options)]
+    )
 
 
 def depth_settings(options: argparse.Namespace) -> list[str]:
@@ -123,7 +129,9 @@ def verification(
 
 
 def mapping(
-    options: argparse.Namespace, recipe: Recipe | None = None, known: MapperOptions | None = None
+    options: argparse.Namespace,
+    recipe: Recipe | None = None,
+    known: MapperOptions | None = None,
 ) -> MapperOptions:
     """Return the mapper that is given, or what is known.
 
@@ -148,7 +156,8 @@ def _seed(options: argparse.Namespace) -> dict[str, int]:
 
 def resources(options: argparse.Namespace) -> Resources:
     return Resources(
-        weights_path=folder("--weights", options.weights), device=options.device or "auto"
+        weights_path=folder("--weights", options.weights),
+        device=options.device or "auto",
     )
 
 

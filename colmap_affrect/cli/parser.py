@@ -99,7 +99,10 @@ class Parser(argparse.ArgumentParser):
         joined: list[str] = []
         for word in words:
             before = joined[-1] if joined else ""
-            is_name = re.fullmatch(r"-[^-].*", word) and word not in self._option_string_actions
+            is_name = (
+                re.fullmatch(r"-[^-].*", word)
+                and word not in self._option_string_actions
+            )
             if is_name and self._takes_value(before):
                 joined[-1] = f"{before}={word}"
             else:
@@ -116,7 +119,9 @@ class Parser(argparse.ArgumentParser):
             return
         flags = [word for word in unknown if word.startswith("-")]
         name = flags[0] if flags else unknown[0]
-        close = get_close_matches(name.partition("=")[0], self._option_string_actions, n=1)
+        close = get_close_matches(
+            name.partition("=")[0], self._option_string_actions, n=1
+        )
         meant = f" (did you mean {close[0]}?)" if close else ""
         self.error(f"unknown argument {name}{meant}")
 
@@ -141,7 +146,9 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=epilog(),
         **usual,
     )
-    parser.add_argument("--version", action="version", version=f"colmap-affrect {__version__}")
+    parser.add_argument(
+        "--version", action="version", version=f"colmap-affrect {__version__}"
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (summary, flags) in COMMANDS.items():
         subparser = commands.add_parser(
@@ -203,7 +210,9 @@ MASKS = "--mask-path --camera-mask-path"
 KNOWN_CAMERAS = """--camera-model --camera-params --cameras-path --focal-length-px
     --focal-mm --film-width-mm --principal-point"""
 CAMERAS = f"--camera-mode {KNOWN_CAMERAS} --ignore-exif"
-IMAGES = f"--image-path! --image-list-path {MASKS} --from-database {CAMERAS} --max-failures"
+IMAGES = (
+    f"--image-path! --image-list-path {MASKS} --from-database {CAMERAS} --max-failures"
+)
 RECIPE = "--recipe --set"
 PAIRS = "--match-list-path --pairs --num-neighbors --max-distance-m"
 NETWORKS = "--weights --device"

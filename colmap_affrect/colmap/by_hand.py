@@ -36,9 +36,13 @@ SIZE_COLUMNS = {4: [2], 6: [2, 5]}
 """Columns of keypoints that hold a radius, or the diagonal of a shape, by the number of columns."""
 Marks = Mapping[str, Mapping[str, Array]]
 """(2,) px from the upper left corner of the image, as COLMAP has them, by point and image name."""
-Indices = Mapping[str, Mapping[str, int]]  # numbers of keypoints, by point and image name
+Indices = Mapping[
+    str, Mapping[str, int]
+]  # numbers of keypoints, by point and image name
 Names = Annotated[tuple[str, str], Field(strict=False)]  # a list, too
-SizeOf = Callable[[str], tuple[int, int] | None]  # (width, height) of a photograph by its name
+SizeOf = Callable[
+    [str], tuple[int, int] | None
+]  # (width, height) of a photograph by its name
 
 
 def unknown_size(_: str) -> None:
@@ -83,7 +87,10 @@ class ByHand(Options):
         """
         if first in self.left_out or second in self.left_out:
             return False
-        return (first, second) not in self.rejected and (second, first) not in self.rejected
+        return (first, second) not in self.rejected and (
+            second,
+            first,
+        ) not in self.rejected
 
     def texts(self) -> tuple[str, ...]:
         """Return what is said, in a few words each."""
@@ -176,10 +183,14 @@ def require_known(name: str, names: Collection[str], option: str = "") -> None:
         OptionError: says which photograph may be meant.
     """
     if name not in names:
-        raise OptionError(f"{option}{name}: no such photograph{suggestion(name, names)}")
+        raise OptionError(
+            f"{option}{name}: no such photograph{suggestion(name, names)}"
+        )
 
 
-def _append_keypoints(database: pycolmap.Database, image_id: int, positions: Array) -> None:
+def _append_keypoints(
+    database: pycolmap.Database, image_id: int, positions: Array
+) -> None:
     """Add (N, 2) positions behind the keypoints of an image, as disks of three pixels."""
     if not database.exists_keypoints(image_id):
         database.write_keypoints(image_id, positions.astype(np.float32))
@@ -192,7 +203,9 @@ def _append_keypoints(database: pycolmap.Database, image_id: int, positions: Arr
     database.update_keypoints(image_id, np.concatenate([known, new]))
 
 
-def require_inside(place: str, mark: Array, name: str, size: tuple[int, int] | None) -> None:
+def require_inside(
+    place: str, mark: Array, name: str, size: tuple[int, int] | None
+) -> None:
     """Refuse a mark that is nowhere in its photograph.
 
     At the border it may be beyond by what marks are off anyway.
@@ -215,7 +228,9 @@ def require_inside(place: str, mark: Array, name: str, size: tuple[int, int] | N
         )
 
 
-def read_marks(path: Path, names: Collection[str], size_of: SizeOf = unknown_size) -> Marks:
+def read_marks(
+    path: Path, names: Collection[str], size_of: SizeOf = unknown_size
+) -> Marks:
     """Read a table of points that are marked in photographs.
 
     Its columns are point, photograph, x and y, in any order, or in this order without a header;
@@ -279,7 +294,9 @@ def _read_mark(place: str, row: Mapping[str, str]) -> Array:
         raise OptionError(f"{place}: x and y must be numbers of px") from error
 
 
-def triangulated(model: pycolmap.Reconstruction, marks: Mapping[int, Array]) -> Array | None:
+def triangulated(
+    model: pycolmap.Reconstruction, marks: Mapping[int, Array]
+) -> Array | None:
     """Return the (3,) position that marks of registered images, by their ids, have in common.
 
     None where their rays do not meet in front of the cameras.

@@ -41,8 +41,12 @@ class CameraRecord:
     focal_px: float  # in px of the stored file; the mean of two
     why: str = ""  # what was decided and for what reason, one clause
     size: tuple[int, int] = (0, 0)  # (width, height) of its images in px
-    given: tuple[Given, ...] = ()  # what of the intrinsics is the user's, to be left as it is
-    lens_mm: float = 0.0  # by EXIF, where nothing tells the size of the sensor, and so the px
+    given: tuple[
+        Given, ...
+    ] = ()  # what of the intrinsics is the user's, to be left as it is
+    lens_mm: float = (
+        0.0  # by EXIF, where nothing tells the size of the sensor, and so the px
+    )
     uncropped_px: float = 0.0  # what EXIF says of a crop, if it was not scaled; else 0
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
@@ -156,7 +160,9 @@ class GivenCamera(Options):
     @pydantic.model_validator(mode="after")
     def _says_all_once(self) -> Self:
         if self.params and (self.focal_px or self.focal_mm or self.cx is not None):
-            raise ValueError("params have focal length and principal point; leave these out")
+            raise ValueError(
+                "params have focal length and principal point; leave these out"
+            )
         if self.focal_px and self.focal_mm:
             raise ValueError("focal_px and focal_mm say the same twice; leave one out")
         if (self.focal_mm is None) != (self.plate_width_mm is None):
@@ -180,7 +186,9 @@ class GivenCamera(Options):
             )
         focals_px = [self.params[index] for index in like.focal_length_idxs()]
         if min(focals_px) <= 0.0:
-            raise ValueError(f"params: a focal length of {self.params[0]:g} px cannot be")
+            raise ValueError(
+                f"params: a focal length of {self.params[0]:g} px cannot be"
+            )
 
 
 def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
@@ -190,12 +198,16 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     cannot be read, naming the line.
     """
     if bool(options.focal_mm) != bool(options.film_width_mm):
-        raise OptionError("--focal-mm, --film-width-mm: one without the other; give both")
+        raise OptionError(
+            "--focal-mm, --film-width-mm: one without the other; give both"
+        )
     says = {"name": "", "model": options.model, "params": options.params}
     if options.focal_length_px:
         says["focal_px"] = str(options.focal_length_px)
     if options.principal_point:
-        says["cx"], _, says["cy"] = options.principal_point.replace(",", " ").partition(" ")
+        says["cx"], _, says["cy"] = options.principal_point.replace(",", " ").partition(
+            " "
+        )
     where = "--camera-model, --camera-params, --focal-length-px or --principal-point"
     others = GivenCamera.from_mapping({**says, "where": "the options"}, where)
     if not options.cameras_path:
@@ -244,7 +256,9 @@ def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
     return found
 
 
-def _completed(given: GivenCamera, cells: Mapping[str, str], others: GivenCamera) -> GivenCamera:
+def _completed(
+    given: GivenCamera, cells: Mapping[str, str], others: GivenCamera
+) -> GivenCamera:
     """Return the camera of a row of a table; what its cells do not say is as in ``others``."""
     if cells.keys() <= {"name", "camera"}:
         given = given.changed(params=others.params)

@@ -56,7 +56,9 @@ FATAL_AS_IT_IS = FATAL | {"no-frame"}
 """The same for a database that is mapped without a copy, which would get frames."""
 FATAL_BEFORE_MAPPING = FATAL - {"rig-without-pose"}
 """The same where nothing is mapped yet."""
-Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
+Problems = dict[
+    str, list[str]
+]  # by kind the images, pairs or cameras concerned, if any
 
 MATRICES = {  # columns that hold so many float64 or nothing, by table
     "two_view_geometries": {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
@@ -64,19 +66,29 @@ MATRICES = {  # columns that hold so many float64 or nothing, by table
     "rig_sensors": {"sensor_from_rig": 7},
 }
 
-PACKED_CAMERA = struct.Struct("<IiQQBQ")  # id, model, size, prior, and how many parameters follow
+PACKED_CAMERA = struct.Struct(
+    "<IiQQBQ"
+)  # id, model, size, prior, and how many parameters follow
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
 MAX_OUTSIDE = 0.01  # of the longer side: so far some programs find, or move, what is at the border
 MAX_OUTSIDE_PX = 2.0  # more than that
 MIN_NORMALISED = 3  # keypoints, none further from the corner than ...
-MAX_NORMALISED = 2.0  # ... so many px: their unit is a side of the image, or half of one
-MIN_IN_A_CORNER = 100  # keypoints that should fill an image, of each of so many images ...
+MAX_NORMALISED = (
+    2.0  # ... so many px: their unit is a side of the image, or half of one
+)
+MIN_IN_A_CORNER = (
+    100  # keypoints that should fill an image, of each of so many images ...
+)
 MIN_IMAGES_IN_A_CORNER = 3  # ... or more; none of them reaches further than ...
 IN_A_CORNER = 0.6  # ... so many sides from the upper left corner
-MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
+MIN_AT_ONE_PLACE = (
+    10  # one place has a few keypoints, of several orientations or shapes
+)
 
 
-def refuse_unusable(path: Path, kinds: Collection[str] = FATAL, *, warns: bool = False) -> None:
+def refuse_unusable(
+    path: Path, kinds: Collection[str] = FATAL, *, warns: bool = False
+) -> None:
     """Refuse a damaged database, or one with some kinds of problems.
 
     Args:
@@ -131,7 +143,11 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         if not len(focals):
             found["camera-panorama"].append(f"{label}: {like.model.name}")
         params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
-        if params is None or not np.isfinite(params).all() or (params[0, focals] <= 0.0).any():
+        if (
+            params is None
+            or not np.isfinite(params).all()
+            or (params[0, focals] <= 0.0).any()
+        ):
             found["bad-camera"].append(label)
         shorter = min(camera.width, camera.height)
         longer = max(camera.width, camera.height)
@@ -139,7 +155,9 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
             found["bad-camera"].append(f"{label}: {camera.width} x {camera.height} px")
 
 
-def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
+def _check_images(
+    connection: sqlite3.Connection, tables: Tables, found: Problems
+) -> None:
     _check_image_names(connection, tables, found)
     for image_id, name in tables.names.items():
         if tables.camera_ids[image_id] not in tables.cameras:
@@ -148,9 +166,13 @@ def _check_images(connection: sqlite3.Connection, tables: Tables, found: Problem
             found["no-frame"].append(name)
 
 
-def _check_image_names(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
+def _check_image_names(
+    connection: sqlite3.Connection, tables: Tables, found: Problems
+) -> None:
     (encoding,) = connection.execute("PRAGMA encoding").fetchone()  # of all its texts
-    rows = connection.execute("SELECT image_id, CAST(name AS BLOB), typeof(name) FROM images")
+    rows = connection.execute(
+        "SELECT image_id, CAST(name AS BLOB), typeof(name) FROM images"
+    )
     for image_id, raw, kind in rows:
         codec = encoding if kind == "text" else "utf-8"
         name = (raw or b"").decode(codec, "replace")
@@ -195,7 +217,9 @@ def _is_camera_or_none(blob: Any) -> bool:
     return like is not None and count == len(like.params) and len(blob) == size
 
 
-def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
+def _check_keypoints(
+    connection: sqlite3.Connection, tables: Tables, found: Problems
+) -> None:
     extents: dict[str, float] = {}
     rows = rows_of(connection, "image_id rows cols data", "keypoints")
     for image_id, count, width, blob in rows:
@@ -224,11 +248,15 @@ def _size_of(tables: Tables, image_id: int) -> tuple[int, int] | None:
     return (camera.width, camera.height) if camera else None
 
 
-def _check_descriptors(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
+def _check_descriptors(
+    connection: sqlite3.Connection, tables: Tables, found: Problems
+) -> None:
     rows = rows_of(connection, "image_id rows cols data", "descriptors")
     for image_id, count, width, blob in rows:
         if _array(blob, count, width, np.dtype("u1")) is None:
-            found["descriptor-data"].append(tables.names.get(image_id, f"image {image_id}"))
+            found["descriptor-data"].append(
+                tables.names.get(image_id, f"image {image_id}")
+            )
 
 
 def extent(keypoints: Singles, size: tuple[int, int]) -> float:
@@ -267,7 +295,9 @@ def keypoint_problems(keypoints: Floats, size: tuple[int, int] | None) -> list[s
 
 def _are_normalised(points: Floats) -> bool:
     """Tell whether (N, 2) keypoints are not in px, but in sides of their image."""
-    return len(points) >= MIN_NORMALISED and bool(np.abs(points).max() <= MAX_NORMALISED)
+    return len(points) >= MIN_NORMALISED and bool(
+        np.abs(points).max() <= MAX_NORMALISED
+    )
 
 
 def _are_outside(points: Floats, size: tuple[int, int]) -> bool:
@@ -284,12 +314,16 @@ def _are_at_one_place(points: Floats, num_keypoints: int) -> bool:
     if len(points) < MIN_AT_ONE_PLACE:
         return False
     middle = len(points) // 2
-    median = np.partition(points, middle, axis=0)[middle]  # what more than half have is the median
+    median = np.partition(points, middle, axis=0)[
+        middle
+    ]  # what more than half have is the median
     num_there = int((points == median).all(axis=1).sum())
     return num_there >= max(MIN_AT_ONE_PLACE, num_keypoints // 2 + 1)
 
 
-def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:
+def _array(
+    blob: Any, rows: int, columns: int, dtype: np.dtype[Any]
+) -> NDArray[Any] | None:
     """Return the (rows, columns) array that is stored in a table, None if it is another size."""
     data = b"" if blob is None else blob
     if not isinstance(data, bytes) or rows < 0 or columns < 0:
@@ -299,9 +333,13 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
     return np.frombuffer(data, dtype).reshape(rows, columns)
 
 
-def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
+def _check_pairs(
+    connection: sqlite3.Connection, tables: Tables, found: Problems
+) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
-        for pair_id, rows, columns, blob in rows_of(connection, "pair_id rows cols data", table):
+        for pair_id, rows, columns, blob in rows_of(
+            connection, "pair_id rows cols data", table
+        ):
             image_ids = divmod(pair_id, MAX_NUM_IMAGES)
             matches = _array(blob, rows, columns, np.dtype("<u4"))
             if not _are_matches(matches, image_ids, tables):
@@ -309,7 +347,9 @@ def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems
                 found["match-data"].append(f"{names[0]} - {names[1]} ({what})")
 
 
-def _are_matches(matches: NDArray[Any] | None, image_ids: tuple[int, int], tables: Tables) -> bool:
+def _are_matches(
+    matches: NDArray[Any] | None, image_ids: tuple[int, int], tables: Tables
+) -> bool:
     """Tell whether matches are (M, 2) numbers of keypoints of two images of a database."""
     if matches is None or image_ids[0] == image_ids[1]:
         return False
@@ -319,5 +359,7 @@ def _are_matches(matches: NDArray[Any] | None, image_ids: tuple[int, int], table
         return True
     if matches.shape[1] != 2:
         return False
-    num_keypoints = [tables.keypoints.get(image_id, (0, 0))[0] for image_id in image_ids]
+    num_keypoints = [
+        tables.keypoints.get(image_id, (0, 0))[0] for image_id in image_ids
+    ]
     return bool((matches.max(axis=0) < num_keypoints).all())

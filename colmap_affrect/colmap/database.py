@@ -36,7 +36,9 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         # A Ctrl-C while pycolmap converts a Path would become a TypeError.
         database = pycolmap.Database.open(str(path))
     except NotAFileError as error:
-        raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error
+        raise DatabaseError(
+            f"{path}: not a usable COLMAP database ({error})"
+        ) from error
     except RuntimeError as error:
         require_space(path, BYTES_OF_EMPTY_DATABASE)
         raise DatabaseError(
@@ -60,7 +62,9 @@ def _mend(path: Path) -> str:
 
 
 def write_frame(
-    database: pycolmap.Database, image: pycolmap.Image, rigs: dict[pycolmap.sensor_t, int]
+    database: pycolmap.Database,
+    image: pycolmap.Image,
+    rigs: dict[pycolmap.sensor_t, int],
 ) -> None:
     """Give an image a frame of the rig of its camera.
 
@@ -116,7 +120,9 @@ def nearest_positions(
     return spatial_pairs(path, options)
 
 
-def spatial_pairs(path: Path, options: pycolmap.SpatialPairingOptions) -> list[tuple[str, str]]:
+def spatial_pairs(
+    path: Path, options: pycolmap.SpatialPairingOptions
+) -> list[tuple[str, str]]:
     """Return the pairs of COLMAP's spatial matcher whose positions are places on earth.
 
     DatabaseError without two such positions.
@@ -157,7 +163,9 @@ def read_positions(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
 
 
 def generated_pairs(
-    path: Path, kind: Callable[[Any, pycolmap.Database], pycolmap.PairGenerator], options: object
+    path: Path,
+    kind: Callable[[Any, pycolmap.Database], pycolmap.PairGenerator],
+    options: object,
 ) -> list[tuple[str, str]]:
     """Return the pairs of images that a generator of pycolmap makes.
 
@@ -220,7 +228,11 @@ def colmap_keypoints(lafs: Floats) -> Singles:
     The centre moves to COLMAP's corner origin; the shape maps the unit circle to one sigma.
     """
     centers = conventions.colmap_from_pixel(lafs[:, :, 2].astype(np.float32))
-    shapes = (lafs[:, :, :2] / conventions.MEASUREMENT_SIGMAS).astype(np.float32).reshape(-1, 4)
+    shapes = (
+        (lafs[:, :, :2] / conventions.MEASUREMENT_SIGMAS)
+        .astype(np.float32)
+        .reshape(-1, 4)
+    )
     return np.concatenate([centers, shapes], axis=1)
 
 
@@ -238,7 +250,10 @@ def has_keypoints(database: pycolmap.Database, image_id: int, count: int) -> boo
 
 
 def write_keypoints(
-    database: pycolmap.Database, image_id: int, lafs: Floats, level_ends: Sequence[int] = ()
+    database: pycolmap.Database,
+    image_id: int,
+    lafs: Floats,
+    level_ends: Sequence[int] = (),
 ) -> None:
     """Write the keypoints of an image.
 
@@ -272,7 +287,9 @@ def write_keypoints(
 
 DESCRIPTOR_SIZE = 128
 DESCRIPTOR_NORM = 512
-SIGNED_SHIFT = 0.30  # added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0
+SIGNED_SHIFT = (
+    0.30  # added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0
+)
 
 
 def read_descriptors(
@@ -292,14 +309,18 @@ def read_descriptors(
     descriptors = database.read_descriptors(image_id)
     count = len(descriptors.data)
     if count != num_keypoints:
-        raise DatabaseError(f"{where} has {num_keypoints} keypoints and {count} descriptors")
+        raise DatabaseError(
+            f"{where} has {num_keypoints} keypoints and {count} descriptors"
+        )
     try:
         return np.asarray(descriptors.to_float().data, np.float32)
     except ValueError as error:
         raise DatabaseError(f"{where} has descriptors of no known type") from error
 
 
-def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: Floats) -> None:
+def write_descriptors(
+    database: pycolmap.Database, image_id: int, descriptors: Floats
+) -> None:
     """Write the descriptors of an image as uint8 rows of length 512, as COLMAP's SIFT has them.
 
     Signed ones are shifted to positive values first, which makes all angles smaller and hardly
@@ -325,7 +346,9 @@ def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: F
     scaled = DESCRIPTOR_NORM * positive / np.maximum(lengths, np.finfo(np.float64).tiny)
     rows = np.asarray(np.minimum(np.rint(scaled), 255), dtype=np.uint8)
     sift = pycolmap.FeatureExtractorType.SIFT
-    database.write_descriptors(image_id, pycolmap.FeatureDescriptors(type=sift, data=rows))
+    database.write_descriptors(
+        image_id, pycolmap.FeatureDescriptors(type=sift, data=rows)
+    )
 
 
 def fill_descriptors(path: Path, features: FeatureStore) -> None:
@@ -334,9 +357,13 @@ def fill_descriptors(path: Path, features: FeatureStore) -> None:
     counts = features.num_keypoints()
     names = [name for name in counts if name in ids]
     with open_database(path) as database:
-        num_written = {name: database.num_descriptors_for_image(ids[name]) for name in names}
+        num_written = {
+            name: database.num_descriptors_for_image(ids[name]) for name in names
+        }
         are_stale = [num_written[name] not in (0, counts[name]) for name in names]
-        if any(are_stale):  # from before an escalation; COLMAP cannot replace single ones
+        if any(
+            are_stale
+        ):  # from before an escalation; COLMAP cannot replace single ones
             database.clear_descriptors()
             num_written = dict.fromkeys(names, 0)
         for name in names:
@@ -354,11 +381,16 @@ def camera_matrix(camera: pycolmap.Camera) -> Array:
 def cameras_of_images(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
     """Return the camera of each image by image id."""
     cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    return {image.image_id: cameras[image.camera_id] for image in database.read_all_images()}
+    return {
+        image.image_id: cameras[image.camera_id] for image in database.read_all_images()
+    }
 
 
 def write_matches(
-    database: pycolmap.Database, image_id1: int, image_id2: int, indices: NDArray[np.integer]
+    database: pycolmap.Database,
+    image_id1: int,
+    image_id2: int,
+    indices: NDArray[np.integer],
 ) -> None:
     """Write the raw matches of a pair; every index is checked first.
 
@@ -384,14 +416,22 @@ def write_matches(
 
 
 def _check_indices(
-    database: pycolmap.Database, image_ids: tuple[int, int], indices: NDArray[np.integer]
+    database: pycolmap.Database,
+    image_ids: tuple[int, int],
+    indices: NDArray[np.integer],
 ) -> None:
     """Refuse matches that are not (M, 2) numbers of keypoints of two images."""
     image_id1, image_id2 = image_ids
     if image_id1 == image_id2:
         raise DatabaseError(f"image {image_id1} cannot be matched with itself")
-    if indices.ndim != 2 or indices.shape[1] != 2 or not np.issubdtype(indices.dtype, np.integer):
-        raise DatabaseError(f"matches must be (M, 2) integers, not {indices.dtype}{indices.shape}")
+    if (
+        indices.ndim != 2
+        or indices.shape[1] != 2
+        or not np.issubdtype(indices.dtype, np.integer)
+    ):
+        raise DatabaseError(
+            f"matches must be (M, 2) integers, not {indices.dtype}{indices.shape}"
+        )
     if not indices.size:
         return
     counts = [

@@ -64,7 +64,10 @@ Change = Callable[[pycolmap.Database], None]
 
 
 def copy_database(
-    source: Path, target: Path, refused: Collection[str] = (), change: Change | None = None
+    source: Path,
+    target: Path,
+    refused: Collection[str] = (),
+    change: Change | None = None,
 ) -> None:
     """Copy a database as it is now, including its write-ahead log.
 
@@ -124,7 +127,9 @@ def _one_line(source: Path, target: Path) -> Iterator[None]:
         raise
 
 
-def _copy_tables(original: sqlite3.Connection, target: Path, version: int | None = None) -> None:
+def _copy_tables(
+    original: sqlite3.Connection, target: Path, version: int | None = None
+) -> None:
     """Copy the rows of COLMAP's tables.
 
     Args:
@@ -148,7 +153,9 @@ def _columns(connection: sqlite3.Connection, table: str) -> list[str]:
     return sorted(name for name in columns_of(connection, table) if name.isidentifier())
 
 
-def _make_table(original: sqlite3.Connection, copy: sqlite3.Connection, table: str) -> None:
+def _make_table(
+    original: sqlite3.Connection, copy: sqlite3.Connection, table: str
+) -> None:
     """Make a table with the columns of the original, and none of its conditions."""
     if not columns_of(original, table):
         return
@@ -164,7 +171,9 @@ def _make_table(original: sqlite3.Connection, copy: sqlite3.Connection, table: s
     copy.execute(f"CREATE TABLE {table} ({', '.join(columns)})")
 
 
-def _copy_rows(original: sqlite3.Connection, copy: sqlite3.Connection, table: str) -> None:
+def _copy_rows(
+    original: sqlite3.Connection, copy: sqlite3.Connection, table: str
+) -> None:
     """Copy the columns that both tables have.
 
     SQLite takes names of tables and columns in no other way than in the text of a statement.
@@ -216,7 +225,9 @@ def open_copy(
 def read_names(source: Path) -> list[str]:
     """Return the names of the images of a database, which is only read."""
     with open_read_only(source) as connection:
-        return sorted(str(name) for (name,) in connection.execute("SELECT name FROM images"))
+        return sorted(
+            str(name) for (name,) in connection.execute("SELECT name FROM images")
+        )
 
 
 def read_sizes(source: Path) -> dict[str, tuple[int, int]]:

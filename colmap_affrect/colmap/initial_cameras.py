@@ -44,7 +44,11 @@ from colmap_affrect.images.exif import (
     exif_focal,
     read_camera_tags,
 )
-from colmap_affrect.images.photographs import CameraOptions, photograph_files, require_folder
+from colmap_affrect.images.photographs import (
+    CameraOptions,
+    photograph_files,
+    require_folder,
+)
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, why_unusable
 from colmap_affrect.project.outputs import database_files, remove_own, temporary_folder
 
@@ -147,7 +151,10 @@ class InitialCameras:
             if size == self.size(first):
                 continue
             both = f"{first} is {_px(self.size(first) or size)}, {name} is {_px(size)}"
-            if self.given(first).params and self.given(first).params == self.given(name).params:
+            if (
+                self.given(first).params
+                and self.given(first).params == self.given(name).params
+            ):
                 raise OptionError(
                     f"{self._who(first)}: {both}, and the given parameters are of one size; give "
                     "those of each size as params in a table (--cameras-path), or leave them out"
@@ -190,7 +197,12 @@ class InitialCameras:
             given = self._given_of(same)
             before = database.read_camera(camera_id)
             size = (before.width, before.height)
-            if not (given.params or given.focal_px or given.focal_mm or self.options.focal_mm):
+            if not (
+                given.params
+                or given.focal_px
+                or given.focal_mm
+                or self.options.focal_mm
+            ):
                 continue
             if given.size and tuple(given.size) != size:
                 raise OptionError(
@@ -216,7 +228,9 @@ class InitialCameras:
                 )
         return first
 
-    def camera(self, names: Sequence[str], size: Size) -> tuple[pycolmap.Camera, CameraRecord]:
+    def camera(
+        self, names: Sequence[str], size: Size
+    ) -> tuple[pycolmap.Camera, CameraRecord]:
         """Return the camera that images of one size share, and what is known of it."""
         given = self._given_of(names)
         longer = max(size)
@@ -227,7 +241,11 @@ class InitialCameras:
         parts: list[Given] = ["focal"] if source == "given" else []
         if given.params:
             camera.params = list(given.params)
-        elif given.cx is not None and given.cy is not None and len(camera.principal_point_idxs()):
+        elif (
+            given.cx is not None
+            and given.cy is not None
+            and len(camera.principal_point_idxs())
+        ):
             camera.principal_point_x = given.cx
             camera.principal_point_y = given.cy
         if given.params or given.cx is not None:
@@ -241,10 +259,14 @@ class InitialCameras:
             why = "a panorama, which no camera model fits? give the photographs that it is made of"
         if source == "given" and focal and not low <= focal / longer <= high:
             why = f"{focal / longer:.2g} longer sides; is it in px of the stored files?"
-        record = CameraRecord(tuple(sorted(names)), source, focal, why, size, tuple(parts))
+        record = CameraRecord(
+            tuple(sorted(names)), source, focal, why, size, tuple(parts)
+        )
         if source == "guess":
             found = self._exif_focal(names)
-            record = replace(record, lens_mm=found.lens_mm, uncropped_px=found.uncropped_px)
+            record = replace(
+                record, lens_mm=found.lens_mm, uncropped_px=found.uncropped_px
+            )
         return camera, record
 
     def _set_focal(
@@ -283,8 +305,15 @@ class InitialCameras:
     @cached_property
     def _cropped_bodies(self) -> set[tuple[str, str, str]]:
         """Bodies of cameras of which photographs were cropped."""
-        all_tags = [self._tags(name) for name in photograph_files(self.image_path, IMAGE_SUFFIXES)]
-        return {tags.body for tags in all_tags if tags and tags.was_cropped and any(tags.body)}
+        all_tags = [
+            self._tags(name)
+            for name in photograph_files(self.image_path, IMAGE_SUFFIXES)
+        ]
+        return {
+            tags.body
+            for tags in all_tags
+            if tags and tags.was_cropped and any(tags.body)
+        }
 
     def _exif_focal(self, names: Sequence[str]) -> ExifFocal:
         """Return the focal length that EXIF gives images of one camera; first that has one."""

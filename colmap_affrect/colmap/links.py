@@ -32,7 +32,9 @@ IDS = {
 MAX_ID = MAX_NUM_IMAGES - 1
 MAX_PAIR_ID = MAX_ID * MAX_NUM_IMAGES + MAX_ID
 
-Found = Mapping[str, list[str]]  # by kind of problem the rows concerned; see checks.toml
+Found = Mapping[
+    str, list[str]
+]  # by kind of problem the rows concerned; see checks.toml
 
 
 class _Sensor(NamedTuple):
@@ -103,20 +105,28 @@ def _check_ids(connection: sqlite3.Connection, found: Found) -> None:
 
 
 def _check_priors(connection: sqlite3.Connection, found: Found) -> None:
-    priors = rows_of(connection, "corr_sensor_type corr_sensor_id corr_data_id", "pose_priors")
+    priors = rows_of(
+        connection, "corr_sensor_type corr_sensor_id corr_data_id", "pose_priors"
+    )
     known = [row for row in priors if row[1]]  # databases of old have no such columns
     for kind, number, data_id in known:
         if not (_is_id(number) and _is_id(data_id)):
-            found["bad-id"].append(f"pose prior of {data_id!r} of {_Sensor(kind, number)}")
+            found["bad-id"].append(
+                f"pose prior of {data_id!r} of {_Sensor(kind, number)}"
+            )
     for kind, number, data_id in _twice(known):
-        found["bad-id"].append(f"pose prior of {data_id!r} of {_Sensor(kind, number)}, twice")
+        found["bad-id"].append(
+            f"pose prior of {data_id!r} of {_Sensor(kind, number)}, twice"
+        )
 
 
 def _check_foreign_keys(connection: sqlite3.Connection, found: Found) -> None:
     for table in ("rig_sensors", "frames", "frame_data"):
         if not columns_of(connection, table):
             continue
-        for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
+        for _, row, parent, _ in connection.execute(
+            f"PRAGMA foreign_key_check({table})"
+        ):
             found["no-parent"].append(f"row {row} of {table}, {parent}")
 
 
@@ -125,8 +135,12 @@ def _members(connection: sqlite3.Connection) -> list[_Member]:
     members = []
     references = rows_of(connection, "rig_id ref_sensor_type ref_sensor_id", "rigs")
     for rig_id, kind, number in references:
-        members.append(_Member(int(rig_id), _Sensor(int(kind), int(number)), True, True))
-    others = rows_of(connection, "rig_id sensor_type sensor_id sensor_from_rig", "rig_sensors")
+        members.append(
+            _Member(int(rig_id), _Sensor(int(kind), int(number)), True, True)
+        )
+    others = rows_of(
+        connection, "rig_id sensor_type sensor_id sensor_from_rig", "rig_sensors"
+    )
     for rig_id, kind, number, pose in others:
         sensor = _Sensor(int(kind), int(number))
         members.append(_Member(int(rig_id), sensor, False, bool(pose)))
@@ -166,7 +180,10 @@ def _data(connection: sqlite3.Connection) -> list[_Datum]:
 
 
 def _check_frames(
-    connection: sqlite3.Connection, members: Sequence[_Member], tables: Tables, found: Found
+    connection: sqlite3.Connection,
+    members: Sequence[_Member],
+    tables: Tables,
+    found: Found,
 ) -> None:
     """Find frames that hold what is not of their rig, or not of their images."""
     rig_ids = {}

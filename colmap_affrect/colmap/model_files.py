@@ -31,7 +31,9 @@ Poses = dict[str, Pose]  # poses by image name
 MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
 FAR = 1e12  # coordinates beyond it are no positions: nothing can be computed with them
 QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds
-SUMMARY = "summary.json"  # beside a model of ours; has the digests of its files as ``model``
+SUMMARY = (
+    "summary.json"  # beside a model of ours; has the digests of its files as ``model``
+)
 
 
 class _Reader:
@@ -68,7 +70,9 @@ class _Reader:
 def camera_like(model: int) -> pycolmap.Camera | None:
     """Return a camera of a model of COLMAP by its number, None if there is no such model."""
     try:
-        return pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
+        return pycolmap.Camera.create_from_model_id(
+            1, pycolmap.CameraModelId(model), 1.0, 1, 1
+        )
     except (ValueError, RuntimeError, TypeError):
         return None
 
@@ -106,18 +110,26 @@ def _image(reader: _Reader) -> str:
 
 
 def _point(reader: _Reader) -> None:
-    *_, length = reader.take("Q3d3BdQ")  # id, position, colour, error, length of the track
+    *_, length = reader.take(
+        "Q3d3BdQ"
+    )  # id, position, colour, error, length of the track
     reader.skip(8 * length)
 
 
-RECORDS: dict[str, Callable[[_Reader], Any]] = {  # what reads a record of each file of a model
+RECORDS: dict[
+    str, Callable[[_Reader], Any]
+] = {  # what reads a record of each file of a model
     "cameras.bin": _camera,
     "rigs.bin": _rig,
     "frames.bin": _frame,
     "images.bin": _image,
     "points3D.bin": _point,
 }
-OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")  # of COLMAP before it knew rigs
+OLD_RECORDS = (
+    "cameras.bin",
+    "images.bin",
+    "points3D.bin",
+)  # of COLMAP before it knew rigs
 
 
 def _read_records(path: Path) -> list[Any]:
@@ -350,10 +362,14 @@ def _is_usable(camera: pycolmap.Camera) -> bool:
 def _is_pose(pose: pycolmap.Rigid3d) -> bool:
     """Return whether a pose has a quaternion of length 1 and a finite translation."""
     length = float(np.linalg.norm(pose.rotation.quat))
-    return abs(length - 1.0) < QUATERNION_ERROR and bool((np.abs(pose.translation) < FAR).all())
+    return abs(length - 1.0) < QUATERNION_ERROR and bool(
+        (np.abs(pose.translation) < FAR).all()
+    )
 
 
-def num_long_tracks(model: pycolmap.Reconstruction, same_view: Mapping[int, int]) -> Counter[int]:
+def num_long_tracks(
+    model: pycolmap.Reconstruction, same_view: Mapping[int, int]
+) -> Counter[int]:
     """Return how many points of three views or more each image sees, by its id.
 
     ``same_view``: of images that show the view of another one, the id of that.

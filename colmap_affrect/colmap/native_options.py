@@ -13,11 +13,16 @@ from typing import Any
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import flat, suggestion
 
-MAX_NUM_THREADS = 1024  # COLMAP starts them all, and waits for ever for those that it cannot have
+MAX_NUM_THREADS = (
+    1024  # COLMAP starts them all, and waits for ever for those that it cannot have
+)
 
 Plain = bool | int | float | str
 
-OWNED = {"image_path": "it is the one that extract was given", "random_seed": "use --random-seed"}
+OWNED = {
+    "image_path": "it is the one that extract was given",
+    "random_seed": "use --random-seed",
+}
 """Options, in any section, that are set by other means."""
 
 
@@ -26,7 +31,9 @@ def flat_values(options: Any) -> dict[str, Any]:
     return flat(options.todict())
 
 
-def differences(options: Any, default: Any, named: Collection[str] = ()) -> dict[str, Plain]:
+def differences(
+    options: Any, default: Any, named: Collection[str] = ()
+) -> dict[str, Plain]:
     """Return the plain values of pycolmap's options that are not the usual ones.
 
     Args:
@@ -39,7 +46,11 @@ def differences(options: Any, default: Any, named: Collection[str] = ()) -> dict
     """
     usual = _plain_values(default)
     values = _plain_values(options)
-    return {key: value for key, value in values.items() if key in named or value != usual[key]}
+    return {
+        key: value
+        for key, value in values.items()
+        if key in named or value != usual[key]
+    }
 
 
 def set_values(options: Any, values: Mapping[str, Any]) -> None:
@@ -77,7 +88,9 @@ def resolve(
         if name in owned:
             raise OptionError(f"{where}: cannot be changed here; {owned[name]}")
         if key not in plain:
-            raise OptionError(f"{where}: cannot be given, it is of type {kind.__name__}")
+            raise OptionError(
+                f"{where}: cannot be given, it is of type {kind.__name__}"
+            )
         try:
             parsed = _parsed(given[text], known[key])
             _check_num_threads(name, parsed, where)
@@ -93,7 +106,9 @@ def resolve(
 
 def _check_num_threads(name: str, value: Any, where: str) -> None:
     if name == "num_threads" and value > MAX_NUM_THREADS:
-        raise OptionError(f"{where}={value}: at most {MAX_NUM_THREADS}, or -1 for all cores")
+        raise OptionError(
+            f"{where}={value}: at most {MAX_NUM_THREADS}, or -1 for all cores"
+        )
 
 
 def _expected(kind: type) -> str:
@@ -106,7 +121,10 @@ def _parsed(value: Any, example: Any) -> Any:
     """Return the number, truth value or name of an enumeration that a text stands for."""
     if isinstance(example, bool | int | float) and isinstance(value, str):
         value = json.loads(value.lower())
-        if isinstance(example, bool) and value in (0, 1):  # as COLMAP's command line has it
+        if isinstance(example, bool) and value in (
+            0,
+            1,
+        ):  # as COLMAP's command line has it
             value = bool(value)
     elif hasattr(type(example), "__members__") and isinstance(value, str):
         value = getattr(type(example), value.upper(), value)
@@ -138,7 +156,9 @@ def _full_key(text: str, known: Mapping[str, Any], flag: str) -> str:
         return text
     found = [key for key in known if _name(key) == text]
     if len(found) > 1:
-        raise OptionError(f"{flag} {text}: exists in several sections; give {' or '.join(found)}")
+        raise OptionError(
+            f"{flag} {text}: exists in several sections; give {' or '.join(found)}"
+        )
     if not found:
         hint = suggestion(text, [*known, *map(_name, known)])
         raise OptionError(f"{flag} {text}: pycolmap has no such option{hint}")

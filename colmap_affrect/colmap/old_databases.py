@@ -23,10 +23,14 @@ MAPPER_OPTIONS = (
 """Our preset for few photographs: by its defaults ``colmap mapper`` finds less, or nothing."""
 
 LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)  # that COLMAP 3.8 has
-FILL = Path(__file__).with_name("colmap_3_8.sql")  # makes the tables, from an attached ``new``
+FILL = Path(__file__).with_name(
+    "colmap_3_8.sql"
+)  # makes the tables, from an attached ``new``
 
 
-def export_database(path: PathLike, database_path: PathLike, *, descriptors: bool = False) -> int:
+def export_database(
+    path: PathLike, database_path: PathLike, *, descriptors: bool = False
+) -> int:
     """Write a database as COLMAP 3.8 makes them; ids stay, and the old one is only read.
 
     Rigs and descriptors of networks are left out. Positions are those of the priors, latitude,
@@ -92,7 +96,9 @@ def _positions(database: pycolmap.Database) -> list[tuple[float, float, float, i
     return positions
 
 
-def _fill(old: Path, new: Path, positions: Sequence[tuple[float, float, float, int]]) -> int:
+def _fill(
+    old: Path, new: Path, positions: Sequence[tuple[float, float, float, int]]
+) -> int:
     """Write a database of COLMAP 3.8; return how many images have descriptors."""
     with closing(sqlite3.connect(old)) as connection:
         connection.execute("ATTACH ? AS new", (str(new),))

@@ -20,8 +20,13 @@ from colmap_affrect.project.regular_files import (
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
 MAGIC = b"SQLite format 3\0"  # begins each file of SQLite's that is not empty
 HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
-DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # what sqlite3 raises, also quoting odd bytes
-MAX_NUM_IMAGES = 2**31 - 1  # an id of a pair is the smaller image id times this, plus the larger
+DAMAGED = (
+    sqlite3.Error,
+    UnicodeDecodeError,
+)  # what sqlite3 raises, also quoting odd bytes
+MAX_NUM_IMAGES = (
+    2**31 - 1
+)  # an id of a pair is the smaller image id times this, plus the larger
 SENSOR_CAMERA = 0
 
 DIGESTED = (  # tables that decide what is mapped
@@ -58,7 +63,9 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
                 f"{journal.name} undoes the half of it; wait, or open it once with a program that "
                 f"may write, e.g. sqlite3 {path.name} .tables"
             ) from error
-        raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error
+        raise DatabaseError(
+            f"{path}: not a usable COLMAP database ({error})"
+        ) from error
 
 
 def _require_sqlite(path: Path) -> None:
@@ -90,7 +97,9 @@ def _require_tables(connection: sqlite3.Connection, path: Path) -> None:
     rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
     missing = TABLES - {name for (name,) in rows}
     if missing:
-        raise DatabaseError(f"{path}: not a COLMAP database (it has no table {min(missing)})")
+        raise DatabaseError(
+            f"{path}: not a COLMAP database (it has no table {min(missing)})"
+        )
 
 
 class Camera(NamedTuple):
@@ -147,7 +156,10 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
         camera_ids={int(image_id): int(camera_id) for image_id, _, camera_id in images},
         frame_images=frame_images,
         num_frames=num_frames,
-        keypoints={int(image_id): (int(rows), int(columns)) for image_id, rows, columns in sizes},
+        keypoints={
+            int(image_id): (int(rows), int(columns))
+            for image_id, rows, columns in sizes
+        },
         num_matched=_num_with_rows(connection, "matches"),
         num_verified=_num_with_rows(connection, "two_view_geometries"),
     )
@@ -158,7 +170,9 @@ def _num_with_rows(connection: sqlite3.Connection, table: str) -> int:
     return sum(int(count) > 0 for (count,) in rows_of(connection, "rows", table))
 
 
-def rows_of(connection: sqlite3.Connection, columns: str, table: str) -> Iterable[tuple[Any, ...]]:
+def rows_of(
+    connection: sqlite3.Connection, columns: str, table: str
+) -> Iterable[tuple[Any, ...]]:
     """Return columns of a table, row by row.
 
     Args:
@@ -192,7 +206,9 @@ def rows_digest(path: Path) -> str:
         for query in queries:
             for row in connection.execute(f"SELECT {query}"):
                 for value in row:
-                    digest.update(value if isinstance(value, bytes) else repr(value).encode())
+                    digest.update(
+                        value if isinstance(value, bytes) else repr(value).encode()
+                    )
                     digest.update(b"|")
     return digest.hexdigest()
 
@@ -216,7 +232,9 @@ def damage_of(path: Path) -> str:
 
 def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:
     """Return the columns of a table, none if there is no such table; a view is none."""
-    is_table = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ? COLLATE NOCASE"
+    is_table = (
+        "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ? COLLATE NOCASE"
+    )
     if not connection.execute(is_table, (table,)).fetchone():
         return set()
     return {str(row[1]) for row in connection.execute(f"PRAGMA table_info({table})")}

@@ -13,7 +13,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
-from colmap_affrect.geometry.epipolar import EpipolarModel, HomographyModel, PairModel, common_sign
+from colmap_affrect.geometry.epipolar import (
+    EpipolarModel,
+    HomographyModel,
+    PairModel,
+    common_sign,
+)
 from colmap_affrect.geometry.significance import (
     log10_bayes_factor,
     log10_false_alarms,
@@ -33,9 +38,13 @@ PLANAR = (  # pairs that a homography explains: their epipolar geometry is arbit
 CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
 MAX_FRAME_ANGLE_DEG = 20.0  # frames of right matches are off by 5 to 10 degrees
 CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0  # of frames that are turned at random
-MAX_CHANCE = 0.99  # frames that agree by chance nearly always, upright ones for one, say nothing
+MAX_CHANCE = (
+    0.99  # frames that agree by chance nearly always, upright ones for one, say nothing
+)
 MIN_VARIETY = 0.05  # of elements of shapes of area one; below they have no direction
-MIN_TRANSLATION = 1e-9  # of a decomposed homography, in units of the distance of its plane
+MIN_TRANSLATION = (
+    1e-9  # of a decomposed homography, in units of the distance of its plane
+)
 
 
 def pair_model(
@@ -65,14 +74,19 @@ def _epipolar_model(
     geometry: pycolmap.TwoViewGeometry, cameras: Cameras, points: tuple[Array, Array]
 ) -> EpipolarModel | None:
     """Return the epipolar geometry of a pair, by its essential matrix where it is calibrated."""
-    is_calibrated = geometry.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+    is_calibrated = (
+        geometry.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+    )
     essential = geometry.E
     fundamental = geometry.F
     if is_calibrated and _is_given(essential):
         matrix1 = cameras[0].calibration_matrix()
         matrix2 = cameras[1].calibration_matrix()
         fundamental = np.linalg.inv(matrix2).T @ essential @ np.linalg.inv(matrix1)
-        points = (undistorted(cameras[0], points[0]), undistorted(cameras[1], points[1]))
+        points = (
+            undistorted(cameras[0], points[0]),
+            undistorted(cameras[1], points[1]),
+        )
     if not _is_given(fundamental):
         return None
     sample_size = 5 if geometry.config == CALIBRATED else 7
@@ -121,7 +135,10 @@ def homography_matrix(geometry: pycolmap.TwoViewGeometry) -> Array | None:
 
 
 def significance(
-    geometry: pycolmap.TwoViewGeometry, cameras: Cameras, keypoints: Keypoints, max_error_px: float
+    geometry: pycolmap.TwoViewGeometry,
+    cameras: Cameras,
+    keypoints: Keypoints,
+    max_error_px: float,
 ) -> float:
     """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
 
@@ -135,7 +152,9 @@ def significance(
     Returns:
         The logarithm; infinite for a watermark, which cannot be tested.
     """
-    with np.errstate(all="ignore"):  # points that a camera cannot undistort are no inliers
+    with np.errstate(
+        all="ignore"
+    ):  # points that a camera cannot undistort are no inliers
         model = pair_model(geometry, cameras, keypoints)
         if model is None:
             return math.inf
@@ -166,7 +185,9 @@ def _telling_shapes(keypoints: Floats) -> Array | None:
     return None if alike or not are_individual_shapes(shapes) else shapes
 
 
-def _frame_evidence(model: PairModel, inliers: Indices, shapes: tuple[Array, Array]) -> float:
+def _frame_evidence(
+    model: PairModel, inliers: Indices, shapes: tuple[Array, Array]
+) -> float:
     """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
     limit = math.cos(math.radians(MAX_FRAME_ANGLE_DEG))
     signs = (1.0, -1.0) if model.has_sign else (1.0,)
@@ -178,4 +199,6 @@ def _frame_evidence(model: PairModel, inliers: Indices, shapes: tuple[Array, Arr
     sign = common_sign(cosines) if model.has_sign else 1.0
     num_agreeing = int(np.count_nonzero(cosines * sign >= limit))
     # The better of two signs: chance has two tries.
-    return log10_bayes_factor(len(inliers), num_agreeing, chance) - math.log10(len(signs))
+    return log10_bayes_factor(len(inliers), num_agreeing, chance) - math.log10(
+        len(signs)
+    )

@@ -22,11 +22,15 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 T = TypeVar("T", int, str)
 Names = tuple[str, str]
-Frames = tuple[Floats, Floats]  # (N, 2, 3) LAFs of each image of a pair, in pixel-centre px
+Frames = tuple[
+    Floats, Floats
+]  # (N, 2, 3) LAFs of each image of a pair, in pixel-centre px
 Matches = NDArray[np.integer]  # (M, 2), rows of the features of each image of a pair
 
 PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many
-MAX_WRITTEN_SHARE = 0.15  # of the inliers on a line of writing; where more are, they made it
+MAX_WRITTEN_SHARE = (
+    0.15  # of the inliers on a line of writing; where more are, they made it
+)
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
 
@@ -136,7 +140,9 @@ def _significant_geometry(
     geometry = pycolmap.estimate_two_view_geometry(
         cameras[0], points[0], cameras[1], points[1], rows, two_view_options(options)
     )
-    min_num_inliers = max(options.min_num_inliers, options.min_inlier_ratio * num_matches)
+    min_num_inliers = max(
+        options.min_num_inliers, options.min_inlier_ratio * num_matches
+    )
     # Of a geometry that it rejects the estimator returns the inliers all the same.
     if geometry.config in REJECTED or len(geometry.inlier_matches) < min_num_inliers:
         return None
@@ -169,7 +175,9 @@ def _twice(rows: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def _planar_geometry(
-    geometry: pycolmap.TwoViewGeometry, points: tuple[Array, Array], options: VerificationOptions
+    geometry: pycolmap.TwoViewGeometry,
+    points: tuple[Array, Array],
+    options: VerificationOptions,
 ) -> pycolmap.TwoViewGeometry:
     """Return the homography of the inliers of an epipolar geometry, with all matches it explains.
 
@@ -186,13 +194,17 @@ def _planar_geometry(
     planar.config = pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC
     planar.H = found["H"]
     with np.errstate(all="ignore"):  # points on the horizon are no inliers
-        inliers = np.flatnonzero(homography_errors(planar.H, *points) <= options.max_error_px)
+        inliers = np.flatnonzero(
+            homography_errors(planar.H, *points) <= options.max_error_px
+        )
     planar.inlier_matches = _twice(inliers.astype(np.uint32))
     return planar
 
 
 def max_error_px(
-    cameras: Sequence[pycolmap.Camera], options: VerificationOptions, extracted_px: int | None
+    cameras: Sequence[pycolmap.Camera],
+    options: VerificationOptions,
+    extracted_px: int | None,
 ) -> float:
     """Return the largest error of an inlier of a pair, in px of the stored images.
 
@@ -350,7 +362,9 @@ class PairVerifier:
         found = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
         return found if self._ids[names[0]] < self._ids[names[1]] else found[:, ::-1]
 
-    def geometry(self, names: Names, frames: Frames, indices: Matches) -> pycolmap.TwoViewGeometry:
+    def geometry(
+        self, names: Names, frames: Frames, indices: Matches
+    ) -> pycolmap.TwoViewGeometry:
         """Return the two-view geometry of a pair, from the image with the lower id.
 
         Args:
@@ -385,14 +399,18 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
     }
 
 
-def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
+def connected_parts(
+    pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()
+) -> list[set[T]]:
     """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
     import networkx  # which takes as long to load as numpy and OpenCV together
 
     graph: networkx.Graph[T] = networkx.Graph()
     graph.add_nodes_from(images)
     graph.add_edges_from(pairs)
-    return sorted(networkx.connected_components(graph), key=lambda part: (-len(part), min(part)))
+    return sorted(
+        networkx.connected_components(graph), key=lambda part: (-len(part), min(part))
+    )
 
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
@@ -402,7 +420,9 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     for first, second in listed:
         partners[first].add(second)
         partners[second].add(first)
-    if not any(partners[first].isdisjoint(partners[second]) for first, second in listed):
+    if not any(
+        partners[first].isdisjoint(partners[second]) for first, second in listed
+    ):
         return []  # a third image ties each pair, too
     import networkx
 

@@ -11,7 +11,11 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
-from colmap_affrect.comparison.method_run import CompareKeywords, CompareOptions, MethodRun
+from colmap_affrect.comparison.method_run import (
+    CompareKeywords,
+    CompareOptions,
+    MethodRun,
+)
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, pose_scores
@@ -70,11 +74,18 @@ def compare(
     output_path = as_path(output_path, "output_path")
     options = CompareOptions.with_keywords(options, keywords)
     require_bools(overwrite=overwrite)
-    return _compare(image_path, output_path, options, Progress.given(progress), again=overwrite)
+    return _compare(
+        image_path, output_path, options, Progress.given(progress), again=overwrite
+    )
 
 
 def _compare(
-    image_path: Path, output_path: Path, options: CompareOptions, progress: Progress, *, again: bool
+    image_path: Path,
+    output_path: Path,
+    options: CompareOptions,
+    progress: Progress,
+    *,
+    again: bool,
 ) -> Comparison:
     """Compare with checked arguments; ``again``: also methods that have results."""
     workspace = Workspace(output_path)
@@ -116,7 +127,11 @@ def _pairs(image_path: Path, names: Sequence[str], options: PairOptions) -> list
 
 
 def _resolve_weights(
-    runs: Sequence[MethodRun], options: CompareOptions, progress: Progress, *, overwrite: bool
+    runs: Sequence[MethodRun],
+    options: CompareOptions,
+    progress: Progress,
+    *,
+    overwrite: bool,
 ) -> None:
     """Find or download the weights of all methods that are to be run."""
     keys: set[str] = set()
@@ -158,7 +173,9 @@ def _run_methods(
         if label in left_s:
             if progress.stream:
                 minutes = max(1.0, pace * sum(left_s.values()) / 60)
-                show(f"{title}about {minutes:.0f} min left for all", file=progress.stream)
+                show(
+                    f"{title}about {minutes:.0f} min left for all", file=progress.stream
+                )
             failed = run_alone(run, title, progress)
             del left_s[label]
             pace = (time.monotonic() - start_s) / (total_s - sum(left_s.values()))
@@ -167,21 +184,29 @@ def _run_methods(
     return results
 
 
-def _checked_inputs(image_path: Path, options: CompareOptions) -> tuple[Inputs, list[str]]:
+def _checked_inputs(
+    image_path: Path, options: CompareOptions
+) -> tuple[Inputs, list[str]]:
     """Return the photographs and their names; refuse what cannot work before anything is done."""
     if not options.seeds or len(set(options.seeds)) < len(options.seeds):
-        raise OptionError(f"--seeds {','.join(map(str, options.seeds))}: give different seeds")
+        raise OptionError(
+            f"--seeds {','.join(map(str, options.seeds))}: give different seeds"
+        )
     options.resources.require_device()
     for seed in options.seeds:
         options.verification.changed(random_seed=seed)
     if options.pairs != PairOptions(match_list_path=options.pairs.match_list_path):
-        raise OptionError("pairs: a comparison matches all pairs, or those of match_list_path")
+        raise OptionError(
+            "pairs: a comparison matches all pairs, or those of match_list_path"
+        )
     inputs = options.inputs(image_path)
     inputs.check()
     names = inputs.names()
     if len(names) < 2:
         only = f"only {names[0] if names else 'no image'} to use"
-        raise AffrectError(f"{image_path}: {only}; a comparison needs at least two images")
+        raise AffrectError(
+            f"{image_path}: {only}; a comparison needs at least two images"
+        )
     inputs.check_names(names)
     return inputs, names
 
@@ -234,7 +259,9 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
     return truth
 
 
-def _scored(result: MethodResult, folder: Path, truth: Poses, names: Sequence[str]) -> MethodResult:
+def _scored(
+    result: MethodResult, folder: Path, truth: Poses, names: Sequence[str]
+) -> MethodResult:
     """Add the scores of the models of all seeds against ground truth."""
     seeds = []
     for seed in result.seeds:

@@ -24,7 +24,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.colmap.verification import (
+    VerificationOptions,
+    verified_pairs,
+    verify,
+)
 from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, GivenMethods, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
@@ -60,7 +64,10 @@ from colmap_affrect.stages.verify import verify_matches
 
 
 def extract_sift(
-    database_path: Path, image_path: Path, image_names: Sequence[str], masks: MaskOptions
+    database_path: Path,
+    image_path: Path,
+    image_names: Sequence[str],
+    masks: MaskOptions,
 ) -> dict[str, str]:
     """Extract SIFT features of images of a database by COLMAP's default options.
 
@@ -88,7 +95,9 @@ def extract_sift(
             mask_path=mask_path, camera_mask_path=masks.camera_path
         )
         if usable:  # pycolmap takes no names for all
-            pycolmap.extract_features(database_path, image_path, usable, reader_options=reader)
+            pycolmap.extract_features(
+                database_path, image_path, usable, reader_options=reader
+            )
     ids = image_ids(database_path)
     with open_database(database_path) as database:
         for name in usable:
@@ -133,10 +142,14 @@ def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
         return
     for name in itertools.chain.from_iterable(pairs):
         if " " in name:
-            raise AffrectError(f"{name}: COLMAP matches no listed names with spaces; rename it")
+            raise AffrectError(
+                f"{name}: COLMAP matches no listed names with spaces; rename it"
+            )
     with temporary_folder(database_path.parent) as folder:
         list_path = folder / "pairs.txt"
-        replace_text(list_path, "".join(f"{first} {second}\n" for first, second in pairs))
+        replace_text(
+            list_path, "".join(f"{first} {second}\n" for first, second in pairs)
+        )
         listed = pycolmap.ImportedPairingOptions(match_list_path=list_path)
         pycolmap.match_image_pairs(database_path, options, listed)
 
@@ -206,7 +219,9 @@ class MethodRun:
         """What is done of the method, as it is on disk."""
         # A result of an older version is not valid: then features stay, and models are made again.
         with suppress(FileNotFoundError, ValidationError):
-            return RESULT_JSON.validate_json(read_regular(self.workspace.path / "result.json"))
+            return RESULT_JSON.validate_json(
+                read_regular(self.workspace.path / "result.json")
+            )
         return MethodResult(
             self.method.label,
             summary=self.method.summary,
@@ -227,7 +242,9 @@ class MethodRun:
         if overwrite:
             remove_own([folder])
         asked = {**self.inputs, **self.method.options}
-        if self.method.escalates:  # verification with this seed decides what is matched again
+        if (
+            self.method.escalates
+        ):  # verification with this seed decides what is matched again
             asked["seed"] = self.options.seeds[0]
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
         with damage(record, "use --overwrite to redo the methods that are named"):
@@ -247,7 +264,9 @@ class MethodRun:
         self.keep(failed="")
         if not self.result.wall_s:  # time that a killed run took does not count
             watch = Stopwatch()
-            extract_and_match = self._match_recipe if self.method.recipe else self._match_sift
+            extract_and_match = (
+                self._match_recipe if self.method.recipe else self._match_sift
+            )
             failures = extract_and_match(watch)
             self.keep(failures=failures, wall_s=watch.seconds)
         done = {result.seed: result for result in self.result.seeds}
@@ -261,7 +280,9 @@ class MethodRun:
         """Change fields of the result on disk."""
         peak = max(self.result.peak_memory_bytes, peak_memory_bytes())
         result = replace(self.result, peak_memory_bytes=peak, **values)
-        replace_bytes(self.workspace.path / "result.json", RESULT_JSON.dump_json(result, indent=1))
+        replace_bytes(
+            self.workspace.path / "result.json", RESULT_JSON.dump_json(result, indent=1)
+        )
 
     def _match_sift(self, watch: Stopwatch) -> dict[str, str]:
         """Extract and match as COLMAP does; return why images cannot be used."""
@@ -274,7 +295,9 @@ class MethodRun:
             usable = [name for name in names if name not in failures]
             if not usable:
                 raise AffrectError(f"COLMAP cannot use any of the {len(names)} images")
-            failures |= extract_sift(self.database, self.image_path, usable, self.options.masks)
+            failures |= extract_sift(
+                self.database, self.image_path, usable, self.options.masks
+            )
             advance(len(names))
         known = set(image_ids(self.database))
         pairs = None
@@ -340,12 +363,16 @@ class MethodRun:
         self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
     ) -> Sequence[ModelSummary]:
         """Verify and map as a run does."""
-        context = Context(self.workspace.branch(folder), self.options.resources, None, progress)
+        context = Context(
+            self.workspace.branch(folder), self.options.resources, None, progress
+        )
         with watch.step("verify"):
             verify_matches(context, self.verification.changed(random_seed=seed))
         with watch.step("map"):
             guide(context)
-            return map_images(context, MAPPERS.make(self.mapping.changed(random_seed=seed)))[1]
+            return map_images(
+                context, MAPPERS.make(self.mapping.changed(random_seed=seed))
+            )[1]
 
     def _models(
         self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
@@ -378,7 +405,10 @@ class MethodRun:
         options = self.verification.changed(random_seed=seed)
         num_pairs = len(unverified_pairs(path))
         num_images = len(image_ids(path))
-        with watch.step("verify"), progress.stage("verify", num_pairs, "pairs") as advance:
+        with (
+            watch.step("verify"),
+            progress.stage("verify", num_pairs, "pairs") as advance,
+        ):
             verify(path, options, advance=advance)
         shutil.copy(self.workspace.cameras, folder)
         mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))

@@ -57,7 +57,9 @@ def _as_tuple(given: Any) -> Any:
     return (given,) if isinstance(given, str) else given
 
 
-GivenMethods = Annotated[tuple[str | Method, ...], BeforeValidator(_as_tuple), Field(strict=False)]
+GivenMethods = Annotated[
+    tuple[str | Method, ...], BeforeValidator(_as_tuple), Field(strict=False)
+]
 """Field of options that takes what :func:`parse_methods` takes, a single text too."""
 
 
@@ -131,5 +133,7 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     if recipe.extraction.uses_depth:
         recipe = load_recipe(name, [*changes, *depth_settings])
     if not label:
-        label = text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
+        label = (
+            text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
+        )
     return Method(label, recipe)

@@ -3,7 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_affrect.comparison.results import MAX_CORRECT_ERROR_DEG, Comparison, MethodResult
+from colmap_affrect.comparison.results import (
+    MAX_CORRECT_ERROR_DEG,
+    Comparison,
+    MethodResult,
+)
 from colmap_affrect.comparison.tables import headline, notes, table
 from colmap_affrect.options import flat
 from colmap_affrect.progress import SILENT, Progress
@@ -32,7 +36,9 @@ class Card:
     groups: tuple[str, ...]  # what the buttons above the sheet choose by
 
 
-def write_page(comparison: Comparison, output_path: Path, progress: Progress = SILENT) -> Path:
+def write_page(
+    comparison: Comparison, output_path: Path, progress: Progress = SILENT
+) -> Path:
     """Write ``report.html``, one file that loads nothing.
 
     Where a photograph cannot be read, or there is no model, the page says so.

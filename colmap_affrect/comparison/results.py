@@ -31,7 +31,9 @@ class PoseScores:
 
     correct_names: tuple[str, ...]  # registered correctly (``MAX_CORRECT_ERROR_DEG``)
     wrong_names: tuple[str, ...]  # the others
-    median_rotation_error_deg: float | None  # over the pairs of these images; None without pairs
+    median_rotation_error_deg: (
+        float | None
+    )  # over the pairs of these images; None without pairs
 
 
 def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
@@ -54,10 +56,14 @@ def correct_images(errors: PairErrors) -> tuple[str, ...]:
         for name in pair:
             num_correct[name] = num_correct.get(name, 0) + is_correct
     num_others = len(num_correct) - 1
-    return tuple(name for name in sorted(num_correct) if 2 * num_correct[name] >= num_others)
+    return tuple(
+        name for name in sorted(num_correct) if 2 * num_correct[name] >= num_others
+    )
 
 
-def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> PoseScores:
+def pose_scores(
+    estimated: Poses, truth: Poses, image_names: Sequence[str]
+) -> PoseScores:
     """Score the poses of registered images against ground truth.
 
     Args:
@@ -68,7 +74,9 @@ def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> P
     Returns:
         Which images are registered correctly, and how far the others are off.
     """
-    errors = pair_errors(estimated, {name: truth[name] for name in truth.keys() & image_names})
+    errors = pair_errors(
+        estimated, {name: truth[name] for name in truth.keys() & image_names}
+    )
     correct = correct_images(errors)
     names = set(itertools.chain.from_iterable(errors))
     rotations_deg = [rotation_deg for rotation_deg, _ in errors.values()]
@@ -107,8 +115,12 @@ class SeedResult:
     mean_track_length: float  # images per point
     mean_reprojection_error_px: float
     sure: tuple[str, ...] = ()  # images of high confidence
-    doubtful: Mapping[str, str] = field(default_factory=dict)  # images of low confidence: why
-    wall_s: Mapping[str, float] = field(default_factory=dict)  # seconds of ``verify`` and ``map``
+    doubtful: Mapping[str, str] = field(
+        default_factory=dict
+    )  # images of low confidence: why
+    wall_s: Mapping[str, float] = field(
+        default_factory=dict
+    )  # seconds of ``verify`` and ``map``
     scores: PoseScores | None = None  # against ground truth; None where there is none
 
     @property
@@ -159,7 +171,9 @@ MEASURES = {
     "verified_pairs": Measure("pairs", lambda seed: seed.verified_pairs),
     "points3D": Measure("points", _of_model("points3D"), 0),
     "mean_track_length": Measure("track", _of_model("mean_track_length"), 2),
-    "mean_reprojection_error_px": Measure("px", _of_model("mean_reprojection_error_px"), 2),
+    "mean_reprojection_error_px": Measure(
+        "px", _of_model("mean_reprojection_error_px"), 2
+    ),
     "median_rotation_error_deg": Measure("degrees", _median_rotation_error_deg, 2),
 }
 """Numbers of every seed, by their names in JSON."""
@@ -180,11 +194,17 @@ class MethodResult:
     folder: str = ""  # of its results, relative to the folder of the comparison
     options: Mapping[str, Any] = field(default_factory=dict)
     failed: str = ""  # why it failed as a whole; empty if it did not
-    failures: Mapping[str, str] = field(default_factory=dict)  # images that cannot be used: why
+    failures: Mapping[str, str] = field(
+        default_factory=dict
+    )  # images that cannot be used: why
     lacks: str = ""  # how to get the weights that it ran without
-    wall_s: Mapping[str, float] = field(default_factory=dict)  # of stages before all seeds
+    wall_s: Mapping[str, float] = field(
+        default_factory=dict
+    )  # of stages before all seeds
     peak_memory_bytes: int = 0
-    seeds: tuple[SeedResult, ...] = ()  # in the order asked for; empty if the method failed
+    seeds: tuple[
+        SeedResult, ...
+    ] = ()  # in the order asked for; empty if the method failed
 
     def span(self, measure: str) -> Span | None:
         """Return one of ``MEASURES`` over the seeds that have it; None without any."""
@@ -247,7 +267,9 @@ class MethodResult:
 def _in_most(names_by_seed: Sequence[Iterable[str]]) -> list[str]:
     """Return the sorted names that more than half of the seeds have."""
     counts = Counter(itertools.chain.from_iterable(names_by_seed))
-    return sorted(name for name, count in counts.items() if 2 * count > len(names_by_seed))
+    return sorted(
+        name for name, count in counts.items() if 2 * count > len(names_by_seed)
+    )
 
 
 @documented
@@ -272,7 +294,9 @@ class Comparison(Summarized):
 
     def summary(self) -> str:
         """Return the table of methods, and what it means."""
-        from colmap_affrect.comparison.tables import summary  # which imports this module
+        from colmap_affrect.comparison.tables import (
+            summary,
+        )  # which imports this module
 
         return summary(self)
 
@@ -283,7 +307,9 @@ class Comparison(Summarized):
         def rank(method: MethodResult) -> tuple[float, float, float]:
             return (-method.trusted.mean, -method.registered.mean, method.total_s)
 
-        return sorted([method for method in self.methods if not method.failed], key=rank)
+        return sorted(
+            [method for method in self.methods if not method.failed], key=rank
+        )
 
     @property
     def has_ground_truth(self) -> bool:
@@ -304,9 +330,13 @@ class Comparison(Summarized):
     def only_registered_by(self) -> dict[str, str]:
         """Image name to the one method that usually registers it."""
         registered_by = self.registered_by.items()
-        return {name: methods[0] for name, methods in registered_by if len(methods) == 1}
+        return {
+            name: methods[0] for name, methods in registered_by if len(methods) == 1
+        }
 
     @property
     def registered_by_none(self) -> tuple[str, ...]:
         """Images that no method usually registers."""
-        return tuple(name for name, methods in self.registered_by.items() if not methods)
+        return tuple(
+            name for name, methods in self.registered_by.items() if not methods
+        )

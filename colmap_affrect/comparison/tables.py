@@ -30,7 +30,9 @@ def table(comparison: Comparison) -> dict[str, list[str]]:
         if any(spans):
             columns[measure.title] = [span_text(span, measure.digits) for span in spans]
     columns["seconds"] = [f"{method.total_s:,.1f}" for method in methods]
-    columns["MB"] = [f"{method.peak_memory_bytes / BYTES_PER_MB:,.0f}" for method in methods]
+    columns["MB"] = [
+        f"{method.peak_memory_bytes / BYTES_PER_MB:,.0f}" for method in methods
+    ]
     return columns
 
 
@@ -150,7 +152,9 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     lines = []
     for first, *others in rows:
         cells = [first.ljust(widths[0])]
-        cells += [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=False)]
+        cells += [
+            cell.rjust(width) for cell, width in zip(others, widths[1:], strict=False)
+        ]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
 
@@ -163,7 +167,9 @@ def to_json(comparison: Comparison) -> str:
         for key in MEASURES:
             span = method.span(key)
             values[key] = asdict(span) if span else None
-        values["registered_names"] = {str(s.seed): s.registered_names for s in method.seeds}
+        values["registered_names"] = {
+            str(s.seed): s.registered_names for s in method.seeds
+        }
         values["total_s"] = method.total_s
         values["wall_s"] = method.stage_seconds
         for seed, numbers in zip(method.seeds, values["seeds"], strict=True):

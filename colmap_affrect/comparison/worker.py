@@ -38,7 +38,9 @@ def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
         code = subprocess.run(  # noqa: S603  (this Python and this module)
             command,
             check=False,
-            input=pickle.dumps((run, title)),  # too long for an argument, with many photographs
+            input=pickle.dumps(
+                (run, title)
+            ),  # too long for an argument, with many photographs
             stdout=progress.file_number,
             stderr=log,
             env=environment,

@@ -20,7 +20,11 @@ from colmap_affrect.errors import DAMAGE
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.policy import SMALL
 from colmap_affrect.mappers.base import Mapper
-from colmap_affrect.mappers.mapping import copy_with_keypoints, model_folders, read_summaries
+from colmap_affrect.mappers.mapping import (
+    copy_with_keypoints,
+    model_folders,
+    read_summaries,
+)
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write, replace_text
 from colmap_affrect.project.match_state import LookedAt, Worth
@@ -91,7 +95,9 @@ def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
     found = read_summaries(learned)
     names = set(context.features.names()).difference(context.by_hand.left_out)
     is_sure = bool(found) and names.issubset(found[0].sure)
-    looked_at = LookedAt(_set_of(context), score(found), is_sure, present_score(context))
+    looked_at = LookedAt(
+        _set_of(context), score(found), is_sure, present_score(context)
+    )
     context.matches.keep(looked_at=looked_at)
 
 
@@ -119,7 +125,9 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
     if not looked_at or looked_at.is_chosen or not context.workspace.learned.exists():
         return False
     # At once: as it was then, also for a run that was killed since.
-    is_wanted = looked_at.is_enough if at_once else looked_at.score > present_score(context)
+    is_wanted = (
+        looked_at.is_enough if at_once else looked_at.score > present_score(context)
+    )
     choice = _learned_choice(escalation) if is_wanted else None
     if not choice or not choice.matches:
         return False
@@ -134,7 +142,9 @@ def _learned_choice(escalation: Escalation) -> Choice:
     learned = escalation.matches.learned(list(states))
     levels = {pair: found.matches.level for pair, found in learned.items()}
     changed = [pair for pair, level in levels.items() if states[pair].level != level]
-    measured = [pair for pair in changed if escalation.state.is_measured[states[pair].level]]
+    measured = [
+        pair for pair in changed if escalation.state.is_measured[states[pair].level]
+    ]
     worths = {pair: states[pair].worth for pair in measured}
     return Choice([learned[pair].matches for pair in changed], worths)
 

@@ -55,14 +55,22 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
             escalated = escalation.taken(step, escalated)
         before = context.workspace.mapped_from()
         reports += _mapped_on(context, mapper, recipe)
-        has_mapped = context.workspace.mapped_from() != before  # perhaps there is no model
-        if has_mapped or restore_best(escalation) or choose_learned(escalation, at_once=False):
+        has_mapped = (
+            context.workspace.mapped_from() != before
+        )  # perhaps there is no model
+        if (
+            has_mapped
+            or restore_best(escalation)
+            or choose_learned(escalation, at_once=False)
+        ):
             continue
         forget_others(context)
         return [*reports, escalation.ended(escalated)]
 
 
-def _learned(escalation: Escalation, mapper: Mapper, report: StageReport) -> StageReport:
+def _learned(
+    escalation: Escalation, mapper: Mapper, report: StageReport
+) -> StageReport:
     """Match pairs of a small set by learned matching, once, and look at what models it makes."""
     if not is_to_be_looked_at(escalation.context) or not escalation.plan_learning():
         return report
@@ -74,7 +82,9 @@ def _learned(escalation: Escalation, mapper: Mapper, report: StageReport) -> Sta
     return replace(report, wall_s=wall_s, num_done=report.num_done + num_matched)
 
 
-def _mapped_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
+def _mapped_first(
+    context: Context, mapper: Mapper, recipe: Recipe
+) -> list[StageReport]:
     """Map for the first time, unless a run before has gone on from there."""
     matches = context.matches
     state = matches.state

@@ -23,7 +23,13 @@ from functools import cached_property
 from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import ImageError, such_as
 from colmap_affrect.escalation.expected_gain import PairState, Step
-from colmap_affrect.escalation.policy import Plan, learned_step, next_step, tried, untried
+from colmap_affrect.escalation.policy import (
+    Plan,
+    learned_step,
+    next_step,
+    tried,
+    untried,
+)
 from colmap_affrect.escalation.set_state import SetState
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
@@ -205,10 +211,14 @@ class Escalation:
         """Return the report with what could not be tried, which is logged, too."""
         warnings = self.waiting()
         if self.is_over_time:
-            warnings["time"] = "it is over; the same command without --max-time tries more"
+            warnings["time"] = (
+                "it is over; the same command without --max-time tries more"
+            )
         for what, text in warnings.items():
             logger.warning("%s: %s", what, text)
-        return StageReport("escalate", report.wall_s, report.num_done, warnings=warnings)
+        return StageReport(
+            "escalate", report.wall_s, report.num_done, warnings=warnings
+        )
 
     def waiting(self) -> dict[str, str]:
         """Say what levels that lack weights may tie, if anything is left to tie."""
@@ -233,10 +243,15 @@ class Escalation:
         if pairs:
             self.matches.keep(step=Begun(level, tuple(pairs)), has_stepped=True)
         learned = self.matches.learned(pairs)
-        known = {pair: one for pair, one in learned.items() if one.matches.level == level}
+        known = {
+            pair: one for pair, one in learned.items() if one.matches.level == level
+        }
         if known:
             states = self.state.states()
-            trials = [Trial(one.matches, one.worth, states[pair]) for pair, one in known.items()]
+            trials = [
+                Trial(one.matches, one.worth, states[pair])
+                for pair, one in known.items()
+            ]
             self._keep(trials, level)
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
@@ -289,7 +304,10 @@ class Escalation:
     def is_learned(self) -> bool:
         """Whether all pairs of :meth:`plan_learning` have learned matches."""
         planned = self.matches.state.learning
-        return planned is not None and min(self.matches.learned_levels(planned.pairs).values()) >= 0
+        return (
+            planned is not None
+            and min(self.matches.learned_levels(planned.pairs).values()) >= 0
+        )
 
     def write(self) -> None:
         """Bring the database up to what is stored, and verify what is new."""
@@ -302,8 +320,12 @@ class Escalation:
         missing = list[tuple[str, int]]()
         for name in sorted({name for pair in pairs for name in pair}):
             there = features.level_ranges(name)
-            missing += [(name, k) for k in sorted({chosen.base, level}) if k not in there]
-        left = f" (at most about {self.left_s / 60:.0f} min)" if self.left_s >= 60 else ""
+            missing += [
+                (name, k) for k in sorted({chosen.base, level}) if k not in there
+            ]
+        left = (
+            f" (at most about {self.left_s / 60:.0f} min)" if self.left_s >= 60 else ""
+        )
         title = f"escalate, {chosen.name}{left}"
         num_steps = len(missing) + len(pairs)
         with self.context.progress.stage(title, num_steps, "steps") as advance:
@@ -311,11 +333,15 @@ class Escalation:
             if pairs:
                 self._match_again(pairs, level, keep, advance)
 
-    def _extend(self, missing: Sequence[tuple[str, int]], advance: Callable[[int], None]) -> None:
+    def _extend(
+        self, missing: Sequence[tuple[str, int]], advance: Callable[[int], None]
+    ) -> None:
         """Add to images the features of levels that they lack."""
         if not missing:
             return
-        images = extract_images(self.context, self.context.inputs, self.extractor, missing)
+        images = extract_images(
+            self.context, self.context.inputs, self.extractor, missing
+        )
         with closing(images) as found_images:
             for (name, level), found in zip(missing, found_images, strict=True):
                 if isinstance(found, ImageError):
@@ -324,7 +350,11 @@ class Escalation:
                 advance(1)
 
     def _match_again(
-        self, pairs: Sequence[Pair], level: int, keep: Keep, advance: Callable[[int], None]
+        self,
+        pairs: Sequence[Pair],
+        level: int,
+        keep: Keep,
+        advance: Callable[[int], None],
     ) -> None:
         """Match pairs with the features of a level, and keep the trials batch by batch."""
         context = self.context
@@ -361,7 +391,9 @@ class Escalation:
 
     def _keep_learned(self, batch: Sequence[Trial], _: int) -> None:
         """Write learned matches beside those in use."""
-        self.matches.keep_learned([Learned(trial.found, trial.worth) for trial in batch])
+        self.matches.keep_learned(
+            [Learned(trial.found, trial.worth) for trial in batch]
+        )
 
     def _measured_worths(self, batch: Sequence[Trial]) -> dict[Pair, Worth]:
         """Return what the best measured matches are worth of pairs that use learned ones."""
@@ -372,5 +404,7 @@ class Escalation:
             if was_measured and not is_measured and trial.is_better:
                 worths[trial.found.names] = trial.before.worth
             elif is_measured and not was_measured:
-                worths[trial.found.names] = max(trial.worth, trial.before.measured_worth)
+                worths[trial.found.names] = max(
+                    trial.worth, trial.before.measured_worth
+                )
         return worths

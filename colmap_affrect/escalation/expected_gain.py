@@ -33,8 +33,13 @@ class PairState:
     num_consistent: int = 0  # raw matches that confirm each other
     level: int = 0  # that its matches are from
     tried: int = 1  # a bit for each level
-    measured_worth: Worth = (0, 0)  # of the measured matches that learned ones took the place of
-    learned_level: int = -1  # of learned matches that are kept beside those in use; -1: none
+    measured_worth: Worth = (
+        0,
+        0,
+    )  # of the measured matches that learned ones took the place of
+    learned_level: int = (
+        -1
+    )  # of learned matches that are kept beside those in use; -1: none
 
     @property
     def worth(self) -> Worth:
@@ -55,7 +60,9 @@ class LevelGain:
         log_odds = sum(self.coefficients[name] * value for name, value in terms.items())
         return 1.0 / (1.0 + math.exp(-log_odds))
 
-    def seconds(self, images: Iterable[float], pairs: Iterable[tuple[float, float]]) -> float:
+    def seconds(
+        self, images: Iterable[float], pairs: Iterable[tuple[float, float]]
+    ) -> float:
         """Return what features of images, and matching of pairs, take on one core.
 
         Args:
@@ -108,7 +115,9 @@ class Candidate:
 
     pair: Pair
     chance: float  # that it verifies, and is right
-    ties: Sequence[tuple[str | int, float]]  # images or a part of the graph, and photographs saved
+    ties: Sequence[
+        tuple[str | int, float]
+    ]  # images or a part of the graph, and photographs saved
 
     @property
     def photographs(self) -> float:
@@ -150,11 +159,15 @@ class ExpectedGain:
     @cached_property
     def _parts(self) -> list[set[str]]:
         verified = (pair for pair, state in self.states.items() if state.num_inliers)
-        return connected_parts(verified, (name for pair in self.states for name in pair))
+        return connected_parts(
+            verified, (name for pair in self.states for name in pair)
+        )
 
     @cached_property
     def _part_of(self) -> dict[str, int]:
-        return {name: number for number, part in enumerate(self._parts) for name in part}
+        return {
+            name: number for number, part in enumerate(self._parts) for name in part
+        }
 
     @cached_property
     def _num_pairs_to_model(self) -> Counter[str]:
@@ -176,7 +189,9 @@ class ExpectedGain:
                 return []
             needy = [name for name in pair if name in self.weights]
             num_pairs = self._num_pairs_to_model
-            return [(name, self.weights[name] / (1 + num_pairs[name])) for name in needy]
+            return [
+                (name, self.weights[name] / (1 + num_pairs[name])) for name in needy
+            ]
         smaller = max(first, second)  # parts come by size
         need = sum(self.weights.get(name, 0.0) for name in self._parts[smaller])
         return [(smaller, need)] if need else []
@@ -184,7 +199,9 @@ class ExpectedGain:
     def _is_strong(self, pair: Pair) -> bool:
         """Tell whether a pair needs nothing more; while there is no model, none is."""
         is_many = self.states[pair].num_inliers >= self.strong_num_inliers
-        return is_many and bool(self.registered) and self.weakly_connected.isdisjoint(pair)
+        return (
+            is_many and bool(self.registered) and self.weakly_connected.isdisjoint(pair)
+        )
 
     def _of_measured(self, state: PairState) -> PairState:
         """Return what the best matches of measured frames say of a pair."""
@@ -206,7 +223,9 @@ class ExpectedGain:
         """
         gain = gain_of(level)
         num_tried = sum(state.tried >> number & 1 for state in self.states.values())
-        wins = sum(s.level == number and s.num_inliers > 0 for s in self.states.values())
+        wins = sum(
+            s.level == number and s.num_inliers > 0 for s in self.states.values()
+        )
         losses = max(0, num_tried - wins)
         found = list[Candidate]()
         for pair, state in self.states.items():
@@ -220,7 +239,9 @@ class ExpectedGain:
         found.sort(key=lambda one: (-one.photographs, one.pair))
         return found
 
-    def best_step(self, number: int, level: Level, others: int, budget_s: float) -> Step:
+    def best_step(
+        self, number: int, level: Level, others: int, budget_s: float
+    ) -> Step:
         """Return the pairs to match at a level now.
 
         A step has the pairs that save more per second than it does as a whole, with the mapping
@@ -264,19 +285,29 @@ class _Selection:
     seconds: float  # of one core; at first that of mapping
     photographs: float = 0.0
     pairs: list[Pair] = field(default_factory=list)
-    _there: set[str] = field(default_factory=set)  # images that get features of the level
-    _lost: dict[str | int, float] = field(default_factory=dict)  # chance that none tied it so far
+    _there: set[str] = field(
+        default_factory=set
+    )  # images that get features of the level
+    _lost: dict[str | int, float] = field(
+        default_factory=dict
+    )  # chance that none tied it so far
 
     def gain_of(self, one: Candidate) -> float:
         """Return how many photographs a pair is expected to save that no other has saved."""
-        return one.chance * sum(value * self._lost.get(key, 1.0) for key, value in one.ties)
+        return one.chance * sum(
+            value * self._lost.get(key, 1.0) for key, value in one.ties
+        )
 
     def cost_of(self, one: Candidate) -> float:
         """Return the seconds of a pair, and of the features that its images lack."""
         sizes = self.gain.megapixels
         first, second = one.pair
-        lacking = [n for n in one.pair if n in self.gain.lacking and n not in self._there]
-        return self.level.seconds([sizes[n] for n in lacking], [(sizes[first], sizes[second])])
+        lacking = [
+            n for n in one.pair if n in self.gain.lacking and n not in self._there
+        ]
+        return self.level.seconds(
+            [sizes[n] for n in lacking], [(sizes[first], sizes[second])]
+        )
 
     def add(self, one: Candidate) -> None:
         """Take a pair in."""
@@ -289,12 +320,18 @@ class _Selection:
 
 
 def insecure_images(
-    num_inliers: Mapping[Pair, int], strong_num_inliers: int, weakly_connected: Collection[str] = ()
+    num_inliers: Mapping[Pair, int],
+    strong_num_inliers: int,
+    weakly_connected: Collection[str] = (),
 ) -> set[str]:
     """Return the images that mapping may well lose: without a strong pair, or weakly connected.
 
     ``num_inliers`` of each pair is 0 where it is not verified.
     """
-    strong = (pair for pair, count in num_inliers.items() if count >= max(1, strong_num_inliers))
+    strong = (
+        pair
+        for pair, count in num_inliers.items()
+        if count >= max(1, strong_num_inliers)
+    )
     names = {name for pair in num_inliers for name in pair}
     return names.difference(*strong).union(weakly_connected)

@@ -30,8 +30,12 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
-SMALL = 30  # images up to which learned matching takes all pairs of images to match again
-MIN_PHOTOGRAPHS = 0.2  # expected of all that the budget allows, below which nothing is tried
+SMALL = (
+    30  # images up to which learned matching takes all pairs of images to match again
+)
+MIN_PHOTOGRAPHS = (
+    0.2  # expected of all that the budget allows, below which nothing is tried
+)
 
 
 @dataclass(frozen=True)
@@ -63,8 +67,12 @@ class Situation:
     usable: Sequence[int]  # numbers of the levels of escalation that may be tried
     states: Mapping[Pair, PairState]  # of all pairs
     weights: Mapping[str, float]  # of the images to match again, in photographs
-    weakly_connected: Collection[str]  # images with few features in tracks through three
-    anchored: Collection[str]  # images of the model that measured frames tie to a likely one
+    weakly_connected: Collection[
+        str
+    ]  # images with few features in tracks through three
+    anchored: Collection[
+        str
+    ]  # images of the model that measured frames tie to a likely one
     megapixels: Sequence[Mapping[str, float]]  # of each image, by level
     lacking: Sequence[Collection[str]]  # images without features of a level, by level
     registered: Collection[str] = ()  # images of the largest model
@@ -104,7 +112,9 @@ class Situation:
     def spent_on(self, number: int) -> float:
         """Return the nominal seconds that a level has taken so far."""
         sizes = self.megapixels[number]
-        tried = [pair for pair, state in self.states.items() if self.has_tried(state, number)]
+        tried = [
+            pair for pair, state in self.states.items() if self.has_tried(state, number)
+        ]
         images = [sizes[name] for name in {name for pair in tried for name in pair}]
         pairs = [(sizes[first], sizes[second]) for first, second in tried]
         return gain_of(self.levels[number]).seconds(images, pairs)
@@ -112,7 +122,9 @@ class Situation:
     def spent_s(self) -> float:
         """Return the nominal seconds spent after learned matching, of which some is free."""
         spent = {number: self.spent_on(number) for number in range(1, len(self.levels))}
-        learned_s = sum(s for k, s in spent.items() if kind_of(self.levels[k]) == LEARNED)
+        learned_s = sum(
+            s for k, s in spent.items() if kind_of(self.levels[k]) == LEARNED
+        )
         free_s = learned_s if self.is_small else min(learned_s, self.first_model_s)
         return sum(spent.values()) - free_s
 
@@ -144,7 +156,9 @@ class Situation:
             for name in self.anchored:
                 weights.pop(name, None)
         gain = self.gain(number, weights)
-        return gain.best_step(number, self.levels[number], self.needless_after(number), budget_s)
+        return gain.best_step(
+            number, self.levels[number], self.needless_after(number), budget_s
+        )
 
 
 def learned_step(situation: Situation) -> Step:
@@ -160,7 +174,9 @@ def learned_step(situation: Situation) -> Step:
     if not situation.is_small:
         left_s = situation.first_model_s - situation.spent_on(number)
         return situation.best_at(number, left_s)
-    lacking = [p for p, state in situation.states.items() if not situation.has_learned(state)]
+    lacking = [
+        p for p, state in situation.states.items() if not situation.has_learned(state)
+    ]
     needed = [pair for pair in lacking if not situation.weights.keys().isdisjoint(pair)]
     sizes = situation.megapixels[number]
     others = [(sizes[a], sizes[b]) for a, b in lacking if (a, b) not in needed]
@@ -196,7 +212,9 @@ def next_step(situation: Situation, effort: EffortName) -> Plan:
     """
     if not situation.weights:
         return Plan()
-    budget = EFFORTS[effort].budget_s(situation.first_model_s, has_model=bool(situation.registered))
+    budget = EFFORTS[effort].budget_s(
+        situation.first_model_s, has_model=bool(situation.registered)
+    )
     left_s = budget - situation.spent_s()
     if not situation.is_small:
         learned = learned_step(situation)

@@ -36,8 +36,12 @@ class SetState:
         self.context = context
         self.options = options
         self.pairs = context.listed_pairs()
-        self.is_measured = [level.features.has_shapes for level in context.extraction.levels]
-        self._confirming: dict[Pair, tuple[bytes, int]] = {}  # raw matches, and their number
+        self.is_measured = [
+            level.features.has_shapes for level in context.extraction.levels
+        ]
+        self._confirming: dict[
+            Pair, tuple[bytes, int]
+        ] = {}  # raw matches, and their number
 
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of the pairs that may be used, 0 of those that are not verified."""
@@ -66,7 +70,9 @@ class SetState:
         Returns:
             Weights in photographs, by image name.
         """
-        names = set(self.context.features.names()).difference(self.context.by_hand.left_out)
+        names = set(self.context.features.names()).difference(
+            self.context.by_hand.left_out
+        )
         wanted = names.difference(models[0].sure)
         if not self._is_mapped():
             wanted = self._insecure(wanted, num_images=len(names))
@@ -86,14 +92,18 @@ class SetState:
         """Return the images that the next model may well lose; none where it will tell of them."""
         strong = self.options.strong_num_inliers
         weakly_connected = self._weakly_connected()
-        insecure = expected_gain.insecure_images(self.num_inliers(), strong, weakly_connected)
+        insecure = expected_gain.insecure_images(
+            self.num_inliers(), strong, weakly_connected
+        )
         insecure &= wanted
         has_models = self.context.workspace.sparse.exists()
         # The next model tells of what has been tied since.
         maps_next = insecure != wanted and has_models and num_images < LARGE
         return set() if maps_next else insecure
 
-    def _anchored(self, model: ModelSummary, states: Mapping[Pair, PairState]) -> set[str]:
+    def _anchored(
+        self, model: ModelSummary, states: Mapping[Pair, PairState]
+    ) -> set[str]:
         """Return the images of a model that measured frames tie to one that is likely right."""
         anchored = set[str]()
         for pair, state in states.items():
@@ -149,7 +159,9 @@ class SetState:
                 found[pair] = self._confirming[pair][1]
         return found
 
-    def situation(self, weights: Mapping[str, float], models: Sequence[ModelSummary]) -> Situation:
+    def situation(
+        self, weights: Mapping[str, float], models: Sequence[ModelSummary]
+    ) -> Situation:
         """Return what the policy decides by.
 
         Args:
@@ -168,7 +180,9 @@ class SetState:
         lacking = list[set[str]]()
         for number, level in enumerate(levels):
             limit_px = level.max_image_size_px
-            megapixels.append({name: _megapixels(size, limit_px) for name, size in sizes.items()})
+            megapixels.append(
+                {name: _megapixels(size, limit_px) for name, size in sizes.items()}
+            )
             lacking.append({name for name in sizes if number not in levels_of[name]})
         return Situation(
             levels=levels,

@@ -83,7 +83,9 @@ def load_evd(folder: Path) -> Pairs:
         for file in (folder / part).glob("*"):
             if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES):
                 names.add(file.stem)
-    entries = [_evd_entry(folder, n, f"1/{n}", f"2/{n}", f"h/{n}.txt") for n in sorted(names)]
+    entries = [
+        _evd_entry(folder, n, f"1/{n}", f"2/{n}", f"h/{n}.txt") for n in sorted(names)
+    ]
     for file in sorted(folder.glob("H_*.txt")):
         parts = re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", file.stem)
         if parts:
@@ -97,11 +99,17 @@ def load_evd(folder: Path) -> Pairs:
     return _load(entries, folder, 0.0)
 
 
-def _evd_entry(folder: Path, name: str, stem1: str, stem2: str, homography: str) -> _Entry:
+def _evd_entry(
+    folder: Path, name: str, stem1: str, stem2: str, homography: str
+) -> _Entry:
     """Return a pair of images by their paths without suffix."""
     paths = []
     for path in (stem1, stem2):
-        known = [path + suffix for suffix in IMAGE_SUFFIXES if (folder / (path + suffix)).is_file()]
+        known = [
+            path + suffix
+            for suffix in IMAGE_SUFFIXES
+            if (folder / (path + suffix)).is_file()
+        ]
         paths.append(known[0] if known else f"{path}.png")
     return _Entry(name=name, image1=paths[0], image2=paths[1], homography=homography)
 
@@ -130,7 +138,11 @@ def _load_scenes(pattern: str, load: Callable[[Path], Pairs], path: Path) -> Pai
 
 
 def _posed_pairs(
-    scene: str, folder: Path, views: Views, listed: Collection[Names], category: Callable[..., str]
+    scene: str,
+    folder: Path,
+    views: Views,
+    listed: Collection[Names],
+    category: Callable[..., str],
 ) -> Pairs:
     """Return the listed pairs of images that are there and posed; a warning tells of the others.
 
@@ -169,7 +181,9 @@ def _posed_pairs(
             "%s: %d of %d listed pairs are left out, without an image or its camera: %s",
             scene, len(lacking), len(listed), such_as(dict.fromkeys(lacking)),
         )  # fmt: skip
-    return sorted(pairs.values(), key=lambda pair: (float(pair.category.rstrip("°")), pair.name))
+    return sorted(
+        pairs.values(), key=lambda pair: (float(pair.category.rstrip("°")), pair.name)
+    )
 
 
 def load_svp(path: Path) -> Pairs:
@@ -204,9 +218,14 @@ def read_views(folder: Path) -> Views:
     with _damaged(folder):
         for line in _lines(folder / "cameras.txt"):
             key, model, width, height, *words = line.split()
-            params = finite_numbers(words, (-1,), f"{folder / 'cameras.txt'}: camera {key}")
+            params = finite_numbers(
+                words, (-1,), f"{folder / 'cameras.txt'}: camera {key}"
+            )
             cameras[key] = pycolmap.Camera(
-                model=model, params=params.tolist(), width=int(width), height=int(height)
+                model=model,
+                params=params.tolist(),
+                width=int(width),
+                height=int(height),
             )
             if not cameras[key].verify_params():
                 raise ValueError(f"camera {key} has {len(params)} parameters")
@@ -255,7 +274,9 @@ def _load_imc_scene(lists_path: Path) -> Pairs:
     views = {}
     for path in sorted((root / "calibration").glob(f"{CALIBRATION_PREFIX}*.h5")):
         views[path.stem.removeprefix(CALIBRATION_PREFIX)] = read_calibration(path)
-    categories: dict[Names, str] = {}  # covisibility; lists are cumulative, and the last counts
+    categories: dict[
+        Names, str
+    ] = {}  # covisibility; lists are cumulative, and the last counts
     for limit in range(NUM_COVISIBILITY_LIMITS):
         path = lists_path / f"keys-th-0.{limit}.npy"
         if limit == 0 and not path.exists():  # this list may be missing
@@ -263,7 +284,9 @@ def _load_imc_scene(lists_path: Path) -> Pairs:
         with _damaged(path):
             for key in np.load(path, allow_pickle=False).ravel().tolist():
                 categories[_split(str(key), views)] = f"0.{limit}"
-    return _posed_pairs(scene, root / "images", views, categories, lambda *names: categories[names])
+    return _posed_pairs(
+        scene, root / "images", views, categories, lambda *names: categories[names]
+    )
 
 
 def _split(key: str, known: Views) -> Names:
@@ -282,7 +305,9 @@ def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
     values = {}
     with _damaged(path), h5py.File(path) as file:
         for key, shape in {"K": (3, 3), "R": (3, 3), "T": (3,)}.items():
-            values[key] = finite_numbers(np.squeeze(file[key][()]), shape, f"{path}: {key}")
+            values[key] = finite_numbers(
+                np.squeeze(file[key][()]), shape, f"{path}: {key}"
+            )
     return pinhole(values["K"], f"{path}: K"), (values["R"], values["T"])
 
 
@@ -321,7 +346,10 @@ def pinhole(matrix: Array, what: str) -> pycolmap.Camera:
     if min(fx, fy, cx, cy) <= 0 or (skew, zero, *last) != (0, 0, 0, 0, 1):
         raise AffrectError(f"{what} is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     return pycolmap.Camera(
-        model="PINHOLE", width=round(2 * cx), height=round(2 * cy), params=[fx, fy, cx, cy]
+        model="PINHOLE",
+        width=round(2 * cx),
+        height=round(2 * cy),
+        params=[fx, fy, cx, cy],
     )
 
 
@@ -338,7 +366,9 @@ def load_pairs(folder: Path) -> Pairs:
         raise AffrectError(f"{path}: has no pairs")
     for name, count in Counter(entry.name for entry in entries).items():
         if count > 1:
-            raise AffrectError(f"{path}: two pairs are called '{name}'; give them names")
+            raise AffrectError(
+                f"{path}: two pairs are called '{name}'; give them names"
+            )
     return _load(entries, folder, offset_px)
 
 
@@ -354,8 +384,12 @@ def _entry(values: Any, where: str) -> _Entry:
     if leads_outside(entry.image1) or leads_outside(entry.image2):
         raise AffrectError(f"{where}: images must be paths of images in the folder")
     if (entry.homography, entry.correspondences, entry.relative_pose).count(None) != 2:
-        raise AffrectError(f"{where}: needs homography, correspondences or relative_pose, and one")
-    return entry.changed(name=entry.name or f"{stem(entry.image1)} {stem(entry.image2)}")
+        raise AffrectError(
+            f"{where}: needs homography, correspondences or relative_pose, and one"
+        )
+    return entry.changed(
+        name=entry.name or f"{stem(entry.image1)} {stem(entry.image2)}"
+    )
 
 
 def _load(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Pairs:
@@ -378,7 +412,9 @@ def _truth(entry: _Entry, folder: Path, offset_px: float) -> Truth:
     if entry.homography is not None:
         what = f"{entry.name}: homography"
         numbers = _numbers(entry.homography, folder)
-        center = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]])
+        center = np.array(
+            [[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]]
+        )
         matrix = center @ finite_numbers(numbers, (3, 3), what) @ np.linalg.inv(center)
         return TrueHomography.from_files(
             matrix, [folder / entry.image1, folder / entry.image2], what
@@ -403,7 +439,12 @@ def _numbers(given: Any, folder: Path) -> Any:
 def _true_pose(entry: _Entry, offset_px: float) -> TruePose:
     """Return the truth of an entry that has a relative pose."""
     given = entry.relative_pose
-    shapes = {"rotation": (3, 3), "translation": (3,), "intrinsics1": (3, 3), "intrinsics2": (3, 3)}
+    shapes = {
+        "rotation": (3, 3),
+        "translation": (3,),
+        "intrinsics1": (3, 3),
+        "intrinsics2": (3, 3),
+    }
     if not isinstance(given, Mapping) or given.keys() != shapes.keys():
         raise AffrectError(f"{entry.name}: relative_pose needs {', '.join(shapes)}")
     values = {}
@@ -413,4 +454,6 @@ def _true_pose(entry: _Entry, offset_px: float) -> TruePose:
     for key in ("intrinsics1", "intrinsics2"):
         values[key][:2, 2] = colmap_from_pixel(values[key][:2, 2] + offset_px)
         cameras.append(pinhole(values[key], f"{entry.name}: {key}"))
-    return TruePose((cameras[0], cameras[1]), (values["rotation"], values["translation"]))
+    return TruePose(
+        (cameras[0], cameras[1]), (values["rotation"], values["translation"])
+    )

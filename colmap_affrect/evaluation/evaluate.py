@@ -19,12 +19,21 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
-from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
+from colmap_affrect.colmap.verification import (
+    Side,
+    VerificationOptions,
+    estimate_geometry,
+)
 from colmap_affrect.comparison.methods import GivenMethods, Method, parse_methods
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.evaluation import truths
 from colmap_affrect.evaluation.datasets import PROTOCOLS, EvaluationPair
-from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, published
+from colmap_affrect.evaluation.results import (
+    SECONDS,
+    Evaluation,
+    RecipeResult,
+    published,
+)
 from colmap_affrect.evaluation.truths import PairResult, ScoreOptions
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats
@@ -52,7 +61,10 @@ NUM_DIGITS = 8  # of a digest in the name of a file of features
 class _Matched:
     """The matches of a pair at the level with most verified inliers."""
 
-    points: tuple[Array, Array] = (np.zeros((0, 2)), np.zeros((0, 2)))  # (M, 2) px, by image
+    points: tuple[Array, Array] = (
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
+    )  # (M, 2) px, by image
     num_keypoints: tuple[int, int] = (0, 0)
     level: str = ""  # see ``PairResult``
     failure: str = ""  # why the pair could not be matched
@@ -104,7 +116,9 @@ class RecipeRun:
             OptionError: the method is COLMAP's.
         """
         if method.recipe is None:
-            raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
+            raise OptionError(
+                f"{method.label} is COLMAP's and no recipe; compare can run it"
+            )
         self.label = method.label
         self.recipe = method.recipe
         self._pairs = pairs
@@ -143,7 +157,9 @@ class RecipeRun:
                 advance(1)
         return results
 
-    def _result(self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair) -> PairResult:
+    def _result(
+        self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair
+    ) -> PairResult:
         """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
         watch = Stopwatch("extract", "match", "estimate")
         matched = self._matched(matchers, pair, watch)
@@ -168,7 +184,10 @@ class RecipeRun:
         )
 
     def _matched(
-        self, matchers: Mapping[int, CachedMatcher], pair: EvaluationPair, watch: Stopwatch
+        self,
+        matchers: Mapping[int, CachedMatcher],
+        pair: EvaluationPair,
+        watch: Stopwatch,
     ) -> _Matched:
         """Match a pair, level by level, until it has many verified inliers."""
         best: _Matched | None = None
@@ -179,13 +198,19 @@ class RecipeRun:
                     break
                 first, second = map(matcher.prepared, pair.images)
             with watch.step("match"):
-                rows1, rows2 = matcher.matcher.match(first.content, second.content).indices.T
+                rows1, rows2 = matcher.matcher.match(
+                    first.content, second.content
+                ).indices.T
                 lafs = (first.frames[rows1], second.frames[rows2])
                 num_inliers = 0
                 name = ""
                 if len(matchers) > 1:
                     num_inliers = self._verified_inliers(pair, lafs, level)
-                    name = self.recipe.extraction.levels[level].name if num_inliers else "none"
+                    name = (
+                        self.recipe.extraction.levels[level].name
+                        if num_inliers
+                        else "none"
+                    )
             if num_inliers > most or not most:
                 most = num_inliers
                 points = (lafs[0][:, :, 2], lafs[1][:, :, 2])
@@ -193,7 +218,9 @@ class RecipeRun:
             if most >= max(1, self.recipe.escalate.strong_num_inliers):
                 break
         if best is None:
-            failures = [self.failures[name] for name in pair.images if name in self.failures]
+            failures = [
+                self.failures[name] for name in pair.images if name in self.failures
+            ]
             best = _Matched(failure="; ".join(failures))
         return best
 
@@ -204,7 +231,9 @@ class RecipeRun:
         is_usable2 = self._extract(*image2, level)
         return is_usable1 and is_usable2
 
-    def _extract(self, name: str, path: Path, intrinsics: Array | None, level: int) -> bool:
+    def _extract(
+        self, name: str, path: Path, intrinsics: Array | None, level: int
+    ) -> bool:
         """Extract what an image lacks of a level; tell whether it can be used."""
         store = self._store
         base = self.recipe.extraction.levels[level].base
@@ -243,7 +272,11 @@ class RecipeRun:
             # COLMAP's camera of an image without EXIF. Each image has one of its own, since two
             # images of one camera are verified in another way.
             camera = pycolmap.Camera.create_from_model_name(
-                number + 1, "SIMPLE_RADIAL", DEFAULT_FOCAL_RATIO * max(width, height), width, height
+                number + 1,
+                "SIMPLE_RADIAL",
+                DEFAULT_FOCAL_RATIO * max(width, height),
+                width,
+                height,
             )
             sides.append(Side(camera, colmap_keypoints(lafs[number])))
         indices = np.arange(len(lafs[0]))
@@ -284,7 +317,9 @@ def evaluate(
     dataset_path = as_path(dataset_path, "dataset_path")
     output_path = as_path(output_path, "output_path")
     if protocol not in PROTOCOLS:
-        raise OptionError(f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}")
+        raise OptionError(
+            f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}"
+        )
     options = EvaluateOptions.with_keywords(options, keywords)
     require_bools(overwrite=overwrite)
     progress = Progress.given(progress)
@@ -294,7 +329,9 @@ def evaluate(
     inputs = {"protocol": protocol, "dataset_path": str(resolved(dataset_path))}
     with Workspace(output_path).locked():
         pairs = PROTOCOLS[protocol](dataset_path)
-        runs = [RecipeRun(method, pairs, output_path, inputs, options) for method in methods]
+        runs = [
+            RecipeRun(method, pairs, output_path, inputs, options) for method in methods
+        ]
         for method in methods if overwrite else ():
             pattern = f"features/{method.folder_name}-{'?' * NUM_DIGITS}.h5"
             remove_own(output_path.glob(pattern))
@@ -317,11 +354,17 @@ def evaluate(
 def _check(options: EvaluateOptions, dataset_path: Path) -> None:
     """Refuse options out of range, and a dataset that is not there; OptionError."""
     if options.max_num_keypoints is not None and options.max_num_keypoints < 1:
-        raise OptionError(f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1")
+        raise OptionError(
+            f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1"
+        )
     if options.scores.random_seed < 0:
-        raise OptionError(f"--random-seed {options.scores.random_seed}: must be at least 0")
+        raise OptionError(
+            f"--random-seed {options.scores.random_seed}: must be at least 0"
+        )
     if not dataset_path.is_dir():
-        raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
+        raise OptionError(
+            f"{dataset_path}: no such folder; give the folder of the dataset"
+        )
 
 
 def _recipe_result(run: RecipeRun, results: Sequence[PairResult]) -> RecipeResult:

@@ -33,7 +33,9 @@ class RecipeResult:
     """The scores of one recipe."""
 
     name: str  # its label
-    summary: Mapping[str, Mapping[str, float]]  # columns of tables, by the kind of truth
+    summary: Mapping[
+        str, Mapping[str, float]
+    ]  # columns of tables, by the kind of truth
     # number of failed pairs, seconds in all, and means over the pairs: ``solved`` from 0 to 1,
     # ``keypoints`` of an image, ``matches``, ``inliers``
     costs: Mapping[str, float]
@@ -72,7 +74,10 @@ class Evaluation(Summarized):
         for kind, columns in first.summary.items():
             rows: dict[str, Mapping[str, float]] = {}
             for recipe in self.recipes:
-                rows[recipe.name] = {**recipe.summary[kind], SECONDS: recipe.costs[SECONDS]}
+                rows[recipe.name] = {
+                    **recipe.summary[kind],
+                    SECONDS: recipe.costs[SECONDS],
+                }
             for name, row in self.published.items():
                 if row.keys() & columns.keys():
                     rows[name] = row
@@ -82,7 +87,9 @@ class Evaluation(Summarized):
         return "\n\n".join(parts)
 
 
-def _table(title: str, columns: Iterable[str], rows: Mapping[str, Mapping[str, float]]) -> str:
+def _table(
+    title: str, columns: Iterable[str], rows: Mapping[str, Mapping[str, float]]
+) -> str:
     """Format rows with two decimals, but for whole numbers; what a row lacks is empty."""
     lines = [[title, *columns]]
     for name, row in rows.items():

@@ -36,11 +36,19 @@ CONFIDENCE = 0.9999  # at which estimators may end before all iterations
 NUM_ESTIMATES = 5  # with other orders of the matches; the one of median error counts
 MIN_HOMOGRAPHY_MATCHES = 4  # determine a homography
 MIN_FUNDAMENTAL_MATCHES = 8  # determine a fundamental matrix linearly
-MIN_POSE_MATCHES = 6  # five determine several essential matrices, without support for any of them
+MIN_POSE_MATCHES = (
+    6  # five determine several essential matrices, without support for any of them
+)
 MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices; judged
-CORRECT_PX = 3.0  # largest transfer error or Sampson distance of a correct match; judged
-GRID_STEP_PX = 4  # in x and y, of the pixels over which the error of a homography is a mean
-MAX_ERROR_PX = 5.0  # of the homography of a solved pair; a column of the paper's table on EVD
+CORRECT_PX = (
+    3.0  # largest transfer error or Sampson distance of a correct match; judged
+)
+GRID_STEP_PX = (
+    4  # in x and y, of the pixels over which the error of a homography is a mean
+)
+MAX_ERROR_PX = (
+    5.0  # of the homography of a solved pair; a column of the paper's table on EVD
+)
 MAX_ERROR_DEG = 5.0  # of the rotation of a solved pair: the paper's limit
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
 MAX_AUC_ERROR_DEG = 10.0  # of the area under the curve of recall; that of the IMC
@@ -64,7 +72,9 @@ class PairScore:
 
     error: float  # of the protocol, px or degrees; infinite where no model was found
     num_inliers: int  # of the model that was estimated
-    num_correct: int | None = None  # matches that agree with the truth; None where it cannot tell
+    num_correct: int | None = (
+        None  # matches that agree with the truth; None where it cannot tell
+    )
     direction_error_deg: float = math.inf  # of the translation of poses
     solved: float = 0.0  # from 0 to 1; 1 or 0 where the protocol has a threshold
     kind: str = ""  # of the truth, as tables name it; empty without one
@@ -125,7 +135,9 @@ def estimate_matrix(
     return np.asarray(matrix, dtype=np.float64), int(np.count_nonzero(inliers))
 
 
-def estimate_pose(rays: Sides, threshold: float, options: ScoreOptions) -> tuple[Pose | None, int]:
+def estimate_pose(
+    rays: Sides, threshold: float, options: ScoreOptions
+) -> tuple[Pose | None, int]:
     """Estimate a relative pose by RANSAC of five-point samples.
 
     Args:
@@ -174,7 +186,9 @@ class TrueHomography:
     size2: Size  # of image 2
 
     @classmethod
-    def from_files(cls, matrix: Array, paths: Sequence[Path], what: str) -> "TrueHomography":
+    def from_files(
+        cls, matrix: Array, paths: Sequence[Path], what: str
+    ) -> "TrueHomography":
         """Return the truth of two image files.
 
         Args:
@@ -204,7 +218,11 @@ class TrueHomography:
         width, height = self.size1
         columns = np.arange(0, width, GRID_STEP_PX)
         rows = np.arange(0, height, GRID_STEP_PX)
-        points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+        points = (
+            np.stack(np.meshgrid(columns, rows), axis=-1)
+            .reshape(-1, 2)
+            .astype(np.float64)
+        )
         points = points[third_coordinates(self.matrix, points) > 0]
         return points[is_inside(project(self.matrix, points), self.size2)]
 
@@ -219,7 +237,9 @@ class TrueHomography:
         target = project(self.matrix, self.visible)
         return float(transfer_errors(signed, self.visible, target).mean())
 
-    def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
+    def score(
+        self, points1: Points, points2: Points, options: ScoreOptions
+    ) -> PairScore:
         """Score matches by the paper's RANSAC.
 
         Args:
@@ -276,7 +296,9 @@ class TruePose:
     cameras: tuple[pycolmap.Camera, pycolmap.Camera]
     pose: Pose  # camera2_from_camera1
 
-    def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
+    def score(
+        self, points1: Points, points2: Points, options: ScoreOptions
+    ) -> PairScore:
         """Score matches by the paper's RANSAC.
 
         Matches within ``CORRECT_PX`` of the true epipolar lines count as correct, also wrong ones
@@ -293,8 +315,12 @@ class TruePose:
         """
         camera1, camera2 = self.cameras
         both = (rays(camera1, points1), rays(camera2, points2))
-        focal_px = float(np.mean([camera1.mean_focal_length(), camera2.mean_focal_length()]))
-        pose, num_inliers = estimate_pose(both, options.threshold_px / focal_px, options)
+        focal_px = float(
+            np.mean([camera1.mean_focal_length(), camera2.mean_focal_length()])
+        )
+        pose, num_inliers = estimate_pose(
+            both, options.threshold_px / focal_px, options
+        )
         rotation_deg = math.inf
         direction_deg = math.inf
         if pose is not None:
@@ -324,7 +350,9 @@ class Correspondences:
 
     points: Points  # (N, 4) x1, y1, x2, y2 in pixel-centre px
 
-    def score(self, points1: Points, points2: Points, options: ScoreOptions) -> PairScore:
+    def score(
+        self, points1: Points, points2: Points, options: ScoreOptions
+    ) -> PairScore:
         """Score matches by the fundamental matrix of OpenCV's USAC_MAGSAC, as WxBS does.
 
         Args:
@@ -346,12 +374,18 @@ class Correspondences:
                 options.changed(random_seed=seed),
             )
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
-            estimates.append((float(np.median(distances)), num_inliers, seed, distances))
+            estimates.append(
+                (float(np.median(distances)), num_inliers, seed, distances)
+            )
         error, num_inliers, _, distances = median_low(estimates)
-        return PairScore(error, num_inliers, solved=wxbs_score(distances), kind="correspondences")
+        return PairScore(
+            error, num_inliers, solved=wxbs_score(distances), kind="correspondences"
+        )
 
 
-def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2: Points) -> Array:
+def symmetric_epipolar_distances(
+    matrix: Array | None, points1: Points, points2: Points
+) -> Array:
     """Return sqrt(d1^2 + d2^2) of the distances of points from epipolar lines.
 
     Args:
@@ -375,7 +409,9 @@ def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2:
 
 def wxbs_score(distances_px: Array) -> float:
     """Return the mean share of (N,) distances within 0, 1, ... 19 px, as WxBS has it."""
-    return float(np.mean([(distances_px <= limit).mean() for limit in range(NUM_WXBS_LIMITS)]))
+    return float(
+        np.mean([(distances_px <= limit).mean() for limit in range(NUM_WXBS_LIMITS)])
+    )
 
 
 def columns(results: Results) -> dict[str, dict[str, float]]:
@@ -419,7 +455,9 @@ def pose_columns(results: Results) -> dict[str, float]:
     areas = []
     for result in results:
         if result.category:
-            by_title.setdefault(result.category, []).append(result.error < MAX_ERROR_DEG)
+            by_title.setdefault(result.category, []).append(
+                result.error < MAX_ERROR_DEG
+            )
         error_deg = max(result.error, result.direction_error_deg)
         areas.append(max(0.0, 1.0 - error_deg / MAX_AUC_ERROR_DEG))
     by_title["all"] = [result.error < MAX_ERROR_DEG for result in results]

@@ -62,7 +62,9 @@ class AffNetHardNet:
         device = network.device
         self.options = options
         self.device = networks.resolve_device(device)
-        self.affnet = networks.OnPatches(networks.load_affnet(weights["affnet"], device))
+        self.affnet = networks.OnPatches(
+            networks.load_affnet(weights["affnet"], device)
+        )
         self.orinet = networks.load_orinet(weights["orinet"], device)
         name = options.descriptor
         self.descriptor = networks.load_descriptor(name, weights[name], device)
@@ -106,7 +108,9 @@ class AffNetHardNet:
         unit_rows = descriptors[is_valid] / lengths[is_valid, None]
         described = replace(features, lafs=lafs, descriptors=unit_rows)
         image_numbers = np.repeat(np.arange(len(detected)), counts)[is_valid]
-        return [described.select(image_numbers == number) for number in range(len(detected))]
+        return [
+            described.select(image_numbers == number) for number in range(len(detected))
+        ]
 
     def _shapes_and_descriptors(
         self, sample: Callable[[Array], Tensor], features: LocalFeatures
@@ -165,7 +169,9 @@ def _sampler(
 
     def sample(lafs: Array) -> Tensor:
         parts = np.split(lafs, starts)
-        patches = [sampler.sample(part) for sampler, part in zip(samplers, parts, strict=True)]
+        patches = [
+            sampler.sample(part) for sampler, part in zip(samplers, parts, strict=True)
+        ]
         return torch.cat(patches)
 
     return sample
@@ -173,4 +179,6 @@ def _sampler(
 
 def _lafs(shapes: Array, radii_px: Array, centers: Array) -> Array:
     """Return (N, 2, 3) LAFs of shapes of determinant 1, geometric mean radii and centres."""
-    return np.concatenate([radii_px[:, None, None] * shapes, centers[:, :, None]], axis=2)
+    return np.concatenate(
+        [radii_px[:, None, None] * shapes, centers[:, :, None]], axis=2
+    )

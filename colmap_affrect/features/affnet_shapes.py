@@ -19,7 +19,12 @@ import numpy as np
 from pydantic import Field
 
 from colmap_affrect.data import GrayImage, Mask, ShapeGrid, ShapeSamples
-from colmap_affrect.features.base import PATCH_SIZE_PX, FeatureOptions, NetworkContext, ShapeOptions
+from colmap_affrect.features.base import (
+    PATCH_SIZE_PX,
+    FeatureOptions,
+    NetworkContext,
+    ShapeOptions,
+)
 from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry import conventions, tilts
 from colmap_affrect.geometry.affine import determinants
@@ -36,16 +41,22 @@ LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
 front, that patch has the block of rows and columns 0...3 in its middle."""
 PAPER_CROP_PX = (-LEAD_PX) % STEP_PX  # puts the patches of all cells round whole blocks
-PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX  # blocks before the first with a patch
+PAPER_LEAD_CELLS = (
+    LEAD_PX + PAPER_CROP_PX
+) // STEP_PX  # blocks before the first with a patch
 CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9  # cell i depends on rows 4 i - 11...4 i + 39
 STRIP_CELLS = 64  # rows of cells that are computed at once, to bound the memory
 WINDOW_PX = 33  # surroundings whose mean and deviation normalize a pixel: about a patch
 DEVIATION_FLOOR = 0.01 * 255
 """Gray values added to deviations, so that surroundings without texture stay so; judged."""
-PAPER_DEVIATION_FLOOR = 1e-6  # added to the deviation of the whole image (the authors' value)
+PAPER_DEVIATION_FLOOR = (
+    1e-6  # added to the deviation of the whole image (the authors' value)
+)
 MAX_NORMALIZED = 6.0
 """Largest normalized value, as in the fully convolutional network of AffNet's authors."""
-PATCH_SIGMAS = 12.0  # half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
+PATCH_SIGMAS = (
+    12.0  # half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
+)
 BATCH_SIZE = 256  # patches that go through the network at once
 
 
@@ -54,7 +65,8 @@ class AffNetOptions(ShapeOptions):
 
     name: Literal["affnet"] = "affnet"
     scales: Annotated[
-        tuple[Annotated[float, within(0.05, 1.0)], ...], Field(strict=False, min_length=1)
+        tuple[Annotated[float, within(0.05, 1.0)], ...],
+        Field(strict=False, min_length=1),
     ] = (1.0, 0.5, 0.25)
     """Sizes of the image at which dense shapes are estimated; their log-Euclidean mean counts."""
     paper: bool = False
@@ -110,7 +122,9 @@ class AffNet:
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
-        lafs = self.detect(image).lafs[: self.options.max_num_keypoints]  # by falling response
+        lafs = self.detect(image).lafs[
+            : self.options.max_num_keypoints
+        ]  # by falling response
         shapes = _shapes(self._patch_outputs(image, lafs))
         is_finite = np.isfinite(shapes).all(axis=(1, 2))
         is_valid = is_finite & (determinants(shapes) > 0)
@@ -120,7 +134,9 @@ class AffNet:
     def _mean_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics, the mean over all sizes of the image."""
         height, width = image.shape
-        mean = np.zeros((ceil(height / STEP_PX), ceil(width / STEP_PX), 2), dtype=np.float32)
+        mean = np.zeros(
+            (ceil(height / STEP_PX), ceil(width / STEP_PX), 2), dtype=np.float32
+        )
         levels = self._levels(image)
         for level in levels:
             local_mean, deviation = _mean_and_deviation(level)
@@ -128,7 +144,9 @@ class AffNet:
             clipped = np.clip(normalized, -MAX_NORMALIZED, MAX_NORMALIZED)
             logs = self._dense_logs(_with_reflected_border(clipped.astype(np.float32)))
             level_size = (level.shape[1], level.shape[0])
-            level_from_image = conventions.resized_from_original((width, height), level_size)
+            level_from_image = conventions.resized_from_original(
+                (width, height), level_size
+            )
             mean += _interpolated(logs, level_from_image, mean.shape[:2]) / len(levels)
         return mean
 
@@ -198,7 +216,9 @@ def _mean_and_deviation(image: GrayImage) -> tuple[Array, Array]:
     """Return (H, W) mean and standard deviation of the window around each pixel."""
     window = (WINDOW_PX, WINDOW_PX)
     border = cv2.BORDER_REFLECT_101
-    mean = np.asarray(cv2.boxFilter(image, cv2.CV_64F, window, borderType=border), np.float64)
+    mean = np.asarray(
+        cv2.boxFilter(image, cv2.CV_64F, window, borderType=border), np.float64
+    )
     mean_square = cv2.sqrBoxFilter(image, cv2.CV_64F, window, borderType=border)
     variance = np.maximum(mean_square - mean**2, 0.0)
     return mean, np.sqrt(variance)
@@ -209,7 +229,9 @@ def _with_reflected_border(values: Floats) -> Floats:
     height, width = values.shape
     bottom = LEAD_PX + -height % STEP_PX
     right = LEAD_PX + -width % STEP_PX
-    bordered = cv2.copyMakeBorder(values, LEAD_PX, bottom, LEAD_PX, right, cv2.BORDER_REFLECT_101)
+    bordered = cv2.copyMakeBorder(
+        values, LEAD_PX, bottom, LEAD_PX, right, cv2.BORDER_REFLECT_101
+    )
     return np.asarray(bordered)
 
 
@@ -222,7 +244,9 @@ def _textured_blocks(image: GrayImage, min_deviation: float) -> Mask:
     return np.asarray(middle_deviation > min_deviation)
 
 
-def _interpolated(values: Singles, level_from_image: Array, cells: tuple[int, int]) -> Singles:
+def _interpolated(
+    values: Singles, level_from_image: Array, cells: tuple[int, int]
+) -> Singles:
     """Interpolate values at the blocks of a resized image at the blocks of the image.
 
     Beyond the outermost blocks their values count.
@@ -246,7 +270,9 @@ def _interpolated(values: Singles, level_from_image: Array, cells: tuple[int, in
     return np.stack(channels, -1)
 
 
-def _linear_weights(scale: float, shift: float, num_cells: int, num_values: int) -> Singles:
+def _linear_weights(
+    scale: float, shift: float, num_cells: int, num_values: int
+) -> Singles:
     """Return (num_cells, num_values) weights of linear interpolation along one axis.
 
     Scale and shift map px of the image to px of the resized one.

@@ -10,7 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, View, in_mask
-from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, NetworkContext
+from colmap_affrect.features.base import (
+    FeatureExtractor,
+    FeatureOptions,
+    NetworkContext,
+)
 from colmap_affrect.features.sift import is_searchable
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.geometry.arrays import Singles
@@ -62,7 +66,9 @@ class Aliked(FeatureExtractor):
         self.device = resolve_device(context.device)
         (key,) = options.weights
         path = context.weights[key]
-        self.network: Any = load_extractor(key, options.score_threshold, path, context.device)
+        self.network: Any = load_extractor(
+            key, options.score_threshold, path, context.device
+        )
 
     def detect(self, view: View) -> LocalFeatures:
         """Detect and describe, by falling response.
@@ -78,7 +84,9 @@ class Aliked(FeatureExtractor):
         with torch.inference_mode():
             pixels = _pixels(image).to(self.device)
             feature_map, score_map = self.network.extract_dense_map(pixels)
-            (normalized,), (scores,), _ = self.network.dkd(score_map)  # positions in [-1, 1]
+            (normalized,), (scores,), _ = self.network.dkd(
+                score_map
+            )  # positions in [-1, 1]
             last_pixel = normalized.new_tensor([image.shape[1] - 1, image.shape[0] - 1])
             points = (normalized + 1) / 2 * last_pixel
             kept = np.flatnonzero(in_mask(is_allowed, _array(points)))

@@ -26,8 +26,12 @@ from colmap_affrect.images.warping import halved
 Network = TypeVar("Network", bound=nn.Module)
 State = dict[str, Any]
 UNUSED_PREFIX = "SIFT."  # of parameters in the file of HardTFeat that no layer has
-PATCHES_AT_ONCE = 512  # patches that are sampled at once, which stay in the cache of a CPU
-DEVIATION_FLOOR = 1e-6  # added to deviations of patches, as in kornia's AffNet and OriNet
+PATCHES_AT_ONCE = (
+    512  # patches that are sampled at once, which stay in the cache of a CPU
+)
+DEVIATION_FLOOR = (
+    1e-6  # added to deviations of patches, as in kornia's AffNet and OriNet
+)
 MAX_PROBLEM_LENGTH = 80  # characters of torch's message that are shown
 
 
@@ -44,7 +48,9 @@ def resolve_device(name: str) -> torch.device:
         torch.empty(0, device=name)
     except (AssertionError, RuntimeError) as error:
         why = str(error).splitlines()[0]
-        raise OptionError(f"--device {name}: {why}; use --device cpu or auto") from error
+        raise OptionError(
+            f"--device {name}: {why}; use --device cpu or auto"
+        ) from error
     return torch.device(name)
 
 
@@ -54,7 +60,9 @@ def load_affnet(path: Path, device: str) -> nn.Sequential:
     Standardized patches (B, 1, 32, 32) give (B, 3, 1, 1); an image of H x W px gives (ceil(H / 4) -
     7) x (ceil(W / 4) - 7) cells, where cell (i, j) has the patch whose first pixel is (4 j, 4 i).
     """
-    network = _with_state(feature.LAFAffNetShapeEstimator(pretrained=False), path, "AffNet")
+    network = _with_state(
+        feature.LAFAffNetShapeEstimator(pretrained=False), path, "AffNet"
+    )
     return _ready(folded(network.features[:-1]), device)
 
 
@@ -98,7 +106,9 @@ def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
     return _ready(network, device)
 
 
-def load_extractor(key: str, score_threshold: float, path: Path, device: str) -> nn.Module:
+def load_extractor(
+    key: str, score_threshold: float, path: Path, device: str
+) -> nn.Module:
     """Build ALIKED.
 
     Args:
@@ -151,7 +161,9 @@ def folded(layers: nn.Module) -> nn.Sequential:
     return nn.Sequential(*kept)
 
 
-def _with_state(network: Network, path: Path, name: str, computed: State | None = None) -> Network:
+def _with_state(
+    network: Network, path: Path, name: str, computed: State | None = None
+) -> Network:
     """Give a network the parameters of a file.
 
     Args:
@@ -199,7 +211,9 @@ class PatchSampler:
         levels = [image]
         while min(levels[-1].shape) >= 2 * PATCH_SIZE_PX:
             levels.append(halved(levels[-1]))
-        self.levels = [torch.from_numpy(level)[None, None].to(device) for level in levels]
+        self.levels = [
+            torch.from_numpy(level)[None, None].to(device) for level in levels
+        ]
 
     def sample(self, lafs: Floats) -> Tensor:
         """Return the (N, 1, 32, 32) patches of (N, 2, 3) LAFs in px.
@@ -212,7 +226,9 @@ class PatchSampler:
         image = self.levels[0]
         if image.device.type == "mps":  # which has no sampling beyond the border
             given = torch.from_numpy(lafs.astype(np.float32)).to(image.device)
-            return feature.extract_patches_from_pyramid(image, given[None], PATCH_SIZE_PX)[0]
+            return feature.extract_patches_from_pyramid(
+                image, given[None], PATCH_SIZE_PX
+            )[0]
         finite = np.where(np.isfinite(lafs), lafs, 0.0)
         level_numbers = self._level_numbers(finite[:, :, :2])
         unit_per_px = 2.0 / np.array(image.shape[:1:-1])
@@ -223,7 +239,9 @@ class PatchSampler:
         for number, level in enumerate(self.levels):
             rows = np.flatnonzero(level_numbers == number)
             for begin in range(0, len(rows), PATCHES_AT_ONCE):
-                part = torch.from_numpy(rows[begin : begin + PATCHES_AT_ONCE]).to(image.device)
+                part = torch.from_numpy(rows[begin : begin + PATCHES_AT_ONCE]).to(
+                    image.device
+                )
                 patches[part] = _sampled(level, normalized[part])
         return patches
 
@@ -238,6 +256,8 @@ class PatchSampler:
 def _sampled(level: Tensor, lafs: Tensor) -> Tensor:
     """Sample (N, 2, 3) LAFs in coordinates of -1...1 from border to border."""
     size = [len(lafs), 1, PATCH_SIZE_PX, PATCH_SIZE_PX]
-    positions = affine_grid(lafs, size, align_corners=False).view(1, -1, PATCH_SIZE_PX, 2)
+    positions = affine_grid(lafs, size, align_corners=False).view(
+        1, -1, PATCH_SIZE_PX, 2
+    )
     sampled = grid_sample(level, positions, padding_mode="border", align_corners=False)
     return sampled.view(size)

@@ -26,7 +26,8 @@ class SecondMomentOptions(ShapeOptions):
     derivative_sigma_px: Annotated[float, within(0.3, 20.0)] = 1.5
     """Gaussian smoothing before the gradients."""
     integration_sigmas_px: Annotated[
-        tuple[Annotated[float, within(1.0, 1000.0)], ...], Field(strict=False, min_length=1)
+        tuple[Annotated[float, within(1.0, 1000.0)], ...],
+        Field(strict=False, min_length=1),
     ] = (8.0, 16.0, 32.0)
     """Windows over which the structure tensor is averaged; shapes are their log-Euclidean mean."""
     min_gradient: Annotated[float, within(0.0, 255.0)] = 1.0
@@ -59,7 +60,9 @@ class SecondMoment:
         square_gradients = smallest_window[..., 0] + smallest_window[..., 1]
         textured = square_gradients > self.options.min_gradient**2
         mean_log[~textured] = 0.0
-        return ShapeGrid(metrics_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX)
+        return ShapeGrid(
+            metrics_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX
+        )
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Return the shapes of the textured blocks of a (H, W) uint8 image."""

@@ -8,7 +8,11 @@ import cv2
 import numpy as np
 
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, View
-from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, NetworkContext
+from colmap_affrect.features.base import (
+    FeatureExtractor,
+    FeatureOptions,
+    NetworkContext,
+)
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
@@ -49,7 +53,9 @@ class RootSift(FeatureExtractor):
     Options = SiftOptions
     descriptor_size = 128
 
-    def __init__(self, options: SiftOptions, network: NetworkContext | None = None) -> None:
+    def __init__(
+        self, options: SiftOptions, network: NetworkContext | None = None
+    ) -> None:
         del network
         self.options = options
 
@@ -118,7 +124,9 @@ class OrderedKeypoints:
 
 def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> OrderedKeypoints:
     """Sort OpenCV's keypoints. OpenCV's ``size`` is the diameter of two sigmas."""
-    responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
+    responses = np.array(
+        [keypoint.response for keypoint in keypoints], dtype=np.float32
+    )
     points = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
     sizes = np.array([keypoint.size for keypoint in keypoints], dtype=np.float64)
     angles_deg = np.array([keypoint.angle for keypoint in keypoints], dtype=np.float64)
@@ -132,7 +140,9 @@ def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> OrderedKeypoints:
     )
 
 
-def detect_dog(image: GrayImage, options: DogOptions, mask: Bytes | None = None) -> LocalFeatures:
+def detect_dog(
+    image: GrayImage, options: DogOptions, mask: Bytes | None = None
+) -> LocalFeatures:
     """Detect DoG keypoints for descriptors that assign orientations themselves.
 
     OpenCV returns a keypoint once for each dominant orientation. These would become equal features,
@@ -155,4 +165,6 @@ def detect_dog(image: GrayImage, options: DogOptions, mask: Bytes | None = None)
     kept = np.sort(first)[: options.max_num_features]
     radii_px = MEASUREMENT_SIGMAS * ordered.sigmas_px[kept]
     lafs = lafs_from_keypoints(ordered.points[kept], radii_px, np.zeros(len(kept)))
-    return LocalFeatures(lafs, ordered.responses[kept], np.zeros((len(kept), 0), np.float32))
+    return LocalFeatures(
+        lafs, ordered.responses[kept], np.zeros((len(kept), 0), np.float32)
+    )

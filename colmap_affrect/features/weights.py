@@ -27,7 +27,11 @@ from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.record import file_sha256
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
-WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # work without weights
+WEIGHTLESS_RECIPES = (
+    "default",
+    "on-demand",
+    "unrectified-rootsift",
+)  # work without weights
 TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
 
 
@@ -119,7 +123,10 @@ def is_published(key: str, path: Path) -> bool | None:
 
 
 def resolve(
-    keys: Iterable[str], weights_path: Path | None = None, *, progress: Progress = SILENT
+    keys: Iterable[str],
+    weights_path: Path | None = None,
+    *,
+    progress: Progress = SILENT,
 ) -> dict[str, Path]:
     """Find files of weights, or download them into torch's cache.
 
@@ -204,7 +211,9 @@ def _target_folder(folder: Path | None) -> Path:
             "--weights: give a folder, there is no home for a cache of files (TORCH_HOME names one)"
         )
     if target.exists() and not target.is_dir():
-        raise OptionError(f"--weights {target}: not a folder; give the folder of the weights")
+        raise OptionError(
+            f"--weights {target}: not a folder; give the folder of the weights"
+        )
     return target
 
 
@@ -288,7 +297,9 @@ def load_state_dict(path: Path) -> dict[str, Any]:
         raise unusable(path, why) from error
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
-    has_names = isinstance(content, Mapping) and all(isinstance(key, str) for key in content)
+    has_names = isinstance(content, Mapping) and all(
+        isinstance(key, str) for key in content
+    )
     if not has_names:
         raise unusable(path, "holds no parameters by name")
     return dict(content)

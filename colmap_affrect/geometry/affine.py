@@ -44,7 +44,9 @@ def transform_lafs(homography: Floats, lafs: Floats) -> Array:
     """
     mapped = lafs[:, :, 2] @ homography[:, :2].T + homography[:, 2]
     centers = mapped[:, :2] / mapped[:, 2:]
-    jacobians = homography[None, :2, :2] - centers[:, :, None] * homography[None, 2:, :2]
+    jacobians = (
+        homography[None, :2, :2] - centers[:, :, None] * homography[None, 2:, :2]
+    )
     jacobians = jacobians / mapped[:, 2, None, None]
     shapes = jacobians @ lafs[:, :, :2]
     return np.concatenate([shapes, centers[:, :, None]], axis=2)
@@ -100,7 +102,9 @@ def ellipse_extents(shapes: Floats) -> Array:
     return np.asarray(np.linalg.norm(shapes, axis=2))
 
 
-def rectifying_affine(tilt: float, angle_rad: float, *, area_preserving: bool = True) -> Array:
+def rectifying_affine(
+    tilt: float, angle_rad: float, *, area_preserving: bool = True
+) -> Array:
     """Return the rectifying map diag(sqrt t, 1 / sqrt t) R(phi) of a tilt class.
 
     Args:
@@ -124,10 +128,14 @@ def image_corners(image_size: tuple[int, int]) -> Array:
     return np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
 
 
-CANVAS_ROUNDING_PX = 1e-9  # float64 rounding of a mapped point adds no column or row to a canvas
+CANVAS_ROUNDING_PX = (
+    1e-9  # float64 rounding of a mapped point adds no column or row to a canvas
+)
 
 
-def fit_canvas(linear: Floats, points: Floats, margin_px: float) -> tuple[Array, tuple[int, int]]:
+def fit_canvas(
+    linear: Floats, points: Floats, margin_px: float
+) -> tuple[Array, tuple[int, int]]:
     """Translate a linear map so that the mapped points fill a canvas from its first pixel on.
 
     Args:

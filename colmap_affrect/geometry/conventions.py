@@ -19,7 +19,9 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Array, Bools, Floats
 
 HALF_PIXEL = 0.5
-MEASUREMENT_SIGMAS = 6.0  # radius of the measurement ellipse of a local affine frame, in sigmas
+MEASUREMENT_SIGMAS = (
+    6.0  # radius of the measurement ellipse of a local affine frame, in sigmas
+)
 
 
 def colmap_from_pixel(points: Floats) -> Floats:
@@ -32,7 +34,9 @@ def pixel_from_colmap(points: Floats) -> Floats:
     return points - points.dtype.type(HALF_PIXEL)
 
 
-def resized_from_original(original_size: tuple[int, int], resized_size: tuple[int, int]) -> Array:
+def resized_from_original(
+    original_size: tuple[int, int], resized_size: tuple[int, int]
+) -> Array:
     """Return the (3, 3) map of pixel-centre px of an image to those of its resized version.
 
     Both sizes are (width, height) in px.
@@ -68,7 +72,9 @@ def grid_origin(step_px: int) -> float:
     return HALF_PIXEL * (step_px - 1)
 
 
-def is_inside(points: Floats, size: tuple[int, int], margin_px: Floats | float = 0) -> Bools:
+def is_inside(
+    points: Floats, size: tuple[int, int], margin_px: Floats | float = 0
+) -> Bools:
     """Return whether points lie in an image and keep a distance from its edge.
 
     Args:

@@ -17,7 +17,9 @@ from colmap_affrect.geometry.two_views import homogeneous
 TINY = np.finfo(float).tiny
 
 
-def epipolar_lines(fundamental: Floats, points1: Floats, points2: Floats) -> tuple[Array, Array]:
+def epipolar_lines(
+    fundamental: Floats, points1: Floats, points2: Floats
+) -> tuple[Array, Array]:
     """Return the epipolar lines of matches.
 
     Args:
@@ -75,9 +77,13 @@ class EpipolarModel:
         Returns:
             (M,) px.
         """
-        return sampson_errors(self.fundamental, self.points[0][rows1], self.points[1][rows2])
+        return sampson_errors(
+            self.fundamental, self.points[0][rows1], self.points[1][rows2]
+        )
 
-    def cosines(self, rows1: Integers, rows2: Integers, shapes: tuple[Array, Array]) -> Array:
+    def cosines(
+        self, rows1: Integers, rows2: Integers, shapes: tuple[Array, Array]
+    ) -> Array:
         """Return how well the LAFs of matches map epipolar lines of image 1 to those of image 2.
 
         Args:
@@ -105,7 +111,9 @@ class EpipolarModel:
         image2_from_smaller = np.diag([second, second, 1.0])
         fundamental = image2_from_smaller @ self.fundamental @ image1_from_smaller
         points1, points2 = self.points
-        return replace(self, fundamental=fundamental, points=(points1 / first, points2 / second))
+        return replace(
+            self, fundamental=fundamental, points=(points1 / first, points2 / second)
+        )
 
 
 @dataclass(frozen=True)
@@ -124,9 +132,13 @@ class HomographyModel:
             rows1: (M,) features of image 1.
             rows2: (M,) features of image 2.
         """
-        return affine.homography_errors(self.matrix, self.points[0][rows1], self.points[1][rows2])
+        return affine.homography_errors(
+            self.matrix, self.points[0][rows1], self.points[1][rows2]
+        )
 
-    def cosines(self, rows1: Integers, rows2: Integers, shapes: tuple[Array, Array]) -> Array:
+    def cosines(
+        self, rows1: Integers, rows2: Integers, shapes: tuple[Array, Array]
+    ) -> Array:
         """Return how well LAFs of image 1, mapped by the homography, agree with those of image 2.
 
         Args:

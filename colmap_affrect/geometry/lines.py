@@ -24,7 +24,9 @@ FOCALS: Array = np.exp(np.linspace(math.log(0.4), math.log(6.0), 28))
 SHIFTS: Array = np.linspace(-0.3, 0.3, 25)
 """Grid of shifts, longer sides: view cameras go to a quarter of their plate."""
 
-MIN_NUM_SEGMENTS = 12  # fewer say nothing: three directions and a focal length have 4 unknowns
+MIN_NUM_SEGMENTS = (
+    12  # fewer say nothing: three directions and a focal length have 4 unknowns
+)
 NUM_SEGMENTS_OF_TRIALS = 90  # the longest, by which first frames are tried
 NUM_TRIALS = 160  # frames of three directions that are tried for each focal length
 NUM_KEPT = 3  # of these, which are refined for each focal length
@@ -38,8 +40,12 @@ by ``tests/benchmarks/lines.py``, with each scene left out in turn."""
 USUAL_FOCAL = 1.2  # longer sides: what COLMAP guesses
 USUAL_FOCAL_SIGMA = 0.5  # of the logarithm of the focal lengths that photographs have
 KNOWN_SIGMA = 0.15  # of log focal length, below which lines know it
-MIDDLE_SIGMA = 0.02  # longer sides, of the axis of a photograph that is as the camera took it
-SHIFTED_SIGMA = 0.15  # longer sides, of the axis of a print: view cameras shift, and prints are cut
+MIDDLE_SIGMA = (
+    0.02  # longer sides, of the axis of a photograph that is as the camera took it
+)
+SHIFTED_SIGMA = (
+    0.15  # longer sides, of the axis of a print: view cameras shift, and prints are cut
+)
 MIN_EVIDENCE = 3.0  # nats, from which on lines have their directions not by chance
 SHIFT_EVIDENCE = 3.0  # nats, from which on lines say that the axis is not in the middle
 
@@ -128,7 +134,10 @@ class Lines:
     @property
     def says_shifted(self) -> bool:
         """Whether the lines say that the optical axis is not in the middle of the image."""
-        return self.likelihood is not None and shift_evidence(self.likelihood) > SHIFT_EVIDENCE
+        return (
+            self.likelihood is not None
+            and shift_evidence(self.likelihood) > SHIFT_EVIDENCE
+        )
 
     @property
     def usual_shift_sigma(self) -> float:
@@ -155,7 +164,9 @@ class Lines:
         focal = float(FOCALS[row])
         shift = float(SHIFTS[column])
         rotation = self.likelihood.rotations[row, column]
-        fit = VanishingFit(self.segments, rotation[None], np.array([focal]), np.array([shift]))
+        fit = VanishingFit(
+            self.segments, rotation[None], np.array([focal]), np.array([shift])
+        )
         evidence = float(self.likelihood.log_likelihoods[row, column])
         return Explanation(focal, shift, rotation, fit.kinds()[0], evidence)
 
@@ -165,7 +176,9 @@ def measure_lines(segments: Segments) -> Lines:
     return Lines(segments, line_likelihood(segments))
 
 
-def line_camera(likelihood: LineLikelihood, shift_sigma: float = MIDDLE_SIGMA) -> LineCamera:
+def line_camera(
+    likelihood: LineLikelihood, shift_sigma: float = MIDDLE_SIGMA
+) -> LineCamera:
     """Return what lines say of a camera, together with what is usual.
 
     Args:
@@ -199,7 +212,8 @@ def shift_evidence(likelihood: LineLikelihood) -> float:
     free = _log_joint(likelihood, SHIFTED_SIGMA)
     in_the_middle = _log_joint(likelihood, MIDDLE_SIGMA)
     return float(
-        np.logaddexp.reduce(free, axis=None) - np.logaddexp.reduce(in_the_middle, axis=None)
+        np.logaddexp.reduce(free, axis=None)
+        - np.logaddexp.reduce(in_the_middle, axis=None)
     )
 
 
@@ -214,7 +228,9 @@ def _log_joint(likelihood: LineLikelihood, shift_sigma: float) -> Floats:
     focal_prior = -0.5 * (np.log(FOCALS / USUAL_FOCAL) / USUAL_FOCAL_SIGMA) ** 2
     shift_prior = -0.5 * (SHIFTS / shift_sigma) ** 2
     prior = focal_prior[:, None] + shift_prior[None, :]
-    return np.asarray(likelihood.log_likelihoods + prior - np.logaddexp.reduce(prior, axis=None))
+    return np.asarray(
+        likelihood.log_likelihoods + prior - np.logaddexp.reduce(prior, axis=None)
+    )
 
 
 def posterior(likelihood: LineLikelihood, shift_sigma: float) -> Floats:
@@ -272,9 +288,13 @@ def _first_rotations(segments: Segments, random_seed: int) -> Floats:
     no_shift = np.zeros(NUM_TRIALS)
     kept = np.empty((len(FOCALS), NUM_KEPT, 3, 3))
     for number, focal in enumerate(FOCALS):
-        normals = _unit(longest.lines * [focal, focal, 1.0])  # of planes with the camera's centre
+        normals = _unit(
+            longest.lines * [focal, focal, 1.0]
+        )  # of planes with the camera's centre
         rotations = _frames(normals[chosen])
-        scores = VanishingFit(longest, rotations, np.full(NUM_TRIALS, focal), no_shift).scores()
+        scores = VanishingFit(
+            longest, rotations, np.full(NUM_TRIALS, focal), no_shift
+        ).scores()
         kept[number] = rotations[np.argsort(-scores, kind="stable")[:NUM_KEPT]]
     return kept
 

@@ -10,7 +10,9 @@ import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Integers
 
-NUM_NEIGHBORS = 8  # nearest matches in each image that may support one; judged on photographs
+NUM_NEIGHBORS = (
+    8  # nearest matches in each image that may support one; judged on photographs
+)
 MIN_SUPPORTING = 2
 """Neighbours that must support a match in both images; judged: one supports some wrong matches,
 two hardly any."""
@@ -19,7 +21,9 @@ MAX_RELATIVE_ERROR = 0.5
 MIN_DISTANCE_PX = 4.0
 """Distance of a neighbour in both images. Nearer matches are of the same point, in several
 orientations or warps; judged."""
-CHUNK_ROWS = 512  # matches that are compared with all others at a time, which bounds memory
+CHUNK_ROWS = (
+    512  # matches that are compared with all others at a time, which bounds memory
+)
 
 
 def num_consistent_matches(lafs1: Floats, lafs2: Floats) -> int:
@@ -54,7 +58,9 @@ def _num_supporting(points1: Array, points2: Array, maps: Array) -> Indices:
         distances1 = _distances(points1, rows)
         distances = np.minimum(distances1, _distances(points2, rows))
         distances1[distances < MIN_DISTANCE_PX] = np.inf  # the match itself, too
-        nearest = np.argpartition(distances1, num_neighbors - 1, axis=1)[:, :num_neighbors]
+        nearest = np.argpartition(distances1, num_neighbors - 1, axis=1)[
+            :, :num_neighbors
+        ]
         is_neighbor = np.isfinite(np.take_along_axis(distances1, nearest, axis=1))
         offsets1 = points1[nearest] - points1[rows, None]
         offsets2 = points2[nearest] - points2[rows, None]
@@ -73,7 +79,9 @@ def _distances(points: Array, rows: Indices) -> Array:
 class NeighborLists:
     """Neighbours of each point, itself included, as compressed rows."""
 
-    starts: Indices  # (N + 1,) the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
+    starts: (
+        Indices  # (N + 1,) the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
+    )
     indices: Indices  # points
 
     def of(self, points: Integers) -> tuple[Indices, Indices]:

@@ -16,18 +16,30 @@ Size = tuple[int, int]
 FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
 """Focal lengths that are tried for a rotated camera, in units of the longer side. From ten on a
 rotation is a shift of the image."""
-MAX_NUM_POINTS = 500  # measure a ratio to two per cent (theory: binomial standard deviation)
-MIN_DEPTH = 1e-3  # of a rotated ray of length 1; what is behind lands far outside of the image
+MAX_NUM_POINTS = (
+    500  # measure a ratio to two per cent (theory: binomial standard deviation)
+)
+MIN_DEPTH = (
+    1e-3  # of a rotated ray of length 1; what is behind lands far outside of the image
+)
 NUM_STARTS = 30  # rotations of two matches each; least squares begin with the best one
 MAX_ITERATIONS = 3  # least squares are repeated without outliers
 
-TEXT_ERROR_FRAC = 0.001  # error of a match of print, in units of the longer side; judged
-TEXT_HEIGHT_FRAC = 0.015  # height of a line of small print, in units of the longer side; judged
-MAX_TEXT_SLOPE = 0.087  # sine of the angle of a line of text to a side of the image, five degrees
+TEXT_ERROR_FRAC = (
+    0.001  # error of a match of print, in units of the longer side; judged
+)
+TEXT_HEIGHT_FRAC = (
+    0.015  # height of a line of small print, in units of the longer side; judged
+)
+MAX_TEXT_SLOPE = (
+    0.087  # sine of the angle of a line of text to a side of the image, five degrees
+)
 MAX_NUM_TRIALS = 300  # of RANSAC: enough for a set that one in eight matches is in
 
 MIN_SAME_VIEW_RATIO = 0.85  # matches of copies that a change of scale explains; judged
-SAME_VIEW_ERROR_FRAC = 0.01  # their error, in units of the longer side: paper is not flat; judged
+SAME_VIEW_ERROR_FRAC = (
+    0.01  # their error, in units of the longer side: paper is not flat; judged
+)
 
 COMPARED_SIZE_PX = 400  # longer side of images whose windows are correlated
 WINDOW_PX = 11  # side of the windows
@@ -78,7 +90,9 @@ def _spread(points: Array) -> float:
     return float(np.median(distances))
 
 
-def _rotation_ratios(points1: Array, points2: Array, lenses: Array, error: float) -> Array:
+def _rotation_ratios(
+    points1: Array, points2: Array, lenses: Array, error: float
+) -> Array:
     """Return the ratios of matches within an error of the best rotation, for each lens.
 
     Args:
@@ -98,7 +112,9 @@ def _rotation_ratios(points1: Array, points2: Array, lenses: Array, error: float
 
     def errors_of(rotations: Array) -> Array:
         """Return (L, S, N) px for (L, S, 3, 3) rotations."""
-        rows = rotations.reshape(len(lenses), -1, 3)  # one product is ten times as fast as many
+        rows = rotations.reshape(
+            len(lenses), -1, 3
+        )  # one product is ten times as fast as many
         rotated = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
         depths = np.maximum(rotated[..., 2, :], MIN_DEPTH)
         scales = focals2[:, None, None] / depths
@@ -139,7 +155,9 @@ def _sampled(points: Array) -> Array:
     return points[::step]
 
 
-def text_line_matches(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Bools:
+def text_line_matches(
+    points1: Array, points2: Array, sizes: tuple[Size, Size]
+) -> Bools:
     """Return which matches are on one line of text along a side of both images.
 
     They are the largest set that a similarity explains; none where that set is no thin line. The
@@ -182,7 +200,9 @@ def _longest_side(sizes: tuple[Size, Size]) -> int:
     return max(*sizes[0], *sizes[1])
 
 
-def same_view_homography(points1: Array, points2: Array, sizes: tuple[Size, Size]) -> Array | None:
+def same_view_homography(
+    points1: Array, points2: Array, sizes: tuple[Size, Size]
+) -> Array | None:
     """Return the homography between two copies of one photograph.
 
     Args:
@@ -195,7 +215,9 @@ def same_view_homography(points1: Array, points2: Array, sizes: tuple[Size, Size
         matches.
     """
     error_px = SAME_VIEW_ERROR_FRAC * _longest_side(sizes)
-    _, inliers = cv2.estimateAffinePartial2D(points1, points2, ransacReprojThreshold=error_px)
+    _, inliers = cv2.estimateAffinePartial2D(
+        points1, points2, ransacReprojThreshold=error_px
+    )
     if inliers is None or np.mean(inliers) < MIN_SAME_VIEW_RATIO:
         return None
     centers1 = pixel_from_colmap(points1)
@@ -261,7 +283,9 @@ def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -
     size1, size2 = sizes
     if not len(points1):
         return 0.0
-    is_keypoint = np.zeros((size1[1] + 2 * MARGIN_PX, size1[0] + 2 * MARGIN_PX), np.uint8)
+    is_keypoint = np.zeros(
+        (size1[1] + 2 * MARGIN_PX, size1[0] + 2 * MARGIN_PX), np.uint8
+    )
     is_keypoint[_pixels(points2 * np.divide(size1, size2), size1)] = 1
     is_near = np.asarray(cv2.dilate(is_keypoint, np.ones((3, 3), np.uint8)))
     ratios = [0.0]

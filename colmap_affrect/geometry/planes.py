@@ -20,7 +20,9 @@ MIN_WEIGHT_FRAC = 0.5
 """Share of the window's weight that known neighbours need; a mere line has 0.499 of it."""
 MAX_SLANT_COS = np.cos(np.deg2rad(85.0))
 """Cosine of the largest viewing angle of a plane; steeper neighbours are on another surface."""
-SPIRAL_STEP = 3.6  # distance of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars 1997)
+SPIRAL_STEP = (
+    3.6  # distance of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars 1997)
+)
 
 
 def shrink_depth(depth: Floats, max_size_px: int) -> tuple[Floats, Array]:
@@ -66,7 +68,9 @@ def normals_from_depth(depth: Floats, camera_matrix: Floats) -> Array:
     offsets = range(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1)
     total_weight = 0.0
     moments = np.zeros((6, height, width))  # sums of w times 1, x, y, x x, x y, y y
-    change_moments = np.zeros((3, height, width))  # sums of w times the change times 1, x, y
+    change_moments = np.zeros(
+        (3, height, width)
+    )  # sums of w times the change times 1, x, y
     for dy in offsets:
         top = dy + WINDOW_RADIUS_PX
         for dx in offsets:
@@ -84,7 +88,9 @@ def normals_from_depth(depth: Floats, camera_matrix: Floats) -> Array:
                 change_moments[index] += factor * weighted_changes
     is_enough = moments[0] >= MIN_WEIGHT_FRAC * total_weight
     sums = np.where(is_enough, moments[0], np.nan)
-    slopes_x, slopes_y, changes = _fitted_planes(moments[1:] / sums, change_moments / sums)
+    slopes_x, slopes_y, changes = _fitted_planes(
+        moments[1:] / sums, change_moments / sums
+    )
     # As a form l . (x, y, 1) of the pixel; on rays r it is (K^T l) . r, and n is along -K^T l.
     columns = np.arange(width)
     rows = np.arange(height)[:, None]
@@ -125,7 +131,9 @@ def spiral_points(num_points: int) -> Array:
     heights = 1.0 - (2.0 * np.arange(num_points) + 1.0) / num_points
     radii = np.sqrt(1.0 - heights**2)
     longitudes = np.cumsum(SPIRAL_STEP / (np.sqrt(num_points) * radii))
-    return np.stack([radii * np.cos(longitudes), radii * np.sin(longitudes), heights], axis=1)
+    return np.stack(
+        [radii * np.cos(longitudes), radii * np.sin(longitudes), heights], axis=1
+    )
 
 
 @dataclass(frozen=True)
@@ -133,7 +141,9 @@ class PlaneClusters:
     """Directions that many normals share."""
 
     normals: Array  # (K, 3) unit normals in order of choice; K may be 0
-    labels: NDArray[np.int32]  # (h, w) the nearest of them for each pixel, -1 where none is near
+    labels: NDArray[
+        np.int32
+    ]  # (h, w) the nearest of them for each pixel, -1 where none is near
 
 
 def cluster_normals(
@@ -213,7 +223,9 @@ def fronto_parallel_homography(normal: Floats, camera_matrix: Floats) -> Array:
     return np.asarray(camera_matrix @ rotation @ np.linalg.inv(camera_matrix))
 
 
-def viewing_cosines(normal: Floats, camera_matrix: Floats, size: tuple[int, int]) -> Array:
+def viewing_cosines(
+    normal: Floats, camera_matrix: Floats, size: tuple[int, int]
+) -> Array:
     """Return the cosines of the angles between the rays of an image and a plane's normal.
 
     Args:

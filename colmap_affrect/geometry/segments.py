@@ -15,7 +15,9 @@ from colmap_affrect.geometry.conventions import HALF_PIXEL
 MAX_NUM_SEGMENTS = 160  # the longest are looked at
 ANGLE_SIGMA = 0.008  # rad, of a segment's direction: lenses distort, and walls are not quite plumb
 END_SIGMA = 0.0008  # longer sides, of the ends of a segment: about one px
-SAME_LINE_DISTANCE = 0.012  # longer sides; closer parallel segments are of one cornice or frame
+SAME_LINE_DISTANCE = (
+    0.012  # longer sides; closer parallel segments are of one cornice or frame
+)
 SAME_LINE_ANGLE = 0.05  # rad
 
 
@@ -74,7 +76,9 @@ class Segments:
     def lines(self) -> Floats:
         """(N, 3) homogeneous lines through the segments, the first two numbers of unit length."""
         x, y = self.directions.T
-        return np.stack([y, -x, x * self.middles[:, 1] - y * self.middles[:, 0]], axis=1)
+        return np.stack(
+            [y, -x, x * self.middles[:, 1] - y * self.middles[:, 0]], axis=1
+        )
 
     @cached_property
     def sigmas(self) -> Floats:
@@ -88,6 +92,8 @@ class Segments:
         normals = np.stack([-self.directions[:, 1], self.directions[:, 0]], axis=1)
         offsets = self.middles[None, :, :] - self.middles[:, None, :]
         distances = np.abs(np.einsum("ijk,ik->ij", offsets, normals))
-        is_same = (cosines > math.cos(SAME_LINE_ANGLE)) & (distances < SAME_LINE_DISTANCE)
+        is_same = (cosines > math.cos(SAME_LINE_ANGLE)) & (
+            distances < SAME_LINE_DISTANCE
+        )
         is_same |= is_same.T
         return np.asarray(self.lengths / (is_same @ self.lengths))

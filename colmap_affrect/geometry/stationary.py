@@ -22,7 +22,9 @@ keypoints are badly localized."""
 MAX_COMPARED = 300  # motions that are compared with each other, which bounds time
 MAX_SLOPE = 0.5
 """Difference of the motions of two points of one object, as a share of their distance; judged."""
-MAX_FITS = 3  # of a rotation to the motions that agree, each of which may make more agree
+MAX_FITS = (
+    3  # of a rotation to the motions that agree, each of which may make more agree
+)
 
 
 def stationary_log_ratios(
@@ -49,7 +51,9 @@ def stationary_log_ratios(
     return np.where(_agreeing(errors, tolerance_px), exact, inexact)
 
 
-def means_of_regions(cells: Indices, values: Array, num_cells: int, reach: int) -> Array:
+def means_of_regions(
+    cells: Indices, values: Array, num_cells: int, reach: int
+) -> Array:
     """Return for each value the mean of those in cells that are connected with its own.
 
     Args:

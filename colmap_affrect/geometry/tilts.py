@@ -21,15 +21,21 @@ from numpy.typing import ArrayLike, NDArray
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
 
-STEP_PX = 4  # dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
+STEP_PX = (
+    4  # dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
+)
 MAX_TANH = 0.999  # where logarithms of metrics are cut off: a tilt of 45
 SMALLEST_NORM = 1e-12  # of deviators that are divided by their norm
 SMALLEST_LOG = 1e-9  # below it sinh(x) / x is 1 in float64
 MIN_DISTINCT_RATIO = 0.5
 """Shapes that differ, as a share of all, where they were measured one by one: then nearly all do;
 judged."""
-SHAPE_STEP = 1e-4  # shapes of unit area that are this close are equal; float32 rounding is less
-GRID_TILTS = np.geomspace(2.0, 6.21970, 6)  # candidates for 1.7-balls up to tilt 5.8 (the paper)
+SHAPE_STEP = (
+    1e-4  # shapes of unit area that are this close are equal; float32 rounding is less
+)
+GRID_TILTS = np.geomspace(
+    2.0, 6.21970, 6
+)  # candidates for 1.7-balls up to tilt 5.8 (the paper)
 GRID_NUM_ANGLES = 32  # candidates of each tilt (the paper)
 NEAR_OPTIMAL_RINGS = ((2.61757, 0.398032, 8), (5.18168, 0.198314, 16))
 """Tilts, steps of the angle in radians and numbers of maps (Rodriguez, Delon, Morel 2018, constants
@@ -178,7 +184,9 @@ class Cover:
     """Covering centres of a set of shapes and the centre nearest to each shape."""
 
     centers: Array  # (K, 2) rows (tilt, angle_rad) in order of choice; K may be 0
-    labels: NDArray[np.int32]  # (N,) index of the nearest centre, IDENTITY_LABEL, UNCOVERED_LABEL
+    labels: NDArray[
+        np.int32
+    ]  # (N,) index of the nearest centre, IDENTITY_LABEL, UNCOVERED_LABEL
 
 
 def cover_shapes(
@@ -230,7 +238,9 @@ def cover_shapes(
     return Cover(centers, nearest_centers(metrics, centers, radius))
 
 
-def nearest_centers(metrics: Floats, centers: Floats, radius: float) -> NDArray[np.int32]:
+def nearest_centers(
+    metrics: Floats, centers: Floats, radius: float
+) -> NDArray[np.int32]:
     """Label metrics with the nearest of the centres and the identity.
 
     Args:

@@ -20,7 +20,9 @@ NUM_PLANE_PARAMETERS = 3
 MAX_PLANE_ERROR = 0.04
 """Relative standard deviation of a predicted inverse depth, and of those a plane is fitted to;
 half of ``MAX_LOG_DIFFERENCE``."""
-PLANE_DAMPING = 1e-9  # added to normal equations, which twelve points on a line leave singular
+PLANE_DAMPING = (
+    1e-9  # added to normal equations, which twelve points on a line leave singular
+)
 NUM_INDEPENDENT = 10
 """Ratios that make the scale more certain, at most: all share the errors of the same poses;
 judged."""
@@ -40,7 +42,9 @@ class Depths:
         return (self.first > 0) & (self.second > 0)
 
 
-def triangulated_depths(rotation: Array, translation: Array, rays1: Array, rays2: Array) -> Depths:
+def triangulated_depths(
+    rotation: Array, translation: Array, rays1: Array, rays2: Array
+) -> Depths:
     """Triangulate matches: the points on both rays that are closest to each other.
 
     Args:
@@ -164,7 +168,9 @@ def scale_by_planes(
     return _densest_scale(rows, log_ratios, np.ones(len(log_ratios)))
 
 
-def _densest_scale(rows: Indices, log_ratios: Array, weights: Array) -> ScaleEstimate | None:
+def _densest_scale(
+    rows: Indices, log_ratios: Array, weights: Array
+) -> ScaleEstimate | None:
     """Return the scale with most weight of ratios around it.
 
     Args:
@@ -204,13 +210,18 @@ class _KnownNeighbors:
     distances: Array  # (M,) px
 
 
-def _nearest_known(known: Array, points: Array, radius_px: float, count: int) -> _KnownNeighbors:
+def _nearest_known(
+    known: Array, points: Array, radius_px: float, count: int
+) -> _KnownNeighbors:
     """Find the ``count`` known points that are nearest to each of (N, 2) points, in a radius."""
     if not len(known) or not len(points):
         nothing = np.zeros(0, np.int64)
         return _KnownNeighbors(nothing, nothing, np.zeros(0))
     distances, columns = cv2.batchDistance(
-        points.astype(np.float32), known.astype(np.float32), cv2.CV_32F, K=min(count, len(known))
+        points.astype(np.float32),
+        known.astype(np.float32),
+        cv2.CV_32F,
+        K=min(count, len(known)),
     )
     is_near = distances <= radius_px
     rows, _ = np.nonzero(is_near)

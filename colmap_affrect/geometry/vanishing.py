@@ -16,7 +16,9 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.segments import Segments
 
-CHANCE_DENSITY = 2.0 / math.pi  # of the angle of a segment that is there by chance, per rad
+CHANCE_DENSITY = (
+    2.0 / math.pi
+)  # of the angle of a segment that is there by chance, per rad
 CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand
 DIRECTION_COUNT = 1.0  # segments of each direction that are reckoned with beforehand
 NUM_EM_STEPS = 3  # for the shares of the directions and of chance
@@ -48,7 +50,9 @@ class VanishingFit:
         self.focals = focals
         self.shifts = shifts
         points = self._vanishing_points(rotations)
-        self.distances = self._distances(points)  # (K, 3, N) from middles to vanishing points
+        self.distances = self._distances(
+            points
+        )  # (K, 3, N) from middles to vanishing points
         self.sines = self._crossed(points) / self.distances  # of the angles to these
         sigmas = segments.sigmas
         densities = np.empty((len(focals), 4, len(segments)))
@@ -102,13 +106,17 @@ class VanishingFit:
         It holds the distances to the vanishing points, as a small turn hardly changes them.
         """
         segments = self.segments
-        portions = segments.weights / segments.sigmas**2 / self._likelihoods(self.shares)
+        portions = (
+            segments.weights / segments.sigmas**2 / self._likelihoods(self.shares)
+        )
         parts = self.densities[:, :3] * self.shares[:, :3, None] * portions[:, None, :]
         num_cameras = len(self.focals)
         slopes = np.empty((num_cameras, 3, *self.sines.shape[1:]))
         for axis in range(3):
             turned = np.cross(np.eye(3)[axis], self.rotations)
-            slopes[:, axis] = self._crossed(self._vanishing_points(turned)) / self.distances
+            slopes[:, axis] = (
+                self._crossed(self._vanishing_points(turned)) / self.distances
+            )
         weighted = (slopes * parts[:, None]).reshape(num_cameras, 3, -1)
         slopes = slopes.reshape(num_cameras, 3, -1)
         normal = weighted @ np.swapaxes(slopes, 1, 2)
@@ -164,5 +172,7 @@ def _turned(rotations: Floats, steps: Floats) -> Floats:
     crossed = np.cross(axes[:, None, :], rotations)
     along = (rotations @ axes[:, :, None]) * axes[:, None, :]
     return np.asarray(
-        rotations * np.cos(angles) + crossed * np.sin(angles) + along * (1.0 - np.cos(angles))
+        rotations * np.cos(angles)
+        + crossed * np.sin(angles)
+        + along * (1.0 - np.cos(angles))
     )

@@ -57,7 +57,12 @@ class ConversionReport(Summarized):
         named = [f"{new}: instead of {old}" for old, new in self.renamed.items()]
         folders = [f"{name}: {why}" for name, why in self.left_out.items()]
         return "\n".join(
-            [line, *named, *folders, *(f"not {n}: {w}" for n, w in self.failures.items())]
+            [
+                line,
+                *named,
+                *folders,
+                *(f"not {n}: {w}" for n, w in self.failures.items()),
+            ]
         )
 
 
@@ -139,7 +144,11 @@ class _Conversion:
                     os.utime(self.folder / made, ns=_times(path))
                 self.report.copied.append(made)
                 return
-            ends = [f"-page{k}" for k in range(1, len(numbers) + 1)] if len(numbers) > 1 else [""]
+            ends = (
+                [f"-page{k}" for k in range(1, len(numbers) + 1)]
+                if len(numbers) > 1
+                else [""]
+            )
             for end, content in zip(ends, _as_png(path, data, numbers), strict=True):
                 # The suffix stays: a.jp2 may lie beside a.png.
                 written.append(self._write(f"{name}{end}.png", content))
@@ -159,7 +168,9 @@ class _Conversion:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with target.open("xb") as file:
                     file.write(content)
-            except FileExistsError:  # names may differ in what the file system does not keep
+            except (
+                FileExistsError
+            ):  # names may differ in what the file system does not keep
                 continue
             except OSError as error:
                 raise cannot_write(self.output_path, error) from error
@@ -206,7 +217,9 @@ def _as_png(path: Path, data: Bytes, numbers: Sequence[int]) -> Iterator[bytes]:
             for number in numbers:
                 image.seek(number)
                 if reading.is_too_large(image.size):
-                    raise ImageError(f"{path}: claims to be {image.width} x {image.height} px")
+                    raise ImageError(
+                        f"{path}: claims to be {image.width} x {image.height} px"
+                    )
                 page = image if image.mode in AS_STORED else image.convert("RGB")
                 file = io.BytesIO()
                 page.save(file, "PNG", exif=image.getexif())
@@ -216,6 +229,8 @@ def _as_png(path: Path, data: Bytes, numbers: Sequence[int]) -> Iterator[bytes]:
     except UnidentifiedImageError as error:
         heic = path.suffix.lower() in (".heic", ".heif")
         hint = "; HEIC needs: pip install pillow-heif" if heic else ""
-        raise ImageError(f"{path}: is of a format that cannot be converted{hint}") from error
+        raise ImageError(
+            f"{path}: is of a format that cannot be converted{hint}"
+        ) from error
     except Exception as error:  # damaged files raise nearly anything in Pillow
         raise ImageError(f"{path}: cannot be read ({error})") from error

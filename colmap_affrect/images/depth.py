@@ -22,10 +22,17 @@ from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.reading import decode, header_size
 from colmap_affrect.options import Options
 
-SUFFIXES = (".npy", ".png", ".tif", ".tiff")  # in the order in which they are looked for
+SUFFIXES = (
+    ".npy",
+    ".png",
+    ".tif",
+    ".tiff",
+)  # in the order in which they are looked for
 MAX_NUM_VALUES = 1 << 27  # of a map; more is taken for damage
 PNG_STEP = 0.001  # depth of one step of 16 bits; only the ratio of depths matters
-MAX_ASPECT_RATIO = 1.05  # of aspects of map and photograph: networks round sizes to 32 px
+MAX_ASPECT_RATIO = (
+    1.05  # of aspects of map and photograph: networks round sizes to 32 px
+)
 MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
 
 
@@ -42,7 +49,9 @@ class DepthOptions(Options):
     def file(self, name: str) -> Path | None:
         """Return the map of an image, if any: ``a/b.jpg.npy`` and so on, then ``a/b.npy``."""
         stems = (name, splitext(name)[0])
-        paths = (Path(self.path) / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES)
+        paths = (
+            Path(self.path) / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES
+        )
         return next((path for path in paths if path.is_file()), None)
 
 
@@ -56,7 +65,9 @@ class DepthMaps:
     def require_some(self, names: Sequence[str]) -> None:
         """Refuse a folder that is not there, or has no map of any image; OptionError."""
         if not self._path.is_dir():
-            raise OptionError(f"{self._path}: no such folder; give the folder of the depth maps")
+            raise OptionError(
+                f"{self._path}: no such folder; give the folder of the depth maps"
+            )
         if not any(self._options.file(name) for name in names):
             raise OptionError(
                 f"{self._path}: holds no depth map of any of the {len(names)} images; "
@@ -98,7 +109,9 @@ class DepthMaps:
                 "aspect as stored, EXIF orientation is not applied"
             )
         step = PNG_STEP if path.suffix == ".png" else 1.0
-        depth = _z_depth(step * values.astype(np.float64), self._options.kind, photograph)
+        depth = _z_depth(
+            step * values.astype(np.float64), self._options.kind, photograph
+        )
         known_frac = np.isfinite(depth).mean()
         if known_frac < MIN_VALID_FRAC:
             raise DepthError(
@@ -118,7 +131,9 @@ def _read_map(path: Path) -> NDArray[Any]:
         if prod(header_size(path) or (0,)) > MAX_NUM_VALUES:
             raise ValueError
         return decode(path, cv2.IMREAD_UNCHANGED, keeps_numbers=True)
-    values = np.load(path, mmap_mode="r", allow_pickle=False)  # which takes no memory yet
+    values = np.load(
+        path, mmap_mode="r", allow_pickle=False
+    )  # which takes no memory yet
     if values.size > MAX_NUM_VALUES:
         raise ValueError
     return np.asarray(values)
@@ -126,15 +141,21 @@ def _read_map(path: Path) -> NDArray[Any]:
 
 def _z_depth(values: Floats, kind: str, photograph: Photograph) -> Singles:
     """Turn (h, w) values of a kind of depth into float32 z-depth, NaN where it is unknown."""
-    with np.errstate(all="ignore"):  # unknown values may be anything, and become NaN below
+    with np.errstate(
+        all="ignore"
+    ):  # unknown values may be anything, and become NaN below
         if kind == "inverse":
             values = 1.0 / values
         elif kind == "ray":
             rows, columns = np.indices(values.shape)
             size = values.shape[1], values.shape[0]
-            camera = resized_from_original(photograph.size, size) @ photograph.camera_matrix
+            camera = (
+                resized_from_original(photograph.size, size) @ photograph.camera_matrix
+            )
             pixels = np.stack([columns, rows, np.ones(values.shape)])
-            rays = np.tensordot(np.linalg.inv(camera), pixels, axes=1)  # to points of depth 1
+            rays = np.tensordot(
+                np.linalg.inv(camera), pixels, axes=1
+            )  # to points of depth 1
             values = values / np.linalg.norm(rays, axis=0)
         depth = values.astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(np.nan))

@@ -15,15 +15,28 @@ from PIL import ExifTags
 
 from colmap_affrect.images.reading import opened, read_header, stored_size
 
-FILM_DIAGONAL_MM = 43.27  # of 35 mm film, to which equivalents refer (by COLMAP's rounding)
+FILM_DIAGONAL_MM = (
+    43.27  # of 35 mm film, to which equivalents refer (by COLMAP's rounding)
+)
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """By EXIF's number of the unit of focal-plane resolutions: inches, cm, and, as COLMAP reads them,
 mm and micrometres."""
-PLAUSIBLE_FOCALS = (0.3, 6.0)  # in longer sides: 118 to 10 degrees, which hold nearly all lenses
-MAX_CONTRADICTION = 1.15  # ratio of focal lengths that still agree: equivalents are rounded
+PLAUSIBLE_FOCALS = (
+    0.3,
+    6.0,
+)  # in longer sides: 118 to 10 degrees, which hold nearly all lenses
+MAX_CONTRADICTION = (
+    1.15  # ratio of focal lengths that still agree: equivalents are rounded
+)
 MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
-SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)  # photographs of another shape may have been cropped
-MAX_THUMBNAIL_PX = 160  # longer side of the thumbnails of cameras, often with black bars
+SENSOR_ASPECTS = (
+    3 / 2,
+    4 / 3,
+    16 / 9,
+)  # photographs of another shape may have been cropped
+MAX_THUMBNAIL_PX = (
+    160  # longer side of the thumbnails of cameras, often with black bars
+)
 RESOLUTION = "focal-plane resolution"
 EQUIVALENT = "35 mm equivalent"
 SENSOR = "known sensor"
@@ -37,18 +50,34 @@ class CameraTags:
     body: tuple[str, str, str] = ("", "", "")  # make, model and serial number
     lens: str = ""  # model of the lens
     focal_mm: float | None = None  # focal length
-    equivalent_mm: float | None = None  # of a camera with 35 mm film and the same field of view
-    px_per_mm: tuple[float, float | None] | None = None  # focal-plane resolution, x and perhaps y
-    original_size: tuple[int, int] | None = None  # (width, height) when EXIF was written
+    equivalent_mm: float | None = (
+        None  # of a camera with 35 mm film and the same field of view
+    )
+    px_per_mm: tuple[float, float | None] | None = (
+        None  # focal-plane resolution, x and perhaps y
+    )
+    original_size: tuple[int, int] | None = (
+        None  # (width, height) when EXIF was written
+    )
     zoom: float = 1.0  # of the part of the sensor that was enlarged; 1 without
 
     @property
     def identity(self) -> tuple[object, ...] | None:
         """What photographs of one camera have in common; None where EXIF has no camera."""
         make, model, _ = self.body
-        if not (make and model and (self.focal_mm or self.equivalent_mm)) or self.was_cropped:
+        if (
+            not (make and model and (self.focal_mm or self.equivalent_mm))
+            or self.was_cropped
+        ):
             return None
-        return (*self.body, self.lens, self.focal_mm, self.equivalent_mm, self.zoom, self.size)
+        return (
+            *self.body,
+            self.lens,
+            self.focal_mm,
+            self.equivalent_mm,
+            self.zoom,
+            self.size,
+        )
 
     @property
     def scale(self) -> float:
@@ -59,18 +88,26 @@ class CameraTags:
     @property
     def was_cropped(self) -> bool:
         """Whether the shape is not that of the file that EXIF describes."""
-        return not _similar(_aspect(self.size), _aspect(self.original_size or self.size))
+        return not _similar(
+            _aspect(self.size), _aspect(self.original_size or self.size)
+        )
 
 
 @dataclass(frozen=True)
 class ExifFocal:
     """A focal length, or why there is none."""
 
-    focal_px: float | None  # of the stored file; None if EXIF does not say or cannot be trusted
+    focal_px: (
+        float | None
+    )  # of the stored file; None if EXIF does not say or cannot be trusted
     is_rescaled: bool = False  # it is not the one that COLMAP would take
     why: str = ""  # what is wrong; empty if nothing
-    lens_mm: float = 0.0  # focal length of the lens, where nothing tells how large the sensor is
-    uncropped_px: float = 0.0  # of the whole photograph that this is a crop of, if EXIF says it
+    lens_mm: float = (
+        0.0  # focal length of the lens, where nothing tells how large the sensor is
+    )
+    uncropped_px: float = (
+        0.0  # of the whole photograph that this is a crop of, if EXIF says it
+    )
 
 
 def read_camera_tags(path: Path) -> CameraTags | None:
@@ -107,7 +144,9 @@ def _tags_of_file(file: BinaryIO) -> CameraTags:
         number(tag.FocalLength),
         number(tag.FocalLengthIn35mmFilm),
         (across / unit, down / unit if down else None) if across and unit else None,
-        (int(width), int(height)) if width and height and min(width, height) >= 1 else None,
+        (int(width), int(height))
+        if width and height and min(width, height) >= 1
+        else None,
         max(1.0, number(tag.DigitalZoomRatio) or 1.0),
     )
 
@@ -145,9 +184,15 @@ def exif_focal(
             when it was taken may then be a crop, too, also where it has kept its shape.
     """
     if tags.was_cropped or (has_crops and tags.scale < 1.0):
-        why = "cropped or padded" if tags.was_cropped else "cropped, as others, or shrunk"
-        whole = exif_focal(replace(tags, size=tags.original_size or tags.size), sensor_width_mm)
-        return ExifFocal(None, why=f"{why}: {_sizes(tags)}", uncropped_px=whole.focal_px or 0.0)
+        why = (
+            "cropped or padded" if tags.was_cropped else "cropped, as others, or shrunk"
+        )
+        whole = exif_focal(
+            replace(tags, size=tags.original_size or tags.size), sensor_width_mm
+        )
+        return ExifFocal(
+            None, why=f"{why}: {_sizes(tags)}", uncropped_px=whole.focal_px or 0.0
+        )
     if tags.original_size and tags.scale < 1.0 and max(tags.size) <= MAX_THUMBNAIL_PX:
         return ExifFocal(None, why=f"a thumbnail: {_sizes(tags)}")
     stated = _statements(tags, sensor_width_mm)
@@ -156,10 +201,14 @@ def exif_focal(
     plausible = {k: f for k, f in stated.items() if low * longer <= f <= high * longer}
     if not plausible:
         key, focal = next(iter(stated.items()), ("", 0.0))
-        wrong = f"EXIF's {key} would be a focal length of {focal / longer:.2g} longer sides"
+        wrong = (
+            f"EXIF's {key} would be a focal length of {focal / longer:.2g} longer sides"
+        )
         if stated:
             return ExifFocal(None, why=wrong)
-        return ExifFocal(None, why="no EXIF focal length in px", lens_mm=tags.focal_mm or 0.0)
+        return ExifFocal(
+            None, why="no EXIF focal length in px", lens_mm=tags.focal_mm or 0.0
+        )
     return _reconciled(tags, stated, plausible)
 
 
@@ -173,7 +222,9 @@ def _statements(tags: CameraTags, sensor_width_mm: float | None) -> dict[str, fl
     """Return the focal lengths in px that can be derived, in COLMAP's order."""
     found = {}
     if tags.equivalent_mm:
-        found[EQUIVALENT] = tags.equivalent_mm / FILM_DIAGONAL_MM * math.hypot(*tags.size)
+        found[EQUIVALENT] = (
+            tags.equivalent_mm / FILM_DIAGONAL_MM * math.hypot(*tags.size)
+        )
     if tags.focal_mm and tags.zoom == 1.0:
         across, down = tags.px_per_mm or (0.0, None)
         if across and (down is None or _agree(across, down)):
@@ -195,7 +246,9 @@ def _reconciled(
     key, focal = next(iter(plausible.items()))
     if not all(_agree(other, focal) for other in plausible.values()):
         if not any(_similar(_aspect(tags.size), aspect) for aspect in SENSOR_ASPECTS):
-            values = " and ".join(f"{f:.0f} px by its {k}" for k, f in plausible.items())
+            values = " and ".join(
+                f"{f:.0f} px by its {k}" for k, f in plausible.items()
+            )
             return ExifFocal(None, why=f"EXIF contradicts itself: {values}")
         key = next(each for each in plausible if each != RESOLUTION)
     if key == RESOLUTION and tags.scale != 1.0:

@@ -12,9 +12,13 @@ from colmap_affrect.geometry.lines import Lines, measure_lines
 from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.images.reading import shrink_to
 
-MAX_SIZE_PX = 1024  # longest side that photographs are shrunk to: lines stay, and grain goes
+MAX_SIZE_PX = (
+    1024  # longest side that photographs are shrunk to: lines stay, and grain goes
+)
 MIN_LENGTH = 0.02  # longer sides
-BORDER = 0.025  # longer sides; segments along the image's border and closer are of its frame
+BORDER = (
+    0.025  # longer sides; segments along the image's border and closer are of its frame
+)
 ALONG = 0.05  # rad, of a segment that runs along the border
 
 
@@ -60,7 +64,9 @@ def _on_frame(ends: Floats, lengths: Floats, size: tuple[int, int]) -> Bools:
     for axis, length in enumerate(size):
         across = ends[:, [axis, axis + 2]]
         is_along = np.abs(across[:, 1] - across[:, 0]) < ALONG * lengths
-        is_near = (across.max(axis=1) < margin) | (across.min(axis=1) > length - 1 - margin)
+        is_near = (across.max(axis=1) < margin) | (
+            across.min(axis=1) > length - 1 - margin
+        )
         is_on_frame |= is_along & is_near
     return is_on_frame
 

@@ -31,7 +31,9 @@ FOLDERS_OF_SYSTEMS = {
     "#snapshot": DELETED, "@Recently-Snapshot": DELETED,
 }  # fmt: skip
 """What folders hold that are beside photographs, but nobody has put there, by their names."""
-LINKED_TWICE = "a link to a folder that is looked through anyway, or holds that of the photographs"
+LINKED_TWICE = (
+    "a link to a folder that is looked through anyway, or holds that of the photographs"
+)
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 
 
@@ -84,7 +86,9 @@ class Photographs:
         if self.masks.path and not Path(self.masks.path).is_dir():
             raise OptionError(f"--mask-path {self.masks.path}: no such folder")
         if self.masks.camera_path and not Path(self.masks.camera_path).is_file():
-            raise OptionError(f"--camera-mask-path {self.masks.camera_path}: no such file")
+            raise OptionError(
+                f"--camera-mask-path {self.masks.camera_path}: no such file"
+            )
 
     def mask(self, name: str) -> Mask | None:
         """Return an image's (H, W) mask, if any; ImageError if it is unreadable or does not fit.
@@ -141,7 +145,10 @@ class Photographs:
 
     def _refuse_photographs(self, names: Sequence[str]) -> None:
         """Refuse masks that are photographs, as in the folder of the photographs; OptionError."""
-        given = {"--mask-path": self.masks.path, "--camera-mask-path": self.masks.camera_path}
+        given = {
+            "--mask-path": self.masks.path,
+            "--camera-mask-path": self.masks.camera_path,
+        }
         if not any(given.values()):
             return
         photographs = {resolved(self.folder / name) for name in names}
@@ -185,10 +192,16 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     require_folder(image_path)
     if image_list_path is not None:
         return _listed_images(image_path, image_list_path)
-    names = [name for name in photograph_files(image_path, IMAGE_SUFFIXES) if not _odd(name)]
+    names = [
+        name for name in photograph_files(image_path, IMAGE_SUFFIXES) if not _odd(name)
+    ]
     if not names:
-        others = "".join(f"; {kind}: {what}" for kind, what in left_out(image_path).items())
-        raise OptionError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
+        others = "".join(
+            f"; {kind}: {what}" for kind, what in left_out(image_path).items()
+        )
+        raise OptionError(
+            f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}"
+        )
     return names
 
 
@@ -197,7 +210,9 @@ def require_folder(image_path: Path) -> None:
     if image_path.is_file():
         raise OptionError(f"{image_path}: is a file; give the folder that it is in")
     if not image_path.is_dir():
-        raise OptionError(f"{image_path}: no such folder; give the folder of the photographs")
+        raise OptionError(
+            f"{image_path}: no such folder; give the folder of the photographs"
+        )
 
 
 def left_out(image_path: Path) -> dict[str, str]:
@@ -210,13 +225,18 @@ def left_out(image_path: Path) -> dict[str, str]:
             found.setdefault(f"*{suffix}", []).append(name)
         elif _odd(name):
             found.setdefault("names", []).append(name)
-        if suffix in TIFF_SUFFIXES and (count := len(reading.pages(image_path / name))) > 1:
+        if (
+            suffix in TIFF_SUFFIXES
+            and (count := len(reading.pages(image_path / name))) > 1
+        ):
             notes[name] = (
                 f"has {count} pages, and only the first is used; colmap-affrect convert makes a "
                 "file of each"
             )
     for kind, names in found.items():
-        why = "COLMAP or OpenCV cannot read this format; colmap-affrect convert makes PNG"
+        why = (
+            "COLMAP or OpenCV cannot read this format; colmap-affrect convert makes PNG"
+        )
         if kind[1:] in VIDEOS:
             why = "it is a video; take photographs out of it, as: ffmpeg -i it -vf fps=2 %04d.jpg"
         elif kind == "names":
@@ -256,7 +276,8 @@ def _walk(folder: Path, suffixes: Collection[str]) -> tuple[list[str], dict[str,
     while walk.ahead or walk.linked:
         walk.enter(walk.ahead.popleft() if walk.ahead else walk.linked.popleft())
     return walk.found, {
-        such_as(map(one_line, names)): f"left out: {why}" for why, names in walk.left_out.items()
+        such_as(map(one_line, names)): f"left out: {why}"
+        for why, names in walk.left_out.items()
     }
 
 
@@ -277,12 +298,18 @@ class _Walk:
 
     def enter(self, path: Path) -> None:
         """Look through a folder, but not through those in it, if nobody has done that."""
-        below = "" if path == self.folder else f"{path.relative_to(self.folder).as_posix()}/"
+        below = (
+            ""
+            if path == self.folder
+            else f"{path.relative_to(self.folder).as_posix()}/"
+        )
         try:
             identity = _identity(path)
             entries = sorted(os.scandir(path), key=lambda entry: entry.name)
         except OSError as error:
-            self.left_out[f"cannot be read ({error.strerror}); permit reading"].append(below)
+            self.left_out[f"cannot be read ({error.strerror}); permit reading"].append(
+                below
+            )
             return
         if identity not in self.seen:
             self.seen.add(identity)
@@ -333,7 +360,9 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
     try:
         lines = read_regular_text(image_list_path, "utf-8-sig").splitlines()
     except OSError as error:
-        raise OptionError(f"{image_list_path}: cannot be read ({error.strerror})") from error
+        raise OptionError(
+            f"{image_list_path}: cannot be read ({error.strerror})"
+        ) from error
     except UnicodeDecodeError as error:
         raise OptionError(f"{image_list_path}: cannot be read ({error})") from error
     listed = []
@@ -358,7 +387,9 @@ def checked_names(image_path: Path, names: Iterable[PathLike], where: str) -> li
         if why := _odd(name):
             raise ImageError(f"{image_path}: {name!r}: {why}; rename it")
     if missing:
-        raise OptionError(f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}")
+        raise OptionError(
+            f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}"
+        )
     return found
 
 

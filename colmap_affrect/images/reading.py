@@ -32,13 +32,17 @@ from colmap_affrect.project.regular_files import (
     require_regular,
 )
 
-MAX_NUM_PX = 1 << 29  # of a photograph; those of the largest cameras have 400 megapixels
+MAX_NUM_PX = (
+    1 << 29
+)  # of a photograph; those of the largest cameras have 400 megapixels
 MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
 USUAL_BYTES = 1 << 26
 """Of a photograph, with all that cameras put beside its pixels, as short films; 64 MiB. Only longer
 files are compared with their pixels."""
 MAX_BYTES_PER_PX = 16  # four channels of four bytes
-ONE_AT_A_TIME = Lock()  # filters of warnings are of the process: threads would mix them up
+ONE_AT_A_TIME = (
+    Lock()
+)  # filters of warnings are of the process: threads would mix them up
 PNG = b"\x89PNG\r\n\x1a\n"
 PNM = b"P"
 READERS = {
@@ -50,7 +54,10 @@ READERS = {
     PNM: PpmImageFile,
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
-NEW_SUBFILE_TYPE, REDUCED = 254, 1  # TIFF's tag, and its bit of a smaller copy of another page
+NEW_SUBFILE_TYPE, REDUCED = (
+    254,
+    1,
+)  # TIFF's tag, and its bit of a smaller copy of another page
 
 Found = TypeVar("Found")
 
@@ -71,7 +78,9 @@ def opened(file: BinaryIO) -> Image.Image:
     file.seek(0)
     if start.startswith(PNM):  # whose header Pillow reads byte by byte
         file = io.BytesIO(file.read(MAX_HEADER))
-    return next(read for magic, read in READERS.items() if start.startswith(magic))(file, "")
+    return next(read for magic, read in READERS.items() if start.startswith(magic))(
+        file, ""
+    )
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
@@ -219,8 +228,12 @@ def require_possible(path: Path) -> None:
 
 
 UNREADABLE = "not a readable image (damaged, empty, or of an unknown format)"
-LIMITS_OF_OPENCV = tuple(f"OPENCV_IO_MAX_IMAGE_{what}" for what in ("PIXELS", "WIDTH", "HEIGHT"))
-OPENCV_CHECKS_SIZE = "validateInputImageSize"  # its function that compares a header with these
+LIMITS_OF_OPENCV = tuple(
+    f"OPENCV_IO_MAX_IMAGE_{what}" for what in ("PIXELS", "WIDTH", "HEIGHT")
+)
+OPENCV_CHECKS_SIZE = (
+    "validateInputImageSize"  # its function that compares a header with these
+)
 IMAGE_SUFFIXES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pbm", ".pgm", ".pnm",
     ".ppm",
@@ -241,16 +254,34 @@ FOREIGN_FORMATS = {
     "AVIF or HEIF": rb"....ftyp(avi|hei|hev|mif|msf)",
 }
 """First bytes of formats that OpenCV may read, whatever the suffix, and pycolmap's wheel not."""
-TONE_PERCENTILES = (0.5, 99.5)  # black and white of a stretched photograph but for dust and glints
-MIN_TONE_RANGE = 0.5  # a photograph whose tones fill less of the range of its file is stretched
-MAX_TONE_STEP = 16  # neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
-FLOAT_RANGE = (-0.5, 2.0)  # of floats that are meant from 0 to 1: filters and highlights go beyond
+TONE_PERCENTILES = (
+    0.5,
+    99.5,
+)  # black and white of a stretched photograph but for dust and glints
+MIN_TONE_RANGE = (
+    0.5  # a photograph whose tones fill less of the range of its file is stretched
+)
+MAX_TONE_STEP = (
+    16  # neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
+)
+FLOAT_RANGE = (
+    -0.5,
+    2.0,
+)  # of floats that are meant from 0 to 1: filters and highlights go beyond
 NUM_TONES = 250_000  # about so many pixels are looked at
-FRAME_FRAC = 0.1  # along each border is passed over: scans have frames and captions there
-BIG_TIFF = 43  # what files of more than 4 GiB have in the place of 42, with offsets of 64 bits
-GRAY_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+FRAME_FRAC = (
+    0.1  # along each border is passed over: scans have frames and captions there
+)
+BIG_TIFF = (
+    43  # what files of more than 4 GiB have in the place of 42, with offsets of 64 bits
+)
+GRAY_AS_STORED = (
+    cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+)
 COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION  # fast, of JPEG
+EIGHTH_OF_COLOR = (
+    cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
+)  # fast, of JPEG
 
 
 def read_gray(path: Path) -> GrayImage:
@@ -266,10 +297,14 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
     size = header_size(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
     is_far_larger = size is not None and max(size) >= 8 * max_size_px
     try:
-        image = decode(path, EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED)[:, :, ::-1]
+        image = decode(path, EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED)[
+            :, :, ::-1
+        ]
     except ImageError:  # OpenCV makes no colour of one channel of floats
         image = np.repeat(decode(path)[:, :, None], 3, axis=2)
-    return shrink_to(in_eight_bits(image, tones(image) if stretch else None), max_size_px)
+    return shrink_to(
+        in_eight_bits(image, tones(image) if stretch else None), max_size_px
+    )
 
 
 def tones(image: NDArray[Any]) -> tuple[float, float] | None:
@@ -311,10 +346,14 @@ def range_of_floats(image: NDArray[Any]) -> tuple[float, float] | None:
     is_float = np.issubdtype(image.dtype, np.floating)
     if is_float and low >= FLOAT_RANGE[0] and high <= FLOAT_RANGE[1]:
         return None
-    return float(low), float(max(high, low + np.finfo(np.float32).eps * max(abs(low), 1.0)))
+    return float(low), float(
+        max(high, low + np.finfo(np.float32).eps * max(abs(low), 1.0))
+    )
 
 
-def in_eight_bits(image: NDArray[Any], black_and_white: tuple[float, float] | None = None) -> Bytes:
+def in_eight_bits(
+    image: NDArray[Any], black_and_white: tuple[float, float] | None = None
+) -> Bytes:
     """Return an image of integers or of floats in 8 bits.
 
     Floats are from 0 to 1; those of another range are stretched (:func:`range_of_floats`), and so
@@ -336,10 +375,14 @@ def in_eight_bits(image: NDArray[Any], black_and_white: tuple[float, float] | No
 def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
     """Return an (H, W) or (H, W, 3) uint8 image as JPEG; quality is 0 to 100."""
     ordered = image[:, :, ::-1] if image.ndim == 3 else image
-    return cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])[
+        1
+    ].tobytes()
 
 
-def decode(path: Path, flags: int = GRAY_AS_STORED, *, keeps_numbers: bool = False) -> NDArray[Any]:
+def decode(
+    path: Path, flags: int = GRAY_AS_STORED, *, keeps_numbers: bool = False
+) -> NDArray[Any]:
     """Read an image, by default as gray in the type it is stored in.
 
     Args:
@@ -398,7 +441,9 @@ def _why_not_decoded(error: cv2.error) -> str:
 def foreign_format(data: Bytes) -> str:
     """Return the format of data that COLMAP cannot read, whatever the suffix, else nothing."""
     beginning = data[:16].tobytes()
-    matching = (n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL))
+    matching = (
+        n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL)
+    )
     return next(matching, "")
 
 
@@ -420,8 +465,12 @@ def stand_upright(data: Bytes) -> None:
         (count,) = struct.unpack_from(order + number, content, start)
         first = start + struct.calcsize(number)
         for entry in range(first, min(first + count * size, data.size), size):
-            if struct.unpack_from(f"{order}H", content, entry) == (ExifTags.Base.Orientation,):
-                struct.pack_into(f"{order}H", content, entry + size - struct.calcsize(offset), 1)
+            if struct.unpack_from(f"{order}H", content, entry) == (
+                ExifTags.Base.Orientation,
+            ):
+                struct.pack_into(
+                    f"{order}H", content, entry + size - struct.calcsize(offset), 1
+                )
 
 
 def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
@@ -431,7 +480,9 @@ def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
     if scale >= 1.0:
         return image
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8
+    )
 
 
 def read_mask(path: Path) -> Mask:
@@ -452,7 +503,9 @@ def alpha_mask(path: Path) -> Mask | None:
     alpha = image[:, :, 3] if is_there else read_header(path, _alpha_beside_gray)
     if alpha is None:
         return None
-    half = np.iinfo(alpha.dtype).max / 2 if np.issubdtype(alpha.dtype, np.integer) else 0.5
+    half = (
+        np.iinfo(alpha.dtype).max / 2 if np.issubdtype(alpha.dtype, np.integer) else 0.5
+    )
     mask = np.asarray(alpha > half)
     return mask if mask.any() and not mask.all() else None
 
@@ -467,7 +520,9 @@ def _alpha_beside_gray(file: BinaryIO) -> NDArray[Any] | None:
 
 def _has_alpha(file: BinaryIO) -> bool:
     image = opened(file)
-    return image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
+    return (
+        image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
+    )
 
 
 def encode_mask(mask: Mask) -> bytes:
@@ -478,7 +533,9 @@ def encode_mask(mask: Mask) -> bytes:
 def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     """Resize an (H, W) mask to (width, height) px, each pixel from the nearest one."""
     values = mask.astype(np.uint8)
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0)
+    return np.asarray(
+        cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    )
 
 
 def grown(mask: Mask, num_px: int) -> Mask:

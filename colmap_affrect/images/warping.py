@@ -12,21 +12,31 @@ from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.geometry.conventions import is_inside
 
-ANTI_ALIASING_SIGMA = 0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
+ANTI_ALIASING_SIGMA = (
+    0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
+)
 TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression
-SAMPLES_PER_TILE = 5  # points along a side of a tile at which its compression is measured
+SAMPLES_PER_TILE = (
+    5  # points along a side of a tile at which its compression is measured
+)
 MAX_DENSITY = 16  # samples per px of a warp along an axis; beyond, memory counts more than aliasing
 
 
 def halved(image: Singles) -> Singles:
     """Return an (H, W) image blurred and resampled to half its size, as kornia's ``pyrdown``."""
     kernel = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
-    smooth = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+    smooth = cv2.sepFilter2D(
+        image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101
+    )
     size = (image.shape[1] // 2, image.shape[0] // 2)
-    return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+    return np.asarray(
+        cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32
+    )
 
 
-def warp(image: GrayImage | ColorImage | Singles, rectification: Rectification) -> Bytes:
+def warp(
+    image: GrayImage | ColorImage | Singles, rectification: Rectification
+) -> Bytes:
     """Render a rectification: one exact resampling, free of aliasing where it compresses.
 
     The image is resampled once, on a grid that is denser than the warp by integer factors, blurred,
@@ -40,7 +50,9 @@ def warp(image: GrayImage | ColorImage | Singles, rectification: Rectification) 
     source = np.asarray(image, dtype=np.float32)
     if rectification.is_affine:
         return _warp_affine(source, rectification)
-    warped = np.empty((*rectification.canvas_size[::-1], *source.shape[2:]), dtype=np.uint8)
+    warped = np.empty(
+        (*rectification.canvas_size[::-1], *source.shape[2:]), dtype=np.uint8
+    )
     for tile, image_from_tile in _tiles(warped, rectification):
         tile[:] = np.rint(_warp_tile(source, image_from_tile, tile.shape[1::-1]))
     return warped
@@ -66,10 +78,17 @@ def _warp_affine(source: Singles, rectification: Rectification) -> GrayImage:
 
 def _anti_aliasing_sigma(compression: float, density: int) -> float:
     """Return the blur before a compression, in px of a grid ``density`` times the warp's."""
-    return ANTI_ALIASING_SIGMA * sqrt(max(compression**2 - 1.0, 0.0)) * density / compression
+    return (
+        ANTI_ALIASING_SIGMA
+        * sqrt(max(compression**2 - 1.0, 0.0))
+        * density
+        / compression
+    )
 
 
-def _tiles(canvas: Bytes, rectification: Rectification) -> Iterator[tuple[Bytes, Array]]:
+def _tiles(
+    canvas: Bytes, rectification: Rectification
+) -> Iterator[tuple[Bytes, Array]]:
     """Yield views of the tiles of a canvas and their (3, 3) maps image_from_tile."""
     image_from_canvas = rectification.image_from_rectified
     for top in range(0, canvas.shape[0], TILE_PX):
@@ -79,10 +98,14 @@ def _tiles(canvas: Bytes, rectification: Rectification) -> Iterator[tuple[Bytes,
             yield canvas[top : top + TILE_PX, left : left + TILE_PX], image_from_tile
 
 
-def _warp_tile(source: Singles, image_from_tile: Array, size: tuple[int, int]) -> Singles:
+def _warp_tile(
+    source: Singles, image_from_tile: Array, size: tuple[int, int]
+) -> Singles:
     """Render one tile of (width, height), with surroundings as far as the blur reaches."""
     compressions = _compressions(image_from_tile, size, source.shape[1::-1])
-    density_x, density_y = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY).astype(int)
+    density_x, density_y = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY).astype(
+        int
+    )
     sigma_x, sigma_y = map(_anti_aliasing_sigma, compressions, (density_x, density_y))
     reach_x = ceil(3 * sigma_x)
     reach_y = ceil(3 * sigma_y)
@@ -90,7 +113,9 @@ def _warp_tile(source: Singles, image_from_tile: Array, size: tuple[int, int]) -
     rows = np.arange(-reach_y, (size[1] - 1) * density_y + reach_y + 1) / density_y
     x, y, _ = _source_points(image_from_tile, columns, rows, source.shape[1::-1])
     dense = cv2.remap(source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    dense = cv2.GaussianBlur(dense, (2 * reach_x + 1, 2 * reach_y + 1), sigma_x, sigmaY=sigma_y)
+    dense = cv2.GaussianBlur(
+        dense, (2 * reach_x + 1, 2 * reach_y + 1), sigma_x, sigmaY=sigma_y
+    )
     rows_end = dense.shape[0] - reach_y
     columns_end = dense.shape[1] - reach_x
     return np.asarray(dense[reach_y:rows_end:density_y, reach_x:columns_end:density_x])
@@ -106,7 +131,9 @@ def _compressions(
     unit = lafs_from_keypoints(points, np.ones(len(points)), np.zeros(len(points)))
     spans = transform_lafs(image_from_tile, unit)
     seen = is_inside(spans[:, :, 2], image_size)
-    return np.asarray(np.linalg.norm(spans[seen, :, :2], axis=1).max(axis=0, initial=1.0))
+    return np.asarray(
+        np.linalg.norm(spans[seen, :, :2], axis=1).max(axis=0, initial=1.0)
+    )
 
 
 def _source_points(
@@ -120,7 +147,8 @@ def _source_points(
     Points further than an image size away are moved there: a border is reflected once.
     """
     x, y, third = (
-        form[0] * columns + form[1] * rows[:, None] + form[2] for form in image_from_tile
+        form[0] * columns + form[1] * rows[:, None] + form[2]
+        for form in image_from_tile
     )
     ahead = third > 0.0
     third = np.where(ahead, third, 1.0)
@@ -149,7 +177,9 @@ def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Byte
     if rectification.is_affine:
         matrix = (rectification.rectified_from_image @ image_from_region)[:2]
         size = rectification.canvas_size
-        return np.asarray(cv2.warpAffine(values, matrix, size, flags=cv2.INTER_NEAREST), np.uint8)
+        return np.asarray(
+            cv2.warpAffine(values, matrix, size, flags=cv2.INTER_NEAREST), np.uint8
+        )
     mask = np.empty(rectification.canvas_size[::-1], dtype=np.uint8)
     region_from_image = np.linalg.inv(image_from_region)
     for tile, image_from_tile in _tiles(mask, rectification):
@@ -157,6 +187,8 @@ def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Byte
         x, y, ahead = _source_points(
             region_from_image @ image_from_tile, columns, rows, region.shape[::-1]
         )
-        inside = cv2.remap(values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        inside = cv2.remap(
+            values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+        )
         tile[:] = np.where(ahead, inside, 0)
     return mask

@@ -15,7 +15,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import require_inside, triangulated
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, FATAL_FOR_MAPPING
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.colmap.model_files import FAR, model_folder, why_unusable, write_model
+from colmap_affrect.colmap.model_files import (
+    FAR,
+    model_folder,
+    why_unusable,
+    write_model,
+)
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.earth import why_not_on_earth
@@ -28,8 +33,12 @@ from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.paths import GivenPath, PathLike, as_path
 from colmap_affrect.project.tables import read_table
 
-GEOREFERENCE = "georeference.json"  # beside a model: what COLMAP's files have no place for
-MIN_WIDTH = 0.01  # of known places across the line that fits them best, in units of its length
+GEOREFERENCE = (
+    "georeference.json"  # beside a model: what COLMAP's files have no place for
+)
+MIN_WIDTH = (
+    0.01  # of known places across the line that fits them best, in units of its length
+)
 METRIC = ("x", "y", "z")
 ON_EARTH = ("latitude", "longitude", "altitude")
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
@@ -79,8 +88,12 @@ class Alignment(Summarized):
                 f"off         {median(self.residuals.values()):.3g} m in the median of "
                 f"{len(largest)}, {largest[0][1]:.3g} m at most"
             )
-            lines += [f"            {name} {value:.3g}" for name, value in largest[:SHOWN]]
-        lines += [f"left out    {name}: {why}" for name, why in sorted(self.left_out.items())]
+            lines += [
+                f"            {name} {value:.3g}" for name, value in largest[:SHOWN]
+            ]
+        lines += [
+            f"left out    {name}: {why}" for name, why in sorted(self.left_out.items())
+        ]
         return "\n".join(lines)
 
 
@@ -121,14 +134,18 @@ def align(
     model_path = as_path(model_path, "model_path")
     output_path = as_path(output_path, "output_path")
     return _align(
-        model_path, output_path, Reference.with_keywords(reference, keywords, "reference")
+        model_path,
+        output_path,
+        Reference.with_keywords(reference, keywords, "reference"),
     )
 
 
 def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignment:
     """Align with checked arguments."""
     if reference.distances and (reference.gps_database or reference.positions_path):
-        raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
+        raise OptionError(
+            "--distance: gives the scale alone; leave it out, or the positions"
+        )
     model = read_finished_model(model_path)
     origin = tuple[float, ...]()
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
@@ -153,9 +170,13 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
         left_out = _not_on_earth(true) if is_on_earth else {}
         left_out |= _not_fitting(old, _without(true, left_out), is_on_earth=is_on_earth)
         right = _without(true, left_out)
-        new_from_old, residuals, origin = _similarity(old, right, is_on_earth=is_on_earth)
+        new_from_old, residuals, origin = _similarity(
+            old, right, is_on_earth=is_on_earth
+        )
     model.transform(new_from_old)
-    upright = stand_upright(model_folder(model_path), model) if reference.distances else ""
+    upright = (
+        stand_upright(model_folder(model_path), model) if reference.distances else ""
+    )
     why = why_unusable(model)
     if not why and new_from_old.scale <= 1.0 / FAR:
         why = "it has no extent"
@@ -184,7 +205,9 @@ def _not_fitting(old: Places, true: Places, *, is_on_earth: bool) -> dict[str, s
     names = sorted(old.keys() & true.keys())
     if len(names) < 4:
         return {}
-    before, after = (np.array([places[name] for name in names]) for places in (old, true))
+    before, after = (
+        np.array([places[name] for name in names]) for places in (old, true)
+    )
     if is_on_earth:
         after = np.asarray(WGS84.ellipsoid_to_enu(after, *np.median(after, axis=0)))
         floor = GPS_ERROR_M
@@ -220,7 +243,9 @@ def _similarity(
             f"the true places of {len(names)} photographs or points of the model are known, and "
             f"3 are needed; known are those of {', '.join(sorted(true)[:3]) or 'none'}"
         )
-    before, after = (np.array([places[name] for name in names]) for places in (old, true))
+    before, after = (
+        np.array([places[name] for name in names]) for places in (old, true)
+    )
     origin = tuple(after.mean(axis=0).tolist()) if is_on_earth else ()
     if origin:
         after = np.asarray(WGS84.ellipsoid_to_enu(after, *origin))
@@ -233,7 +258,9 @@ def _similarity(
             )
     new_from_old = pycolmap.estimate_sim3d(before, after)
     if new_from_old is None:
-        raise OptionError("the known places do not fit the model in any scale and rotation")
+        raise OptionError(
+            "the known places do not fit the model in any scale and rotation"
+        )
     residuals = residuals_of(new_from_old, before, after).tolist()
     return new_from_old, dict(zip(names, residuals, strict=True)), origin
 
@@ -251,9 +278,13 @@ def _scale(
                 )
         own = float(np.linalg.norm(places[first] - places[second]))
         if own <= 0.0 or not 0.0 < length < np.inf:
-            raise OptionError(f"--distance {first},{second}: must be of two places, and positive")
+            raise OptionError(
+                f"--distance {first},{second}: must be of two places, and positive"
+            )
         lengths[f"{first},{second}"] = own, length
-    scale = float(np.exp(np.mean([np.log(true / own) for own, true in lengths.values()])))
+    scale = float(
+        np.exp(np.mean([np.log(true / own) for own, true in lengths.values()]))
+    )
     residuals = {name: abs(scale * own - true) for name, (own, true) in lengths.items()}
     return pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)), residuals
 
@@ -262,10 +293,14 @@ def _gps(path: Path) -> tuple[Places, bool]:
     """Return the pose priors of a database by image name, and whether they are on earth."""
     with open_copy(path, FATAL_FOR_IMAGES - FATAL_FOR_MAPPING) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
+        priors = [
+            prior for prior in database.read_all_pose_priors() if prior.has_position()
+        ]
     systems = {prior.coordinate_system for prior in priors}
     if not priors:
-        raise DatabaseError(f"{path}: no photograph has a position; give --positions FILE")
+        raise DatabaseError(
+            f"{path}: no photograph has a position; give --positions FILE"
+        )
     if len(systems) > 1:
         raise DatabaseError(f"{path}: some positions are on earth, others are not")
     true = {
@@ -308,7 +343,9 @@ def _marked_points(
     where = f"--points {path}"
     marks: defaultdict[str, dict[int, Array]] = defaultdict(dict)  # by image id
     true = Places()
-    for place, row in read_table(path, where, ("point", "image", "px", "py", *METRIC), "point"):
+    for place, row in read_table(
+        path, where, ("point", "image", "px", "py", *METRIC), "point"
+    ):
         name = row.get("point", "")
         if not name:
             raise OptionError(f"{place}: names no point")
@@ -327,6 +364,8 @@ def _marked_points(
     for name, marked in views.items():
         point = triangulated(model, marked)
         if point is None:
-            raise OptionError(f"{where}: the rays of point {name} do not meet; look at its marks")
+            raise OptionError(
+                f"{where}: the rays of point {name} do not meet; look at its marks"
+            )
         old[name] = point
     return old, true

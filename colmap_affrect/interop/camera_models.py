@@ -62,7 +62,9 @@ def fitted_camera(camera: pycolmap.Camera, name: str) -> tuple[pycolmap.Camera, 
     pixels, rays = _grid(camera)
     focal_px = float(camera.mean_focal_length())
     size = camera.width, camera.height
-    fitted = pycolmap.Camera.create_from_model_name(camera.camera_id, name, focal_px, *size)
+    fitted = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, name, focal_px, *size
+    )
     fitted.has_prior_focal_length = camera.has_prior_focal_length
     fitted.principal_point_x = camera.principal_point_x
     fitted.principal_point_y = camera.principal_point_y
@@ -85,7 +87,9 @@ def _grid(camera: pycolmap.Camera) -> tuple[Array, Array]:
     flat = np.asarray(camera.cam_from_img(pixels), np.float64)
     has_ray = np.isfinite(flat).all(axis=1)
     if not has_ray.any():
-        raise AffrectError(f"camera {camera.camera_id}: no point of its images has a ray")
+        raise AffrectError(
+            f"camera {camera.camera_id}: no point of its images has a ray"
+        )
     flat = flat[has_ray]
     return pixels[has_ray], np.column_stack([flat, np.ones(len(flat))])
 
@@ -116,7 +120,9 @@ def _least_squares(errors: Callable[[Array], Array], params: Array) -> Array:
     return params
 
 
-def _derivatives(errors: Callable[[Array], Array], params: Array, current: Array) -> Array:
+def _derivatives(
+    errors: Callable[[Array], Array], params: Array, current: Array
+) -> Array:
     columns = []
     for index, value in enumerate(params):
         step = STEP * max(1.0, abs(value))

@@ -10,8 +10,12 @@ from colmap_affrect.geometry.arrays import Array, Bools
 
 MAX_NUM_TRIPLES = 500  # similarities that are tried, each by three places
 GROSS = 5.0  # times the median residual: beyond is no error of measuring any more
-SMALL_SAMPLE = 5.0  # few places fit too well by chance, of which the median says too little
-FAR_BEYOND = 10.0  # times how far three places spread is the fourth, if these alone tell it
+SMALL_SAMPLE = (
+    5.0  # few places fit too well by chance, of which the median says too little
+)
+FAR_BEYOND = (
+    10.0  # times how far three places spread is the fourth, if these alone tell it
+)
 
 
 def residuals(new_from_old: pycolmap.Sim3d, before: Array, after: Array) -> Array:
@@ -69,4 +73,6 @@ def _triples(count: int) -> list[list[int]]:
     if math.comb(count, 3) <= MAX_NUM_TRIPLES:
         return list(map(list, itertools.combinations(range(count), 3)))
     rng = np.random.default_rng(0)
-    return [rng.choice(count, 3, replace=False).tolist() for _ in range(MAX_NUM_TRIPLES)]
+    return [
+        rng.choice(count, 3, replace=False).tolist() for _ in range(MAX_NUM_TRIPLES)
+    ]

@@ -38,8 +38,12 @@ USUAL = ("ply", "text", "cameras")  # formats that need no photographs
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
 UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright
-MEAN_DISTANCE_IN_CUBES = 1.32  # of cameras from the middle, as instant-ngp's converter has it
-FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL and nerfstudio
+MEAN_DISTANCE_IN_CUBES = (
+    1.32  # of cameras from the middle, as instant-ngp's converter has it
+)
+FLIP_Y_Z = np.diag(
+    [1.0, -1.0, -1.0]
+)  # from COLMAP's camera to that of OpenGL and nerfstudio
 
 
 @dataclass(frozen=True)
@@ -107,13 +111,19 @@ def _source(model_path: Path, image_path: Path | None) -> Source:
     """Read what is exported; the photographs are by default those of the run."""
     if image_path is not None and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
-    photographs = image_path or Workspace(resolved(model_path).parent.parent).photographs()
+    photographs = (
+        image_path or Workspace(resolved(model_path).parent.parent).photographs()
+    )
     return Source(model_path, read_finished_model(model_path), photographs)
 
 
-def _write(source: Source, output_path: Path, formats: Sequence[str]) -> dict[str, Path]:
+def _write(
+    source: Source, output_path: Path, formats: Sequence[str]
+) -> dict[str, Path]:
     """Write formats into a folder, all or none; return what was written by format."""
-    chosen = [name for name in FORMATS if name in formats]  # in the order in which they are made
+    chosen = [
+        name for name in FORMATS if name in formats
+    ]  # in the order in which they are made
     targets = dict.fromkeys(output_path / FORMATS[name].leaves for name in chosen)
     photographs = [image.name for image in source.images()]
     written = {}
@@ -129,23 +139,34 @@ def _checked_formats(given: str | Sequence[str]) -> list[str]:
     formats = given.split(",") if isinstance(given, str) else list(given)
     for name in formats:
         if name not in FORMATS:
-            raise OptionError(f"--format {name}: unknown{suggestion(str(name), FORMATS)}")
+            raise OptionError(
+                f"--format {name}: unknown{suggestion(str(name), FORMATS)}"
+            )
     return formats
 
 
 def _change_cameras(
-    model: pycolmap.Reconstruction, name: str, formats: Sequence[str], note: Callable[[str], None]
+    model: pycolmap.Reconstruction,
+    name: str,
+    formats: Sequence[str],
+    note: Callable[[str], None],
 ) -> None:
     if not {"text", "cameras"}.intersection(formats):
-        raise OptionError("--camera-model: changes 'text' and 'cameras'; give one of these formats")
+        raise OptionError(
+            "--camera-model: changes 'text' and 'cameras'; give one of these formats"
+        )
     refuse_panoramas(model, "--camera-model")
-    before = {camera_id: camera.model_name for camera_id, camera in model.cameras.items()}
+    before = {
+        camera_id: camera.model_name for camera_id, camera in model.cameras.items()
+    }
     largest_px: dict[str, float] = {}  # by the model that cameras had
     for camera_id, difference_px in with_camera_model(model, name).items():
         old = before[camera_id]
         largest_px[old] = max(difference_px, largest_px.get(old, 0.0))
     for old, difference_px in sorted(largest_px.items()):
-        note(f"cameras: {name} in the place of {old}, at most {difference_px:.3f} px apart")
+        note(
+            f"cameras: {name} in the place of {old}, at most {difference_px:.3f} px apart"
+        )
 
 
 def _points(source: Source, folder: Path) -> Path:
@@ -204,7 +225,9 @@ def _undistorted(source: Source, folder: Path) -> Path:
     path = folder / DENSE
     refuse_panoramas(source.model, "undistorted photographs")
     if source.image_path is None:
-        raise OptionError("--image-path: give the folder of the photographs, to undistort them")
+        raise OptionError(
+            "--image-path: give the folder of the photographs, to undistort them"
+        )
     _check_photographs(source, source.image_path)
     given = folder.parent / "model"  # a run may remove that of its folder meanwhile
     if not given.exists():
@@ -214,7 +237,9 @@ def _undistorted(source: Source, folder: Path) -> Path:
         picture = path / "images" / image.name
         if not picture.is_file():
             raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
-        forget_orientation(picture)  # COLMAP takes over EXIF, by which others would turn it
+        forget_orientation(
+            picture
+        )  # COLMAP takes over EXIF, by which others would turn it
     return path
 
 
@@ -227,7 +252,9 @@ def _check_photographs(source: Source, image_path: Path) -> None:
                 "photographs; rename it, no undistorted picture can be written for it"
             )
         if not (image_path / image.name).is_file():
-            raise ImageError(f"{image_path / image.name}: no such photograph; give --image-path")
+            raise ImageError(
+                f"{image_path / image.name}: no such photograph; give --image-path"
+            )
         _require_size(image_path / image.name, source.model.cameras[image.camera_id])
 
 
@@ -247,7 +274,10 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
     try:
         flat = Source(path, read_given_model(path / "sparse"), None, source.is_upright)
-    except (OptionError, StoreError) as error:  # which COLMAP does not say when it writes
+    except (
+        OptionError,
+        StoreError,
+    ) as error:  # which COLMAP does not say when it writes
         raise why_not_written(path / "sparse", error) from error
     with native_writes(path):
         flat.model.export_PLY(path / "points3D.ply")
@@ -293,7 +323,9 @@ def _place(source: Source) -> dict[str, Any]:
 
     Cameras are then 1.32 from the middle on average, as its own converter has them.
     """
-    poses = np.array([image.cam_from_world().inverse().matrix() for image in source.images()])
+    poses = np.array(
+        [image.cam_from_world().inverse().matrix() for image in source.images()]
+    )
     centers = poses[:, :, 3]
     points = [point.xyz for point in source.model.points3D.values()]
     middle = np.median(points or centers, axis=0)
@@ -349,7 +381,9 @@ def _no_formula(text: str) -> str:
 class Format:
     """A format that models are exported to."""
 
-    write: Callable[[Source, Path], Path]  # writes it into a folder, returns what it has written
+    write: Callable[
+        [Source, Path], Path
+    ]  # writes it into a folder, returns what it has written
     leaves: str  # what it leaves in the folder
 
 
@@ -357,7 +391,9 @@ FORMATS = {
     "ply": Format(_points, "points3D.ply"),
     "text": Format(_text, "text"),
     "undistorted": Format(_undistorted, DENSE),
-    "nerfstudio": Format(_nerfstudio, DENSE),  # uses the folder of ``undistorted``, if it is there
+    "nerfstudio": Format(
+        _nerfstudio, DENSE
+    ),  # uses the folder of ``undistorted``, if it is there
     "mvsnet": Format(_mvsnet, DENSE),
     "cameras": Format(_cameras, "cameras.csv"),
 }

@@ -18,7 +18,9 @@ from colmap_affrect.geometry.conventions import colmap_from_pixel
 from colmap_affrect.project.given_h5 import GivenFile
 
 
-def keys_of(features: GivenFile, names: Sequence[str], image_path: Path) -> dict[str, str]:
+def keys_of(
+    features: GivenFile, names: Sequence[str], image_path: Path
+) -> dict[str, str]:
     """Return the key of the features of each image, by its name.
 
     Some programs leave out the folders of images.
@@ -74,7 +76,9 @@ def given_descriptors(features: GivenFile, key: str, count: int) -> NDArray[Any]
     return values.T if shape[1] == count else values
 
 
-def require_size(source: GivenFile, key: str, name: str, expected: tuple[int, int]) -> None:
+def require_size(
+    source: GivenFile, key: str, name: str, expected: tuple[int, int]
+) -> None:
     """Refuse features that were found in an image of another size than it has.
 
     Args:
@@ -101,7 +105,9 @@ def require_size(source: GivenFile, key: str, name: str, expected: tuple[int, in
 
 def keypoint_rows(source: GivenFile, name: str) -> Singles:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
-    with np.errstate(all="ignore"):  # what is not finite, or float32 cannot hold, is refused later
+    with np.errstate(
+        all="ignore"
+    ):  # what is not finite, or float32 cannot hold, is refused later
         points = source.read(f"{name}/keypoints", (None, 2)).astype(np.float32)
         centers = np.asarray(colmap_from_pixel(points))
         count = len(points)

@@ -36,7 +36,11 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
-from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.colmap.verification import (
+    VerificationOptions,
+    verified_pairs,
+    verify,
+)
 from colmap_affrect.errors import (
     ImageError,
     OptionError,
@@ -48,7 +52,11 @@ from colmap_affrect.geometry.conventions import (
     MEASUREMENT_SIGMAS,
     pixel_from_colmap,
 )
-from colmap_affrect.images.photographs import CameraOptions, list_images, refuse_colliding_keys
+from colmap_affrect.images.photographs import (
+    CameraOptions,
+    list_images,
+    refuse_colliding_keys,
+)
 from colmap_affrect.interop.given_features import (
     given_descriptors,
     keypoint_rows,
@@ -68,8 +76,18 @@ from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.given_h5 import GivenFile, opened
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
-from colmap_affrect.project.stores import PairMatches, frame_datasets, hloc_matches, pair_key
-from colmap_affrect.stages.descriptors import Arrays, matched, unit_rows, write_given_matches
+from colmap_affrect.project.stores import (
+    PairMatches,
+    frame_datasets,
+    hloc_matches,
+    pair_key,
+)
+from colmap_affrect.stages.descriptors import (
+    Arrays,
+    matched,
+    unit_rows,
+    write_given_matches,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -100,7 +118,9 @@ class InterchangeReport(Summarized):
 
     def summary(self) -> str:
         """Return a line of numbers, and one for each note."""
-        verified = "" if self.num_verified is None else f", {self.num_verified} verified"
+        verified = (
+            "" if self.num_verified is None else f", {self.num_verified} verified"
+        )
         lines = [
             f"{self.action}: {self.num_images} images, {self.num_keypoints} keypoints, "
             f"{self.num_pairs} pairs{verified}, {self.num_matches} matches"
@@ -168,7 +188,9 @@ def import_h5(  # noqa: PLR0913 (all but three are keywords)
     cameras = CameraOptions.given(cameras, "cameras")
     progress = Progress.given(progress)
     if matches_path and match_list_path:
-        raise OptionError("--match-list-path: only without --matches-path: it says what to match")
+        raise OptionError(
+            "--match-list-path: only without --matches-path: it says what to match"
+        )
     wanted = _Wanted(
         as_path_or_none(matches_path, "matches_path"),
         match_type,
@@ -231,7 +253,11 @@ def _matches(
         with given_matches(wanted.matches_path, keys) as found:
             yield found
         return
-    lacking = [name for name, key in keys.items() if f"{key}/descriptors" not in features.shapes]
+    lacking = [
+        name
+        for name, key in keys.items()
+        if f"{key}/descriptors" not in features.shapes
+    ]
     if lacking:
         raise StoreError(
             f"{features.path}: has no descriptors to match by (give --matches-path): "
@@ -239,7 +265,9 @@ def _matches(
         )
     names = sorted(keys)
     if wanted.match_list_path:
-        pairs: Sequence[Pair] = read_pairs(wanted.match_list_path, names, wanted.image_path)
+        pairs: Sequence[Pair] = read_pairs(
+            wanted.match_list_path, names, wanted.image_path
+        )
     else:
         pairs = exhaustive_pairs(names)
 
@@ -267,7 +295,9 @@ def _fill(
         with progress.stage("keypoints", len(keys), "images") as advance:
             for name, key in keys.items():
                 _write_keypoints(database, images[name], features, key)
-                if not _keep_descriptors(database, images[name].image_id, features, key):
+                if not _keep_descriptors(
+                    database, images[name].image_id, features, key
+                ):
                     unkept.append(name)
                 advance(1)
     return unkept
@@ -289,7 +319,9 @@ def _keep_descriptors(
     return True
 
 
-def _fill_matches(path: Path, given: GivenMatches, wanted: _Wanted, progress: Progress) -> None:
+def _fill_matches(
+    path: Path, given: GivenMatches, wanted: _Wanted, progress: Progress
+) -> None:
     with (
         open_database(path) as database,
         pycolmap.DatabaseTransaction(database),
@@ -366,7 +398,9 @@ def export_h5(
         names = [image.name for image in known]
         _check_names(names)
         pair_ids, _ = database.read_num_matches()
-        features = ((i.name, _feature_datasets(database, i, database_path)) for i in known)
+        features = (
+            (i.name, _feature_datasets(database, i, database_path)) for i in known
+        )
         matches = _match_groups(database, known, pair_ids)
         with new_results(features_path, matches_path, names=names) as made:
             with progress.stage("features", len(names), "images") as advance:
@@ -380,7 +414,9 @@ def export_h5(
 
 
 def _match_groups(
-    database: pycolmap.Database, images: Sequence[pycolmap.Image], pair_ids: Sequence[int]
+    database: pycolmap.Database,
+    images: Sequence[pycolmap.Image],
+    pair_ids: Sequence[int],
 ) -> Iterator[tuple[str, Datasets]]:
     """Yield key and datasets of each pair."""
     names = {image.image_id: image.name for image in images}
@@ -394,7 +430,9 @@ def _match_groups(
         yield pair_key(*pair.names), hloc_matches(pair)
 
 
-def _feature_datasets(database: pycolmap.Database, image: pycolmap.Image, path: Path) -> Datasets:
+def _feature_datasets(
+    database: pycolmap.Database, image: pycolmap.Image, path: Path
+) -> Datasets:
     """Return the datasets of an image with keypoints."""
     camera = database.read_camera(image.camera_id)
     keypoints = np.asarray(database.read_keypoints(image.image_id), np.float32)
@@ -412,7 +450,10 @@ def _feature_datasets(database: pycolmap.Database, image: pycolmap.Image, path: 
     if database.exists_descriptors(image.image_id):
         where = f"{path}: {image.name}"
         values = read_descriptors(database, image.image_id, len(points), where)
-        sift = database.read_descriptors(image.image_id).type == pycolmap.FeatureExtractorType.SIFT
+        sift = (
+            database.read_descriptors(image.image_id).type
+            == pycolmap.FeatureExtractorType.SIFT
+        )
         data["descriptors"] = (values / np.float32(DESCRIPTOR_NORM if sift else 1)).T
     return data
 
@@ -431,7 +472,11 @@ def _check_names(names: Sequence[str]) -> None:
 
 def _is_plain(name: str) -> bool:
     """Tell whether a name is a relative path in its shortest form."""
-    return not leads_outside(name) and PurePosixPath(name).as_posix() == name and "\0" not in name
+    return (
+        not leads_outside(name)
+        and PurePosixPath(name).as_posix() == name
+        and "\0" not in name
+    )
 
 
 def _write_file(

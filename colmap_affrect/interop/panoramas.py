@@ -97,9 +97,13 @@ def reconstruct_panoramas(
     _check(image_path, names)
     _check_output(image_path, output_path)
     module: Any = _module(_Functions(progress))
-    module.render_perspective_images = _rendering(module.render_perspective_images, progress)
+    module.render_perspective_images = _rendering(
+        module.render_perspective_images, progress
+    )
     options = module.PanoramaReconstructionOptions(
-        matcher=module.Matcher(MATCHERS[order]), random_seed=random_seed, show_progress=False
+        matcher=module.Matcher(MATCHERS[order]),
+        random_seed=random_seed,
+        show_progress=False,
     )
     found = module.reconstruct(image_path, output_path, options)
     if not found:
@@ -132,12 +136,16 @@ def _rendering(render: Callable[..., Any], progress: Progress) -> Callable[..., 
 def _check(image_path: Path, names: Sequence[str]) -> None:
     """Refuse pictures that are no panoramas of one size, before anything is made."""
     if len(names) < 2:
-        raise ImageError(f"{image_path}: has {len(names)} pictures; give two panoramas or more")
+        raise ImageError(
+            f"{image_path}: has {len(names)} pictures; give two panoramas or more"
+        )
     first_size = None
     for name in names:
         tags = read_camera_tags(image_path / name)
         if not (tags and tags.size):
-            raise ImageError(f"{image_path / name}: cannot be read; take it out of the folder")
+            raise ImageError(
+                f"{image_path / name}: cannot be read; take it out of the folder"
+            )
         width, height = tags.size
         if width != 2 * height:
             raise ImageError(
@@ -155,10 +163,21 @@ def _check(image_path: Path, names: Sequence[str]) -> None:
 def _check_output(image_path: Path, output_path: Path) -> None:
     """Refuse to write among panoramas, or into a folder of something else."""
     if resolved(output_path).is_relative_to(resolved(image_path)):
-        raise OptionError(f"{output_path}: is in the folder of the panoramas; give another one")
-    for name in ("", "images", "masks", "sparse", "sparse_equirectangular", "database.db"):
+        raise OptionError(
+            f"{output_path}: is in the folder of the panoramas; give another one"
+        )
+    for name in (
+        "",
+        "images",
+        "masks",
+        "sparse",
+        "sparse_equirectangular",
+        "database.db",
+    ):
         refuse_link(output_path / name)
     begun = Workspace.beside(output_path / "database.db").path
     is_other = output_path.exists() and not output_path.is_dir()
-    if is_other or (output_path.is_dir() and any(output_path.iterdir()) and not begun.is_dir()):
+    if is_other or (
+        output_path.is_dir() and any(output_path.iterdir()) and not begun.is_dir()
+    ):
         raise OptionError(f"{output_path}: exists already; give a new folder")

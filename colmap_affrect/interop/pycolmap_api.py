@@ -17,8 +17,17 @@ from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
-from colmap_affrect.colmap.checks import FATAL_AS_IT_IS, FATAL_BEFORE_MAPPING, refuse_unusable
-from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
+from colmap_affrect.colmap.checks import (
+    FATAL_AS_IT_IS,
+    FATAL_BEFORE_MAPPING,
+    refuse_unusable,
+)
+from colmap_affrect.colmap.database import (
+    generated_pairs,
+    image_ids,
+    open_database,
+    spatial_pairs,
+)
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
 from colmap_affrect.errors import AffrectError, OptionError, such_as
@@ -51,7 +60,9 @@ from colmap_affrect.stages.pairs import add_pairs
 
 CANCELLED = "Operation cancelled"  # what pycolmap says
 
-Native = Mapping[str, Any] | None  # nested dictionaries are taken for all options of pycolmap
+Native = (
+    Mapping[str, Any] | None
+)  # nested dictionaries are taken for all options of pycolmap
 GivenMatching = pycolmap.FeatureMatchingOptions | MatcherOptions | Native
 GivenVerification = VerificationOptions | pycolmap.TwoViewGeometryOptions | Native
 Token = pycolmap.CancellationToken | None
@@ -116,7 +127,10 @@ def extract_features(  # noqa: PLR0913 (arguments are those of pycolmap)
     cameras, masks = translate.reader_options(reader_options, camera_mode)
     original = as_path_or_none(from_database, "from_database")
     inputs = Inputs.of(
-        as_path(image_path, "image_path"), from_database=original, cameras=cameras, masks=masks
+        as_path(image_path, "image_path"),
+        from_database=original,
+        cameras=cameras,
+        masks=masks,
     )
     recipe, asked = translate.extraction_recipe(extraction_options)
     shown = _Cancellable(Progress.given(progress), cancellation_token)
@@ -124,7 +138,9 @@ def extract_features(  # noqa: PLR0913 (arguments are those of pycolmap)
         report = extract(context, inputs, recipe, image_names=list(image_names))
     if report.failures:  # a script of pycolmap does not look at the report
         first, *_ = report.failures.values()
-        warnings.warn(f"left out: {such_as(report.failures)}; the first: {first}", stacklevel=2)
+        warnings.warn(
+            f"left out: {such_as(report.failures)}; the first: {first}", stacklevel=2
+        )
     return report
 
 
@@ -161,18 +177,24 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
                 What each stage did.
             """
             pairing: Any = translate.native(pairing_options, kind, "pairing_options")
-            verification = translate.verification_options(verification_options, random_seed)
+            verification = translate.verification_options(
+                verification_options, random_seed
+            )
             matching, asked = translate.matching_options(matching_options)
             shown = _Cancellable(Progress.given(progress), cancellation_token)
             with _context(database_path, device, asked, weights_path, shown) as context:
                 names = _described(context)
                 if names:
                     pairs = choose(_Images(context, names), pairing)
-                    return _match_descriptors(context, pairs, matching, verification, asked)
+                    return _match_descriptors(
+                        context, pairs, matching, verification, asked
+                    )
                 context.workspace.require("extract")
                 write_images_and_keypoints(context)
                 pairs = choose(_Images(context, context.features.names()), pairing)
-                return _match(context, pairs, matching, verification, asked, cancellation_token)
+                return _match(
+                    context, pairs, matching, verification, asked, cancellation_token
+                )
 
         matched.__name__ = matched.__qualname__ = choose.__name__
         texts = (choose.__doc__ or "", matched.__doc__ or "")
@@ -183,45 +205,61 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
 
 
 @_matching(pycolmap.ExhaustivePairingOptions)
-def match_exhaustive(images: _Images, _: pycolmap.ExhaustivePairingOptions) -> Iterable[Pair]:
+def match_exhaustive(
+    images: _Images, _: pycolmap.ExhaustivePairingOptions
+) -> Iterable[Pair]:
     """Match and verify all pairs of the images that :func:`extract_features` was given."""
     return exhaustive_pairs(images.names)
 
 
 @_matching(pycolmap.SequentialPairingOptions)
-def match_sequential(images: _Images, options: pycolmap.SequentialPairingOptions) -> list[Pair]:
+def match_sequential(
+    images: _Images, options: pycolmap.SequentialPairingOptions
+) -> list[Pair]:
     """Match images that follow each other by name.
 
     With ``loop_detection`` also images that are alike as a whole, which needs no vocabulary tree:
     as many as ``loop_detection_num_images`` of every ``loop_detection_period``th image.
     """
     context = images.context
-    num_alike = math.ceil(options.loop_detection_num_images / max(1, options.loop_detection_period))
+    num_alike = math.ceil(
+        options.loop_detection_num_images / max(1, options.loop_detection_period)
+    )
     in_order = type(options)({**options.todict(), "loop_detection": False})
     path = context.workspace.database
     pairs = generated_pairs(path, pycolmap.SequentialPairGenerator, in_order)
     if options.loop_detection:
         context.workspace.require("extract")
-        names = [name for name, count in context.features.num_keypoints().items() if count]
-        pairs += retrieved_pairs(names, context.features.read, num_alike, context.progress)
+        names = [
+            name for name, count in context.features.num_keypoints().items() if count
+        ]
+        pairs += retrieved_pairs(
+            names, context.features.read, num_alike, context.progress
+        )
     return pairs
 
 
 @_matching(pycolmap.SpatialPairingOptions)
-def match_spatial(images: _Images, options: pycolmap.SpatialPairingOptions) -> list[Pair]:
+def match_spatial(
+    images: _Images, options: pycolmap.SpatialPairingOptions
+) -> list[Pair]:
     """Match images near to each other; DatabaseError when fewer than two have a position."""
     return spatial_pairs(images.context.workspace.database, options)
 
 
 @_matching(pycolmap.ImportedPairingOptions)
-def match_image_pairs(images: _Images, options: pycolmap.ImportedPairingOptions) -> Iterable[Pair]:
+def match_image_pairs(
+    images: _Images, options: pycolmap.ImportedPairingOptions
+) -> Iterable[Pair]:
     """Match and verify the pairs of a list, ``match_list_path``, a file of two names per line.
 
     Raises AffrectError without one, or when it names images without features.
     """
     path = translate.given_path(options.match_list_path)
     if not path:
-        raise AffrectError("pairing_options: give match_list_path, a file with two names per line")
+        raise AffrectError(
+            "pairing_options: give match_list_path, a file with two names per line"
+        )
     return read_pairs(Path(path), images.names)
 
 
@@ -243,7 +281,9 @@ def _match_descriptors(
     """Match and verify pairs of images by the descriptors that another program has made."""
     nearest = matching if isinstance(matching, NearestOptions) else None
     if matching and not nearest:
-        raise OptionError("matching_options: descriptors of a database take NearestOptions alone")
+        raise OptionError(
+            "matching_options: descriptors of a database take NearestOptions alone"
+        )
     refused = sorted(asked.keys() & {"guided_matching", "rig_verification"})
     if refused:
         raise OptionError(f"{refused[0]}: not for descriptors of another program")
@@ -320,11 +360,15 @@ def verify_matches(
     pairs = None
     verification = translate.verification_options(options, None)
     refuse_unusable(path, FATAL_BEFORE_MAPPING, warns=True)
-    with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
+    with _Cancellable(SILENT, cancellation_token).stage(
+        "verify", 0, "pairs"
+    ) as advance:
         if pairs_path is not None:
             ids = image_ids(path)
             pairs = set[tuple[int, int]]()
-            for first, second in read_pairs(as_path(pairs_path, "pairs_path"), list(ids)):
+            for first, second in read_pairs(
+                as_path(pairs_path, "pairs_path"), list(ids)
+            ):
                 pairs.add((min(ids[first], ids[second]), max(ids[first], ids[second])))
         verify_database(path, verification, advance=advance, pairs=pairs)
 
@@ -336,7 +380,9 @@ def _of_different_frames(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
             image.name: image.frame_id if image.has_frame_id() else image.name
             for image in database.read_all_images()
         }
-    return [(first, second) for first, second in pairs if frames[first] != frames[second]]
+    return [
+        (first, second) for first, second in pairs if frames[first] != frames[second]
+    ]
 
 
 def incremental_mapping(
@@ -385,7 +431,9 @@ def incremental_mapping(
             cancellation=cancellation_token,
         )
         extends = existing is not None
-        show = _calling(initial_image_pair_callback, next_image_callback, extends=extends)
+        show = _calling(
+            initial_image_pair_callback, next_image_callback, extends=extends
+        )
         try:
             map_database(mapper, task, folder / "sparse", show)
         except KeyboardInterrupt as error:
@@ -395,7 +443,9 @@ def incremental_mapping(
         return _written(folder / "sparse", output, extends=extends)
 
 
-def _written(found: Path, output: Path, *, extends: bool) -> dict[int, pycolmap.Reconstruction]:
+def _written(
+    found: Path, output: Path, *, extends: bool
+) -> dict[int, pycolmap.Reconstruction]:
     """Read models and move their files to where pycolmap writes them."""
     models = {int(path.name): pycolmap.Reconstruction(path) for path in found.iterdir()}
     files = list(found.glob("*/*"))
@@ -409,7 +459,9 @@ def _written(found: Path, output: Path, *, extends: bool) -> dict[int, pycolmap.
     return dict(sorted(models.items()))
 
 
-def _calling(begun: Callback, following: Callback, *, extends: bool) -> Callable[[int], None]:
+def _calling(
+    begun: Callback, following: Callback, *, extends: bool
+) -> Callable[[int], None]:
     """Return what calls pycolmap's callbacks for a number of newly registered images.
 
     The first are a pair, or all images of the model that is extended: that is one call.
@@ -472,10 +524,14 @@ def _context(
 ) -> Iterator[Context]:
     """Lock the folder beside a database and return what the stages work with."""
     weights = as_path_or_none(weights_path, "weights_path")
-    resources = Resources(weights_path=weights, device=str(getattr(device, "name", device)))
+    resources = Resources(
+        weights_path=weights, device=str(getattr(device, "name", device))
+    )
     threads = asked.get("num_threads", -1)
     executor = Threads(threads) if threads > 0 else None
-    with Workspace.beside(as_path(database_path, "database_path")).locked() as workspace:
+    with Workspace.beside(
+        as_path(database_path, "database_path")
+    ).locked() as workspace:
         context = Context(workspace, resources, executor, progress)
         with watched(context):
             yield context

@@ -77,7 +77,9 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
         resolve(options, _unusual(_named(given), options), f"{argument}:", owned={})
     else:
         shown = f"{argument}: {type(given).__name__} does not apply here"
-        raise OptionError(f"{shown}; give pycolmap.{kind.__name__} or a dictionary of its fields")
+        raise OptionError(
+            f"{shown}; give pycolmap.{kind.__name__} or a dictionary of its fields"
+        )
     for key, value in _differing(options).items():
         if kind in HONOURED and key not in HONOURED[kind]:
             shown = getattr(value, "name", value)
@@ -93,7 +95,11 @@ def _differing(options: Any) -> dict[str, Any]:
 def _unusual(values: Mapping[str, Any], options: Any) -> dict[str, Any]:
     """Return the values, by dotted key, that options do not have."""
     usual = flat_values(options)
-    return {key: value for key, value in values.items() if key not in usual or value != usual[key]}
+    return {
+        key: value
+        for key, value in values.items()
+        if key not in usual or value != usual[key]
+    }
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
@@ -160,12 +166,16 @@ def verification_options(given: object, random_seed: int | None) -> Verification
     return options.changed(random_seed=random_seed)
 
 
-def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, MaskOptions]:
+def reader_options(
+    given: object, camera_mode: object
+) -> tuple[CameraOptions, MaskOptions]:
     """Return what pycolmap's options say of cameras and masks."""
     known = native(given, pycolmap.ImageReaderOptions, "reader_options")
     cameras = CameraOptions.from_mapping(
         {
-            "mode": str(getattr(camera_mode, "name", camera_mode)).lower().replace("_", "-"),
+            "mode": str(getattr(camera_mode, "name", camera_mode))
+            .lower()
+            .replace("_", "-"),
             "model": known.camera_model,
             "params": known.camera_params,
             "default_focal_length_factor": known.default_focal_length_factor,

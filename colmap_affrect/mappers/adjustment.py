@@ -31,17 +31,23 @@ NOISE_PX = 0.7  # standard deviation of keypoints, judged on the benchmark scene
 FAST = 15  # iterations while a model grows
 MEDIUM = 50  # iterations before models are compared
 FINAL = 300  # iterations of models that are kept
-FAST_TOLERANCE = 1e-5  # relative change of the cost at which Ceres ends a fast adjustment
+FAST_TOLERANCE = (
+    1e-5  # relative change of the cost at which Ceres ends a fast adjustment
+)
 TOLERANCE = 1e-7  # the same of all others
 DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one (measured)
 MIN_LONG_TRACKS = 100
 """Tracks of three images that every image needs before tracks of two are left out (judged)."""
-TIE_POINT_LOSS_SCALE = 4.0  # in deviations of keypoints: tie points pull from farther away
+TIE_POINT_LOSS_SCALE = (
+    4.0  # in deviations of keypoints: tie points pull from farther away
+)
 
 # When a trial adjustment ends early. Judged: this changes the growth of the cost by less than
 # three times as many iterations do, four per cent.
 FIRST_STEPS = 3  # of an adjustment, which say nothing of those that follow
-SMALL_STEP = 0.001  # part of the excess over the other cost, below which a step is small
+SMALL_STEP = (
+    0.001  # part of the excess over the other cost, below which a step is small
+)
 NUM_SMALL = 3  # small steps in a row that end an adjustment
 
 
@@ -85,7 +91,9 @@ class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
             self._num_small = 0
         num_left = max(0, self.max_iterations - step.iteration)
         lowest_cost = cost - num_left * change
-        return lowest_cost >= self.enough * self.other_cost or self._num_small >= NUM_SMALL
+        return (
+            lowest_cost >= self.enough * self.other_cost or self._num_small >= NUM_SMALL
+        )
 
 
 class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
@@ -95,7 +103,11 @@ class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
     """
 
     def __init__(
-        self, camera: pycolmap.Camera, prior: CameraPrior, noise_px: float, fixed: Sequence[int]
+        self,
+        camera: pycolmap.Camera,
+        prior: CameraPrior,
+        noise_px: float,
+        fixed: Sequence[int],
     ) -> None:
         """Begin.
 
@@ -143,9 +155,15 @@ class Adjuster:
 
     priors: Mapping[int, CameraPrior]  # by camera id
     noise_px: float  # standard deviation of the keypoints, the scale of the robust loss
-    refining: pycolmap.BundleAdjustmentOptions  # say which parameters of cameras are refined
-    constant: frozenset[int] = frozenset()  # ids of the cameras of which nothing is refined
-    constant_frames: frozenset[int] = frozenset()  # ids of the frames whose poses are fixed
+    refining: (
+        pycolmap.BundleAdjustmentOptions
+    )  # say which parameters of cameras are refined
+    constant: frozenset[int] = (
+        frozenset()
+    )  # ids of the cameras of which nothing is refined
+    constant_frames: frozenset[int] = (
+        frozenset()
+    )  # ids of the frames whose poses are fixed
     tie_points: TiePoints = NONE  # observed by all models that have two of their images
 
     def set_initial_focals(self, model: pycolmap.Reconstruction) -> None:
@@ -180,10 +198,16 @@ class Adjuster:
         images = sorted(registered if image_ids is None else set(image_ids))
         cameras = {model.images[image_id].camera_id for image_id in images}
         others = registered.difference(images)
-        fixed = {model.images[image_id].camera_id for image_id in others} | self.constant
-        config = self._config(model, images, cameras & fixed, fix_gauge=image_ids is None)
+        fixed = {
+            model.images[image_id].camera_id for image_id in others
+        } | self.constant
+        config = self._config(
+            model, images, cameras & fixed, fix_gauge=image_ids is None
+        )
         options = self._options(model, cameras - fixed)
-        problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+        problem = pycolmap.create_default_ceres_bundle_adjuster(
+            options, config, model
+        ).problem
         self._add_tie_points(problem, model)
         for key in sorted(cameras - fixed):
             if problem.has_parameter_block(model.cameras[key].params):
@@ -199,7 +223,9 @@ class Adjuster:
             return math.inf
         return float(summary.final_cost) / self.noise_px**2
 
-    def pose_covariance(self, model: pycolmap.Reconstruction) -> pycolmap.BACovariance | None:
+    def pose_covariance(
+        self, model: pycolmap.Reconstruction
+    ) -> pycolmap.BACovariance | None:
         """Return the covariance of the poses of a model that has been adjusted.
 
         Three points are held, which changes nothing of what does not depend on the frame of the
@@ -213,7 +239,9 @@ class Adjuster:
         config = self._config(model, images, cameras & self.constant, fix_gauge=False)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
         options = self._options(model, cameras - self.constant)
-        problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+        problem = pycolmap.create_default_ceres_bundle_adjuster(
+            options, config, model
+        ).problem
         self._add_tie_points(problem, model)
         for key in sorted(cameras - self.constant):
             if problem.has_parameter_block(model.cameras[key].params):
@@ -270,7 +298,9 @@ class Adjuster:
             image = model.images[image_id]
             camera = model.cameras[image.camera_id]
             frame = model.frames[image.frame_id]
-            is_reference = frame.rig is None or frame.rig.is_ref_sensor(camera.sensor_id)
+            is_reference = frame.rig is None or frame.rig.is_ref_sensor(
+                camera.sensor_id
+            )
             if frame.rig_from_world is None or not is_reference:
                 continue
             blocks = [

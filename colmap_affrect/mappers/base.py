@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol
 
 from pydantic import Field
 
-from colmap_affrect.options import MAX_SEED, PartOptions, PresetOptions, Registry, within
+from colmap_affrect.options import (
+    MAX_SEED,
+    PartOptions,
+    PresetOptions,
+    Registry,
+    within,
+)
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
@@ -57,15 +63,21 @@ class MappingTask:
     extend: ExistingModel | None = None  # register images into this model
     # models from before pairs were matched again, the best first: mappers may begin with them
     previous_models: Sequence[MappedModel] = ()
-    snapshot_path: Path | None = None  # of snapshots to go on from; mappers may leave it unused
+    snapshot_path: Path | None = (
+        None  # of snapshots to go on from; mappers may leave it unused
+    )
     cancellation: pycolmap.CancellationToken | None = None  # stops mapping from outside
     # pairs of image names that only affine frames verify which were not measured one by one
     unmeasured_pairs: frozenset[tuple[str, str]] = frozenset()
-    cameras: Mapping[int, CameraRecord] = field(default_factory=dict)  # what is known, by id
+    cameras: Mapping[int, CameraRecord] = field(
+        default_factory=dict
+    )  # what is known, by id
     # what the straight lines of images say of their cameras, by image name; runs leave it empty,
     # as far as it is not measured that models of stored lines (FeatureStore.lines) are better
     lines: Mapping[str, LineCamera] = field(default_factory=dict)
-    may_share: bool = False  # images of one size may turn out to share an uncalibrated camera
+    may_share: bool = (
+        False  # images of one size may turn out to share an uncalibrated camera
+    )
     # keypoints of the tie points, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
@@ -73,7 +85,11 @@ class MappingTask:
     def colors_path(self) -> Path:
         """A folder that exists, as pycolmap needs one also where there are no photographs."""
         photographs = self.image_path
-        return photographs if photographs and photographs.is_dir() else self.database_path.parent
+        return (
+            photographs
+            if photographs and photographs.is_dir()
+            else self.database_path.parent
+        )
 
     def refined_intrinsics(self, options: MapperOptions) -> RefinedIntrinsics:
         """Return what is to be refined, of at least one camera."""
@@ -107,7 +123,9 @@ class MappedModel:
     reconstruction: pycolmap.Reconstruction
     bridges: Mapping[str, Bridge] = field(default_factory=dict)
     """By the names of images that came in by one verified pair, not by tracks of three images."""
-    moves: tuple[str, ...] = ()  # hypotheses that made the model, in the words of a report
+    moves: tuple[
+        str, ...
+    ] = ()  # hypotheses that made the model, in the words of a report
     finish: Callable[[], None] | None = None
     """Gives the reconstruction its last points and colours; called once, when images are scored."""
 
@@ -118,7 +136,11 @@ class Mapper(Protocol):
     options: Any  # checked, with pycolmap's full keys in ``mapper_options``
 
     def map(
-        self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
+        self,
+        task: MappingTask,
+        output_path: Path,
+        random_seed: int,
+        show: Callable[[int], None],
     ) -> list[MappedModel]:
         """Map once.
 

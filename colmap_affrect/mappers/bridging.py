@@ -17,7 +17,11 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.two_views import ScaleEstimate, scale_between, scale_by_planes
+from colmap_affrect.geometry.two_views import (
+    ScaleEstimate,
+    scale_between,
+    scale_by_planes,
+)
 from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
     CameraById,
@@ -30,8 +34,12 @@ from colmap_affrect.mappers.pair_graph import (
 from colmap_affrect.project.report import Bridge
 
 # Judged on bridges of the benchmark scenes whose poses are known.
-NEIGHBOR_RADIUS = 0.03  # of the longer side of an image: known depths so near are compared
-PLANE_RADIUS_FACTOR = 4.0  # known depths on a common plane may be so many times farther away
+NEIGHBOR_RADIUS = (
+    0.03  # of the longer side of an image: known depths so near are compared
+)
+PLANE_RADIUS_FACTOR = (
+    4.0  # known depths on a common plane may be so many times farther away
+)
 MIN_AGREEING = 10  # depth ratios that agree with a scale
 MIN_AGREEING_SHARE = 0.5  # of all ratios: right pairs have 0.8, chance 0.25
 FOCAL_STEP = 0.02  # of the logarithm: relative poses are estimated once for such a step
@@ -113,7 +121,9 @@ class BridgeFinder:
                 initial = self.graph.cameras[pair.ids[1 - side]]
                 yield _OpenPair(pair, side, refined.get(initial.camera_id, initial))
 
-    def _hypotheses(self, posed: _PosedModel, open_pair: _OpenPair) -> Iterator[BridgeHypothesis]:
+    def _hypotheses(
+        self, posed: _PosedModel, open_pair: _OpenPair
+    ) -> Iterator[BridgeHypothesis]:
         """Yield the bridges that the relative poses of a pair allow."""
         inside = open_pair.inside
         outside = open_pair.outside
@@ -123,13 +133,20 @@ class BridgeFinder:
             scale = self._scale(posed, open_pair, relative)
             if scale is None:
                 continue
-            pose = _chained(posed.poses[inside], relative.pose, open_pair.side, scale.scale)
+            pose = _chained(
+                posed.poses[inside], relative.pose, open_pair.side, scale.scale
+            )
             agreeing = self._agreeing_weight(posed, outside, pose, camera)
             if agreeing is not None:
                 bridge = Bridge(
-                    self.graph.names[inside], scale.num_agreeing, scale.num_ratios, scale.error_frac
+                    self.graph.names[inside],
+                    scale.num_agreeing,
+                    scale.num_ratios,
+                    scale.error_frac,
                 )
-                yield BridgeHypothesis(bridge, outside, pose, camera, agreeing * scale.share)
+                yield BridgeHypothesis(
+                    bridge, outside, pose, camera, agreeing * scale.share
+                )
 
     def _scale(
         self, posed: _PosedModel, open_pair: _OpenPair, relative: RelativePose
@@ -162,13 +179,17 @@ class BridgeFinder:
                 agreeing += weight * self.graph.agreement(pair, poses, cameras)
         return agreeing if agreeing >= MIN_SHARE * total else None
 
-    def _poses_of_pair(self, pair: VerifiedPair, cameras: CameraById) -> list[RelativePose]:
+    def _poses_of_pair(
+        self, pair: VerifiedPair, cameras: CameraById
+    ) -> list[RelativePose]:
         """Return the relative poses of a pair; for nearly the same focal lengths the same ones."""
         focals = [cameras[image_id].mean_focal_length() for image_id in pair.ids]
         steps = np.round(np.log(focals) / FOCAL_STEP).astype(int)
         key = (pair.ids, *steps)
         if key not in self._relative_poses:
-            self._relative_poses[key] = self.graph.relative_poses(pair, cameras, self.random_seed)
+            self._relative_poses[key] = self.graph.relative_poses(
+                pair, cameras, self.random_seed
+            )
         return self._relative_poses[key]
 
 

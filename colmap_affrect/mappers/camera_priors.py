@@ -36,12 +36,16 @@ LYING_LINES = 0.1  # share of photographs whose lines say something else than th
 CROP_SIGMA = 0.2
 """Of the logarithm of the focal length of a crop, around that of the whole photograph in px: some
 crops were enlarged or shrunk, too (judged)."""
-DISTORTION_SIGMA = 0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
+DISTORTION_SIGMA = (
+    0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
+)
 SHIFTED_SHARE = 0.2  # of the photographs of which nothing is known (judged)
 NO_SHARE = 1e-9  # of measurements that are false
 WIDE_SIGMA = 1.0  # of the logarithm of a focal length of which nothing is expected
 MIN_FOCAL_PX = 1e-9  # whose logarithm is taken
-MAX_DEVIATIONS = 2.5  # by which EXIF and lines may differ before they contradict each other
+MAX_DEVIATIONS = (
+    2.5  # by which EXIF and lines may differ before they contradict each other
+)
 ZOOMS = 1.0, 1.4, 0.7, 2.0
 """Factors of the usual focal length near which unknown ones begin (judged): all lenses from wide to
 long are within a fifth of one of them. Where lines tell more, starts are nearer to each other."""
@@ -125,13 +129,18 @@ class CameraPrior:
         """Return how much a focal length costs, in nats."""
         if not self.sigma:
             return 0.0
-        return 0.5 * (math.log(max(focal_px, MIN_FOCAL_PX) / self.focal_px) / self.sigma) ** 2
+        return (
+            0.5
+            * (math.log(max(focal_px, MIN_FOCAL_PX) / self.focal_px) / self.sigma) ** 2
+        )
 
     def cost_of(self, camera: pycolmap.Camera) -> float:
         """Return how much focal length and principal point of a camera cost, in nats."""
         cost = self.cost(camera.mean_focal_length())
         if self.principal_point:
-            cost += self.principal_point.cost(camera.principal_point_x, camera.principal_point_y)
+            cost += self.principal_point.cost(
+                camera.principal_point_x, camera.principal_point_y
+            )
         return cost
 
 
@@ -146,7 +155,9 @@ def with_distortion_of(
     """
     is_straight = {camera.camera_id: camera.is_undistorted() for camera in cameras}
     return {
-        key: replace(prior, has_distortion=not (prior.is_unknown and is_straight.get(key, False)))
+        key: replace(
+            prior, has_distortion=not (prior.is_unknown and is_straight.get(key, False))
+        )
         for key, prior in priors.items()
     }
 
@@ -176,7 +187,9 @@ def product(usual: LogNormal, measurements: Iterable[Measurement]) -> LogNormal:
     """
     logs = usual.log_densities(LOG_FOCALS)
     for measured in measurements:
-        right = math.log(1.0 - measured.false_share) + measured.focal.log_densities(LOG_FOCALS)
+        right = math.log(1.0 - measured.false_share) + measured.focal.log_densities(
+            LOG_FOCALS
+        )
         false = math.log(measured.false_share) + USUAL.log_densities(LOG_FOCALS)
         logs = logs + np.logaddexp(right, false)
     chances = np.exp(logs - logs.max())
@@ -202,7 +215,9 @@ def measurement_of_lines(camera: LineCamera) -> Measurement | None:
 
 
 def camera_prior(
-    camera: pycolmap.Camera, record: CameraRecord | None, lines: Sequence[LineCamera] = ()
+    camera: pycolmap.Camera,
+    record: CameraRecord | None,
+    lines: Sequence[LineCamera] = (),
 ) -> CameraPrior:
     """Return what is known of a camera of a database.
 
@@ -234,7 +249,9 @@ def camera_prior(
 def _starts(focal_px: LogNormal) -> tuple[float, ...]:
     """Return the focal lengths near which models begin, the likeliest first."""
     zooms = ZOOMS if focal_px.sigma > KNOWN_SIGMA else ZOOMS[:1]
-    return tuple(focal_px.focal * zoom ** (focal_px.sigma / USUAL_SIGMA) for zoom in zooms)
+    return tuple(
+        focal_px.focal * zoom ** (focal_px.sigma / USUAL_SIGMA) for zoom in zooms
+    )
 
 
 def _principal_point(
@@ -266,7 +283,9 @@ def _principal_point(
 def usual_principal_point(camera: pycolmap.Camera) -> PrincipalPointPrior:
     """Return what is known of the principal point of a whole photograph."""
     sigma_px = MIDDLE_SIGMA * max(camera.width, camera.height)
-    return PrincipalPointPrior((camera.width / 2.0, camera.height / 2.0), (sigma_px, sigma_px))
+    return PrincipalPointPrior(
+        (camera.width / 2.0, camera.height / 2.0), (sigma_px, sigma_px)
+    )
 
 
 def _shift(lines: Iterable[LineCamera]) -> Normal | None:
@@ -308,7 +327,9 @@ def camera_priors(
     found = {}
     for camera in cameras:
         record = records.get(camera.camera_id)
-        of_images = [lines[name] for name in (record.names if record else ()) if name in lines]
+        of_images = [
+            lines[name] for name in (record.names if record else ()) if name in lines
+        ]
         found[camera.camera_id] = camera_prior(camera, record, of_images)
     return found
 
@@ -331,7 +352,9 @@ def focal_contradictions(
         if record is None or record.source not in TRUSTED:
             continue
         of_images = [lines[name] for name in record.names if name in lines]
-        told = [measured for measured in map(measurement_of_lines, of_images) if measured]
+        told = [
+            measured for measured in map(measurement_of_lines, of_images) if measured
+        ]
         certain = [replace(measured, false_share=NO_SHARE) for measured in told]
         by_lines = product(LogNormal(USUAL_FOCAL, WIDE_SIGMA), certain)
         longer_px = max(camera.width, camera.height)

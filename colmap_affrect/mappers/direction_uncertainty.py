@@ -19,7 +19,9 @@ MAX_NUM_IMAGES = 100
 hardly stand at one place."""
 
 
-def direction_sigmas_deg(model: pycolmap.Reconstruction, adjuster: Adjuster) -> dict[int, float]:
+def direction_sigmas_deg(
+    model: pycolmap.Reconstruction, adjuster: Adjuster
+) -> dict[int, float]:
     """Return how uncertain the directions from each image to others are.
 
     Args:

@@ -42,14 +42,18 @@ def cameras_that_tell_distortion(graph: PairGraph) -> frozenset[int]:
 
 def _num_partners(graph: PairGraph) -> dict[int, Indices]:
     """Return in how many other images each feature is matched, by image id."""
-    found = {i: np.zeros(len(points), np.int64) for i, points in graph.keypoints.items()}
+    found = {
+        i: np.zeros(len(points), np.int64) for i, points in graph.keypoints.items()
+    }
     for pair in graph.verified:
         for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
             found[image_id][np.unique(features)] += 1
     return found
 
 
-def redundancy_of(camera: pycolmap.Camera, keypoints: Array, num_partners: Indices) -> float:
+def redundancy_of(
+    camera: pycolmap.Camera, keypoints: Array, num_partners: Indices
+) -> float:
     """Return how many observations of an image are redundant.
 
     Args:

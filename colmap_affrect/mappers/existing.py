@@ -15,7 +15,11 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.model_files import model_folder, read_given_model, refuse_panoramas
+from colmap_affrect.colmap.model_files import (
+    model_folder,
+    read_given_model,
+    refuse_panoramas,
+)
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options
@@ -76,7 +80,9 @@ class ExistingModel:
 
     def constrain(self, native: pycolmap.IncrementalPipelineOptions) -> None:
         """Have pycolmap's mapper keep poses, cameras and rigs, unless they may move."""
-        native.load_all_images = True  # also those of the model that no match ties to others
+        native.load_all_images = (
+            True  # also those of the model that no match ties to others
+        )
         if self.refine:
             return
         native.fix_existing_frames = True
@@ -101,9 +107,13 @@ class ExistingModel:
 
         The model as a whole is moved back onto them: COLMAP gives it another scale.
         """
-        before = [image for image in self.images if model.image(image.image_id).has_pose]
+        before = [
+            image for image in self.images if model.image(image.image_id).has_pose
+        ]
         after = [model.image(image.image_id) for image in before]
-        old_from_new = pycolmap.estimate_sim3d(_pose_points(after), _pose_points(before))
+        old_from_new = pycolmap.estimate_sim3d(
+            _pose_points(after), _pose_points(before)
+        )
         if old_from_new:
             model.transform(old_from_new)
         for image in self.images:
@@ -156,7 +166,9 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     new.load(cache)
     ids = {image.name: image_id for image_id, image in new.images.items()}
     _known_names(old, path, ids)
-    images = [_SameImage(image, new.image(ids[image.name])) for image in _registered(old)]
+    images = [
+        _SameImage(image, new.image(ids[image.name])) for image in _registered(old)
+    ]
     _take_cameras(images, old, new, path)
     _take_rigs(images, new)
     _take_poses(images, new, path)
@@ -167,7 +179,9 @@ def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [model.image(image_id) for image_id in model.reg_image_ids()]
 
 
-def _known_names(model: pycolmap.Reconstruction, path: Path, known: Collection[str]) -> list[str]:
+def _known_names(
+    model: pycolmap.Reconstruction, path: Path, known: Collection[str]
+) -> list[str]:
     names = sorted(image.name for image in _registered(model))
     missing = [name for name in names if name not in known]
     if missing:
@@ -240,7 +254,9 @@ def _take_rigs(images: Sequence[_SameImage], new: pycolmap.Reconstruction) -> No
             rig.set_sensor_from_rig(own.sensor_id, sensor_from_rig)
 
 
-def _take_poses(images: Sequence[_SameImage], new: pycolmap.Reconstruction, path: Path) -> None:
+def _take_poses(
+    images: Sequence[_SameImage], new: pycolmap.Reconstruction, path: Path
+) -> None:
     """Set the poses of frames.
 
     Args:

@@ -50,7 +50,12 @@ def complete_points(
     max_error_px = mapping.filter_max_reproj_error
     failing = _failing(model, max_error_px) - by_hand
     if failing:
-        _refine(model, model.point3D_ids() - failing, pycolmap.LossFunctionType.TRIVIAL, noise_px)
+        _refine(
+            model,
+            model.point3D_ids() - failing,
+            pycolmap.LossFunctionType.TRIVIAL,
+            noise_px,
+        )
     refined = model.point3D_ids() - by_hand
     manager.filter_points3D(max_error_px, mapping.filter_min_tri_angle, refined)
     model.update_point_3d_errors()
@@ -87,7 +92,9 @@ def _failing(model: pycolmap.Reconstruction, max_error_px: float) -> set[int]:
 
 
 def _error_px(
-    model: pycolmap.Reconstruction, point: pycolmap.Point3D, element: pycolmap.TrackElement
+    model: pycolmap.Reconstruction,
+    point: pycolmap.Point3D,
+    element: pycolmap.TrackElement,
 ) -> float:
     """Return how far an observation is from its point; infinite behind the camera."""
     image = model.images[element.image_id]
@@ -128,20 +135,26 @@ def _refine(
         config.add_constant_point(point_id)
     poses = _pose_parameters(model)
     before = [pose.copy() for pose in poses]
-    problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+    problem = pycolmap.create_default_ceres_bundle_adjuster(
+        options, config, model
+    ).problem
     solver = pyceres.SolverOptions()
     solver.max_num_iterations = MAX_ITERATIONS
     solver.num_threads = 1
     solver.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
     pyceres.solve(solver, problem, pyceres.SolverSummary())
     for pose, known in zip(poses, before, strict=True):
-        pose[:] = known  # COLMAP makes quaternions of length 1 again, which may change a last bit
+        pose[:] = (
+            known  # COLMAP makes quaternions of length 1 again, which may change a last bit
+        )
 
 
 def _pose_parameters(model: pycolmap.Reconstruction) -> list[Array]:
     """Return the parameters of the poses of frames, and of the sensors in rigs, as the model's."""
     poses = [model.frames[key].rig_from_world for key in sorted(model.reg_frame_ids())]
     for rig_id in sorted(model.rigs):
-        rig = model.rigs[rig_id]  # its sensors are copies there, and the model's by their ids
+        rig = model.rigs[
+            rig_id
+        ]  # its sensors are copies there, and the model's by their ids
         poses += [rig.sensor_from_rig(sensor) for sensor in rig.non_ref_sensors]
     return [pose.params for pose in poses if pose is not None]

@@ -13,7 +13,11 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, EarlyStop
 from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.camera_priors import CameraPrior, camera_priors, with_distortion_of
+from colmap_affrect.mappers.camera_priors import (
+    CameraPrior,
+    camera_priors,
+    with_distortion_of,
+)
 from colmap_affrect.mappers.model_score import num_occupied_cells
 from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs, sampling_step
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -22,11 +26,19 @@ FACTORS = 1.25, 0.8
 """Other focal lengths that are tried: with these, poses are off by 5 degrees and more (judged)."""
 MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing (judged)
 MAX_GROWTH = 1.0  # as of known focal lengths: more makes no photograph surer (judged)
-FREE_SIGMA = 1.0  # of the logarithm of a given focal length while others are tried: nearly free
-MIN_MOVE = 0.1  # of the logarithm of a given focal length, from which on another one is named
-NUM_ITERATIONS = 100  # of a trial: three times as many change growths by 4 % at most (measured)
+FREE_SIGMA = (
+    1.0  # of the logarithm of a given focal length while others are tried: nearly free
+)
+MIN_MOVE = (
+    0.1  # of the logarithm of a given focal length, from which on another one is named
+)
+NUM_ITERATIONS = (
+    100  # of a trial: three times as many change growths by 4 % at most (measured)
+)
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once, to save time
-MAX_NUM_IMAGES = 100  # larger models have points of many images, which tell focal lengths
+MAX_NUM_IMAGES = (
+    100  # larger models have points of many images, which tell focal lengths
+)
 MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time
 MAX_NUM_OBSERVATIONS = 3_000
 """The same of a model of rigs: with the poses of the sensors as unknowns, too, each observation
@@ -77,7 +89,9 @@ class _FocalTrials:
         return least - 1.0
 
 
-def focal_growths(model: pycolmap.Reconstruction, task: MappingTask) -> dict[int, float]:
+def focal_growths(
+    model: pycolmap.Reconstruction, task: MappingTask
+) -> dict[int, float]:
     """Return by what part the cost grows with another focal length, by id of the camera.
 
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
@@ -157,7 +171,9 @@ def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction
     ids = sorted(fewer.point3D_ids())
     step = sampling_step(len(ids), MAX_NUM_POINTS)
     if has_rigs(model):
-        step = max(step, sampling_step(model.compute_num_observations(), MAX_NUM_OBSERVATIONS))
+        step = max(
+            step, sampling_step(model.compute_num_observations(), MAX_NUM_OBSERVATIONS)
+        )
     kept = set(ids[::step])
     for point_id in ids:
         if point_id not in kept:

@@ -60,7 +60,11 @@ class GlobalMapper:
         self.options = options.changed(mapper_options=resolved)
 
     def map(
-        self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
+        self,
+        task: MappingTask,
+        output_path: Path,
+        random_seed: int,
+        show: Callable[[int], None],
     ) -> list[MappedModel]:
         """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
 
@@ -97,7 +101,9 @@ class GlobalMapper:
         show(max((model.num_reg_images() for model in models), default=0))
         return [MappedModel(model) for model in models]
 
-    def native(self, task: MappingTask, random_seed: int) -> pycolmap.GlobalPipelineOptions:
+    def native(
+        self, task: MappingTask, random_seed: int
+    ) -> pycolmap.GlobalPipelineOptions:
         """Translate the options into pycolmap's.
 
         Args:
@@ -139,7 +145,10 @@ class GlobalMapper:
         if not constant:
             return
         with open_database(task.database_path) as database:
-            given = {c.camera_id: c.params.tolist() for c in cameras_of_images(database).values()}
+            given = {
+                c.camera_id: c.params.tolist()
+                for c in cameras_of_images(database).values()
+            }
         has_changed = False
         for key in constant:
             camera = model.cameras[key]
@@ -148,4 +157,6 @@ class GlobalMapper:
                 has_changed = True
         if has_changed:
             priors = camera_priors(model.cameras.values(), task.cameras, task.lines)
-            Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(model, FINAL)
+            Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(
+                model, FINAL
+            )

@@ -15,13 +15,23 @@ from colmap_affrect.mappers.adjustment import FAST, FINAL, MEDIUM, Adjuster
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import BridgeFinder
 from colmap_affrect.mappers.model_score import ModelScorer
-from colmap_affrect.mappers.pair_graph import CameraById, PairGraph, PoseById, cameras_of, poses_of
+from colmap_affrect.mappers.pair_graph import (
+    CameraById,
+    PairGraph,
+    PoseById,
+    cameras_of,
+    poses_of,
+)
 
 MIN_POINTS = 10  # of a first pair (judged)
-NUM_ALWAYS_ADJUSTED = 10  # images up to which each new one is followed by a global adjustment
+NUM_ALWAYS_ADJUSTED = (
+    10  # images up to which each new one is followed by a global adjustment
+)
 GROWTH = 1.15  # of the number of images from one global adjustment to the next; COLMAP has 1.1
 NUM_LAST_ROUNDS = 2  # of triangulation and adjustment at the end (judged)
-MAX_TRIALS = 5  # bridges that are built from one model before it is called complete (judged)
+MAX_TRIALS = (
+    5  # bridges that are built from one model before it is called complete (judged)
+)
 
 
 class Grower:
@@ -50,7 +60,9 @@ class Grower:
         self.triangulation = native.get_triangulation()
 
     @contextmanager
-    def _mapping(self, model: pycolmap.Reconstruction) -> Iterator[pycolmap.IncrementalMapper]:
+    def _mapping(
+        self, model: pycolmap.Reconstruction
+    ) -> Iterator[pycolmap.IncrementalMapper]:
         mapper = pycolmap.IncrementalMapper(self.graph.cache)
         mapper.begin_reconstruction(model)
         yield mapper
@@ -73,7 +85,9 @@ class Grower:
             self._complete(mapper)
         return model
 
-    def finish(self, model: pycolmap.Reconstruction, max_iterations: int = FINAL) -> None:
+    def finish(
+        self, model: pycolmap.Reconstruction, max_iterations: int = FINAL
+    ) -> None:
         """Triangulate again and adjust a model, by default until it converges.
 
         Args:
@@ -92,7 +106,9 @@ class Grower:
 
     def restart_from(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """Return a new model that begins with the poses and cameras of another one."""
-        return self.register_at(poses_of(model), cameras_of(model), pycolmap.Reconstruction())
+        return self.register_at(
+            poses_of(model), cameras_of(model), pycolmap.Reconstruction()
+        )
 
     def register_at(
         self, poses: PoseById, cameras: CameraById, model: pycolmap.Reconstruction
@@ -114,7 +130,9 @@ class Grower:
             if image.has_pose or image.frame is None:
                 continue
             if image.camera_id not in used:
-                model.cameras[image.camera_id].params = cameras[image_id].params.tolist()
+                model.cameras[image.camera_id].params = cameras[
+                    image_id
+                ].params.tolist()
             pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
             image.frame.set_cam_from_world(image.camera_id, pose)
             model.register_frame(image.frame_id)
@@ -134,7 +152,9 @@ class Grower:
             mapper.complete_and_merge_tracks(self.triangulation)
             num_images = model.num_reg_images()
             self.show(num_images)
-            is_global = num_images <= NUM_ALWAYS_ADJUSTED or num_images >= GROWTH * num_adjusted
+            is_global = (
+                num_images <= NUM_ALWAYS_ADJUSTED or num_images >= GROWTH * num_adjusted
+            )
             if is_global:
                 self._adjust(mapper, FAST)
                 num_adjusted = num_images
@@ -151,7 +171,9 @@ class Grower:
                 return image_id
         return None
 
-    def _triangulate(self, mapper: pycolmap.IncrementalMapper, image_ids: Collection[int]) -> None:
+    def _triangulate(
+        self, mapper: pycolmap.IncrementalMapper, image_ids: Collection[int]
+    ) -> None:
         """Triangulate images, and those that a rig took with them."""
         for image_id in _with_frames(mapper.reconstruction, image_ids):
             mapper.triangulate_image(self.triangulation, image_id)
@@ -171,7 +193,9 @@ class Grower:
         mapper.filter_points(self.options)
 
 
-def _with_frames(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> list[int]:
+def _with_frames(
+    model: pycolmap.Reconstruction, image_ids: Collection[int]
+) -> list[int]:
     """Return images, each followed by the others of its frame, once."""
     found = dict[int, None]()
     for image_id in image_ids:
@@ -206,10 +230,14 @@ def register_bridges(
         for hypothesis in bridges.find(model)[:MAX_TRIALS]:
             image_id = hypothesis.image_id
             grown = grower.register_at(
-                {image_id: hypothesis.pose}, {image_id: hypothesis.camera}, copy.deepcopy(model)
+                {image_id: hypothesis.pose},
+                {image_id: hypothesis.camera},
+                copy.deepcopy(model),
             )
             grown_score = scorer.score(grown)
-            has_grown = grown.num_reg_images() > model.num_reg_images() and grown_score > score
+            has_grown = (
+                grown.num_reg_images() > model.num_reg_images() and grown_score > score
+            )
             if has_grown:
                 model = grown
                 score = grown_score

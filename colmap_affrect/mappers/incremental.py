@@ -14,7 +14,11 @@ from colmap_affrect.colmap.native_options import resolve, set_values
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel
-from colmap_affrect.mappers.snapshots import SNAPSHOT_FRAMES, drop_old_snapshots, largest_snapshot
+from colmap_affrect.mappers.snapshots import (
+    SNAPSHOT_FRAMES,
+    drop_old_snapshots,
+    largest_snapshot,
+)
 from colmap_affrect.options import within
 
 FLAG = "--mapper-options"
@@ -65,7 +69,11 @@ class IncrementalMapper:
         self.options = options.changed(mapper_options=resolved)
 
     def map(
-        self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
+        self,
+        task: MappingTask,
+        output_path: Path,
+        random_seed: int,
+        show: Callable[[int], None],
     ) -> list[MappedModel]:
         """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
 
@@ -92,10 +100,14 @@ class IncrementalMapper:
             raise KeyboardInterrupt from error
         except (RuntimeError, ValueError) as error:
             reason = " ".join(str(error).split())
-            raise AffrectError(f"COLMAP's incremental mapper failed: {reason}") from error
+            raise AffrectError(
+                f"COLMAP's incremental mapper failed: {reason}"
+            ) from error
         return [MappedModel(model) for model in models]
 
-    def native(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:
+    def native(
+        self, task: MappingTask, random_seed: int
+    ) -> pycolmap.IncrementalPipelineOptions:
         """Translate the options into pycolmap's.
 
         Args:
@@ -122,7 +134,8 @@ class IncrementalMapper:
                 num_threads=1,
             ),
             triangulation=dict(
-                ignore_two_view_tracks=options.ignore_two_view_tracks, random_seed=random_seed
+                ignore_two_view_tracks=options.ignore_two_view_tracks,
+                random_seed=random_seed,
             ),
         )
         set_values(native, options.mapper_options)
@@ -140,7 +153,9 @@ class _PipelineRun:
     database_path: Path
     num_registered: int = 0
 
-    def models(self, token: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
+    def models(
+        self, token: pycolmap.CancellationToken
+    ) -> list[pycolmap.Reconstruction]:
         """Map from scratch, resume from a snapshot, or extend the model of the task."""
         snapshots = self.task.snapshot_path
         if self.task.extend:
@@ -185,7 +200,11 @@ class _PipelineRun:
             start.write(folder)
             frames = {image.frame_id for image in existing.images}
             # COLMAP drops a model of which no pair ties some images to others.
-            models = [model for model in self._map(token, folder) if frames <= set(model.frames)]
+            models = [
+                model
+                for model in self._map(token, folder)
+                if frames <= set(model.frames)
+            ]
         if not models:
             models = [start]
         for model in models:
@@ -195,7 +214,9 @@ class _PipelineRun:
     def _map(
         self, token: pycolmap.CancellationToken, input_path: Path | None = None
     ) -> list[pycolmap.Reconstruction]:
-        num_initial = 0 if input_path else 2  # pycolmap also calls it for a resumed model
+        num_initial = (
+            0 if input_path else 2
+        )  # pycolmap also calls it for a resumed model
         models = pycolmap.incremental_mapping(
             self.database_path,
             self.task.colors_path,

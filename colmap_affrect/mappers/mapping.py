@@ -14,7 +14,12 @@ from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact, write_model
+from colmap_affrect.colmap.model_files import (
+    SUMMARY,
+    file_digests,
+    require_intact,
+    write_model,
+)
 from colmap_affrect.errors import WorkspaceError, damage, made_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.focal_observability import focal_growths
@@ -99,8 +104,12 @@ class _ScoredModel:
     """A model and the confidence in its images."""
 
     mapped: MappedModel
-    confidences: dict[str, Confidence] = field(default_factory=dict)  # of its images, by name
-    taken_out: dict[str, Confidence] = field(default_factory=dict)  # of images that it has lost
+    confidences: dict[str, Confidence] = field(
+        default_factory=dict
+    )  # of its images, by name
+    taken_out: dict[str, Confidence] = field(
+        default_factory=dict
+    )  # of images that it has lost
 
     @property
     def size(self) -> tuple[int, int]:
@@ -128,7 +137,10 @@ class _Progress:
 
 
 def map_database(
-    mapper: Mapper, task: MappingTask, sparse_path: Path, next_image: Callable[[int], None]
+    mapper: Mapper,
+    task: MappingTask,
+    sparse_path: Path,
+    next_image: Callable[[int], None],
 ) -> list[ModelSummary]:
     """Map a verified database and write the models to ``sparse_path``/0, /1, ..., largest first.
 
@@ -278,7 +290,9 @@ def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
     graph = graph_of(task, MIN_NUM_MATCHES)
     confidences = scored.confidences
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
-    focals_px = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
+    focals_px = {
+        i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images
+    }
     bridges = scored.mapped.bridges
     everybody = {**scored.taken_out, **confidences}
     probabilities = {}

@@ -18,7 +18,13 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import seen_points
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.mappers.camera_priors import CameraPrior
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of, poses_of
+from colmap_affrect.mappers.pair_graph import (
+    Ids,
+    PairGraph,
+    VerifiedPair,
+    cameras_of,
+    poses_of,
+)
 
 
 @dataclass(frozen=True)
@@ -30,12 +36,18 @@ class Beta:
 
 
 # Judged on models of the benchmark scenes whose poses are known, right and wrong.
-GRID = 8  # cells on a side of an image: features in one cell err together and count once
-RIGHT_PAIR = Beta(14.0, 1.0)  # inliers of a pair with right poses, 93 per cent on average
+GRID = (
+    8  # cells on a side of an image: features in one cell err together and count once
+)
+RIGHT_PAIR = Beta(
+    14.0, 1.0
+)  # inliers of a pair with right poses, 93 per cent on average
 RIGHT_TRACKS = Beta(6.0, 2.0)  # features of three images of a right model, 75 per cent
 CHANCE = Beta(2.0, 4.0)  # both of wrong models, a third
 WRONG_PAIR = 0.05  # probability that a verified pair is wrong
-MIN_SCORE_GAIN = 3.0  # log-likelihood ratio, twenty to one, by which a score is clearly higher
+MIN_SCORE_GAIN = (
+    3.0  # log-likelihood ratio, twenty to one, by which a score is clearly higher
+)
 
 
 @dataclass(frozen=True)
@@ -71,7 +83,9 @@ class ModelScorer:
         these features whose point three images see, or more.
         """
         num_partners = self._num_partners(model)
-        points = {image_id: seen_points(model.images[image_id]) for image_id in num_partners}
+        points = {
+            image_id: seen_points(model.images[image_id]) for image_id in num_partners
+        }
         long_tracks = _seen_by_three(points)
         log_ratios = {}
         for image_id, number in num_partners.items():
@@ -87,14 +101,18 @@ class ModelScorer:
         """Return how many cells hold inliers, in that image of a pair which has fewer."""
         if pair.ids not in self._num_cells:
             both = zip(pair.ids, self.graph.points(pair), strict=True)
-            counts = [num_occupied_cells(self.graph.cameras[i], points) for i, points in both]
+            counts = [
+                num_occupied_cells(self.graph.cameras[i], points) for i, points in both
+            ]
             self._num_cells[pair.ids] = min(counts)
         return self._num_cells[pair.ids]
 
     def _num_partners(self, model: pycolmap.Reconstruction) -> dict[int, Indices]:
         """Return in how many other images of the model each feature is matched, by image id."""
         inside = self.graph.keypoints.keys() & set(model.reg_image_ids())
-        found = {i: np.zeros(len(self.graph.keypoints[i]), np.int64) for i in sorted(inside)}
+        found = {
+            i: np.zeros(len(self.graph.keypoints[i]), np.int64) for i in sorted(inside)
+        }
         for pair in self.graph.pairs_inside(found):
             for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
                 found[image_id][np.unique(features)] += 1
@@ -119,7 +137,9 @@ def pair_log_ratio(num_agreeing: float, num: float) -> float:
 
 def _seen_by_three(points: Mapping[int, Indices]) -> Indices:
     """Return the ids of the points that three images or more see, of those by keypoint."""
-    ids, num_observations = np.unique(np.concatenate([*points.values(), [-1]]), return_counts=True)
+    ids, num_observations = np.unique(
+        np.concatenate([*points.values(), [-1]]), return_counts=True
+    )
     return np.asarray(ids[(num_observations > 2) & (ids >= 0)])
 
 

@@ -15,12 +15,20 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.model_files import Pose, relative_pose
-from colmap_affrect.colmap.two_views import Cameras, decomposed_homography, homography_matrix
+from colmap_affrect.colmap.two_views import (
+    Cameras,
+    decomposed_homography,
+    homography_matrix,
+)
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
 from colmap_affrect.geometry.epipolar import sampson_errors
 from colmap_affrect.geometry.parallax import Size
-from colmap_affrect.geometry.two_views import Depths, essential_matrix, triangulated_depths
+from colmap_affrect.geometry.two_views import (
+    Depths,
+    essential_matrix,
+    triangulated_depths,
+)
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.thinning import matches_of_best_tracks
 
@@ -36,7 +44,9 @@ MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
 MAX_MATCHES = 500  # inliers of a pair that are sampled for agreement and relative poses
 MAX_TRIALS = 1000  # of RANSAC, for a relative pose
-MAX_PAIRS_OF_IMAGE = 15  # the strongest of each image that models are scored by (judged)
+MAX_PAIRS_OF_IMAGE = (
+    15  # the strongest of each image that models are scored by (judged)
+)
 MIN_NUM_MATCHES = 15  # inliers of a pair; COLMAP's min_num_matches
 MIN_SHARE = 0.5  # of the inliers of a pair: fewer that agree contradict poses
 
@@ -58,7 +68,9 @@ class RelativePose:
     """A relative pose of a pair that its inliers allow."""
 
     pose: Pose  # cam2_from_cam1, with a translation of length 1
-    matches: Indices  # (M, 2) features that agree, with enough parallax to know their depth
+    matches: (
+        Indices  # (M, 2) features that agree, with enough parallax to know their depth
+    )
     depths: tuple[Array, Array]  # of these in both cameras, twice (M,), all positive
 
 
@@ -90,7 +102,9 @@ class PairGraph:
     pairs: Pairs  # sorted by ids
     weak: Pairs  # that are not among the strongest, and in the cache only
     min_num_matches: int  # pairs with fewer inliers are left out
-    _agreements: dict[Ids, _KnownAgreement] = field(default_factory=dict, init=False, repr=False)
+    _agreements: dict[Ids, _KnownAgreement] = field(
+        default_factory=dict, init=False, repr=False
+    )
     """The last agreement of each pair: models are looked at several times."""
 
     @classmethod
@@ -105,7 +119,9 @@ class PairGraph:
             return cls.of(database, min_num_matches)
 
     @classmethod
-    def of(cls, database: pycolmap.Database, min_num_matches: int = MIN_NUM_MATCHES) -> Self:
+    def of(
+        cls, database: pycolmap.Database, min_num_matches: int = MIN_NUM_MATCHES
+    ) -> Self:
         """Read the same from a database that is open."""
         options = pycolmap.DatabaseCacheOptions(
             min_num_matches=min_num_matches, load_all_images=True
@@ -173,7 +189,9 @@ class PairGraph:
             thin.append(replace(pair, matches=pair.matches[kept]))
         return self._with(thin, self.cache)
 
-    def _with(self, verified: Iterable[VerifiedPair], cache: pycolmap.DatabaseCache) -> Self:
+    def _with(
+        self, verified: Iterable[VerifiedPair], cache: pycolmap.DatabaseCache
+    ) -> Self:
         """Return a graph of other pairs, with the cameras and images of a cache."""
         kept = [pair for pair in verified if len(pair.matches) >= self.min_num_matches]
         new = _empty_copy(cache, {})
@@ -212,7 +230,9 @@ class PairGraph:
         inside = set(image_ids)
         return [pair for pair in self.pairs if inside.issuperset(pair.ids)]
 
-    def agreement(self, pair: VerifiedPair, poses: PoseById, cameras: CameraById) -> float:
+    def agreement(
+        self, pair: VerifiedPair, poses: PoseById, cameras: CameraById
+    ) -> float:
         """Return the share of the inliers of a pair that agree with poses, from a sample of them.
 
         Args:
@@ -235,7 +255,9 @@ class PairGraph:
         """Return the pairs that contradict a model, or have an image that it has not."""
         inside = set(model.reg_image_ids())
         against = self.contradicted(model)
-        return [p for p in self.pairs if p.ids in against or not inside.issuperset(p.ids)]
+        return [
+            p for p in self.pairs if p.ids in against or not inside.issuperset(p.ids)
+        ]
 
     def contradicted(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
         """Return the pairs most of whose inliers disagree with a model that has both images."""
@@ -275,7 +297,9 @@ class PairGraph:
         self, pair: VerifiedPair, cameras: Cameras, random_seed: int
     ) -> list[Pose]:
         options = pycolmap.RANSACOptions(
-            max_error=MAX_ERROR_PX, max_num_trials=MAX_TRIALS, random_seed=max(random_seed, 0)
+            max_error=MAX_ERROR_PX,
+            max_num_trials=MAX_TRIALS,
+            random_seed=max(random_seed, 0),
         )
         candidates = list[Pose]()
         # Not by a two-view geometry, which where a fundamental matrix has more inliers is that.
@@ -355,7 +379,9 @@ def _agreement(pose: Pose, cameras: Cameras, points: tuple[Array, Array]) -> _Ag
     return _Agreement((errors <= tolerance) & is_possible, depths)
 
 
-def _read_pairs(database: pycolmap.Database, min_num_matches: int) -> list[VerifiedPair]:
+def _read_pairs(
+    database: pycolmap.Database, min_num_matches: int
+) -> list[VerifiedPair]:
     verified = list[VerifiedPair]()
     for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
         matches = np.asarray(geometry.inlier_matches, np.int64)

@@ -19,16 +19,26 @@ from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, fea
 from colmap_affrect.project.reasons import Doubt
 
 # Shapes of the terms, judged where the share of right photographs no longer changes.
-LOG_RATIO_SCALE = 3.0  # log-likelihood ratio, from which on more counts by its logarithm only
+LOG_RATIO_SCALE = (
+    3.0  # log-likelihood ratio, from which on more counts by its logarithm only
+)
 MAX_THREE_VIEW_POINTS = 300  # more points make no photograph surer
-USUAL_ROTATION_RATIO = 0.5  # share of matches that a rotation may explain from any two positions
-MAX_LOG_SPREAD = 0.5  # of focal lengths: farther apart they are no surer parts of others
+USUAL_ROTATION_RATIO = (
+    0.5  # share of matches that a rotation may explain from any two positions
+)
+MAX_LOG_SPREAD = (
+    0.5  # of focal lengths: farther apart they are no surer parts of others
+)
 # A bridge edge between two components may be of two scenes, found by chance among all pairs.
 CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (judged)
-CHANCE_SCALE = 10.0  # inliers more that make the former less likely by a factor of e (judged)
+CHANCE_SCALE = (
+    10.0  # inliers more that make the former less likely by a factor of e (judged)
+)
 MAX_ERROR_DEG = 5.0  # of poses that count as right, in BENCHMARKS and in the fit
 MIN_SIGMA_DEG = 1e-3  # of directions; they are divided by
-MIN_LOSS = 0.7  # of the log odds: what takes less, half of the odds, is no reason to doubt
+MIN_LOSS = (
+    0.7  # of the log odds: what takes less, half of the odds, is no reason to doubt
+)
 NUM_REASONS = 2  # that are said of a photograph
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")
@@ -59,7 +69,9 @@ def _agreement(features: ReliabilityFeatures) -> float:
 
 
 def _agreement_reason(features: ReliabilityFeatures) -> Doubt:
-    return Doubt("little_agreement", {"percent": math.floor(100.0 * features.agreement)})
+    return Doubt(
+        "little_agreement", {"percent": math.floor(100.0 * features.agreement)}
+    )
 
 
 def _three_view_points(features: ReliabilityFeatures) -> float:
@@ -124,7 +136,11 @@ TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
     "mirrored copy": Term(_mirrored_copy, _mirrored_copy_reason),
     "focal spread": Term(_focal_spread, _focal_spread_reason),
 }
-OF_MATCHES = {"log-likelihood ratio", "agreement", "three-view points"}  # which more may mend
+OF_MATCHES = {
+    "log-likelihood ratio",
+    "agreement",
+    "three-view points",
+}  # which more may mend
 
 
 @dataclass(frozen=True)
@@ -195,11 +211,15 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
     for name, fitted in coefficients.terms.items():
         value = TERMS[name].value(features)
         log_odds += fitted.weight * value
-        loss = _Loss(fitted.weight * (fitted.usual - value), TERMS[name].reason(features))
+        loss = _Loss(
+            fitted.weight * (fitted.usual - value), TERMS[name].reason(features)
+        )
         losses.append(loss)
         if name in OF_MATCHES:
             mendable += max(0.0, loss.log_odds)
-    probability = _probability(log_odds) * share_of_directions / (1.0 + odds_of_two_scenes)
+    probability = (
+        _probability(log_odds) * share_of_directions / (1.0 + odds_of_two_scenes)
+    )
     with_matches = _probability(log_odds + mendable) * share_of_directions
     return Confidence(probability, _main_reasons(losses), with_matches - probability)
 
@@ -210,7 +230,9 @@ def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
     if features.bridge_edge:
         odds = _odds_of_two_scenes(features)
         num_inliers = features.num_bridge_inliers
-        edge = Doubt("bridge_edge", {"num_inliers": num_inliers, "pair": features.bridge_edge})
+        edge = Doubt(
+            "bridge_edge", {"num_inliers": num_inliers, "pair": features.bridge_edge}
+        )
         losses.append(_Loss(math.log1p(odds), edge))
     if features.direction_sigma_deg:
         share = _share_of_directions(features)

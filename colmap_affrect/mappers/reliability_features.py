@@ -31,19 +31,27 @@ from colmap_affrect.mappers.pair_graph import (
     sampling_step,
 )
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
-from colmap_affrect.mappers.tie_points import TiePoints, tie_point_log_odds, tie_points_of
+from colmap_affrect.mappers.tie_points import (
+    TiePoints,
+    tie_point_log_odds,
+    tie_points_of,
+)
 
 # The terms of the regression are fitted to features that are measured with these numbers, which
 # are judged on the benchmark scenes; after a change fit again.
 MIN_TOLD = 0.03
 """Growth of the cost with another focal length, from which on a model tells the focal length: of
 parts of photographs it is 0.15."""
-NUM_ROTATION_PAIRS = 4  # strongest pairs of a frame that are compared with a pure rotation
+NUM_ROTATION_PAIRS = (
+    4  # strongest pairs of a frame that are compared with a pure rotation
+)
 MAX_ROTATION_PAIRS = 300  # the same of a model, to save time
 MIN_MIRRORED_SHARE = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
 images a tenth by chance."""
-MAX_MIRRORED_PAIRS = 1000  # looked at, all of 45 photographs; of more some copies are missed
+MAX_MIRRORED_PAIRS = (
+    1000  # looked at, all of 45 photographs; of more some copies are missed
+)
 MIN_FOCAL_PX = 1e-9  # focal lengths are divided by
 
 
@@ -59,10 +67,14 @@ class ReliabilityFeatures:
     focal_growth: float
     """Part by which the cost of adjustment grows with another focal length; 1 of a known one."""
     focal_px: float  # of its camera
-    fitting_focal_px: float  # what fits, where the focal length that the user gave does not; else 0
+    fitting_focal_px: (
+        float  # what fits, where the focal length that the user gave does not; else 0
+    )
     pure_rotation_ratio: float
     """Share of the matches without parallax, of the strongest pairs of its frame with others."""
-    mirrored_original: str  # name of the photograph that it may be a mirrored copy of, or empty
+    mirrored_original: (
+        str  # name of the photograph that it may be a mirrored copy of, or empty
+    )
     focal_spread: float
     """Longest by shortest focal length of the photographs of its size, of those that only the model
     tells: parts of photographs have longer ones, and their middle is elsewhere."""
@@ -90,9 +102,13 @@ class _ModelContext:
         self.scorer = ModelScorer(self.graph, self.priors)
         self.pairs = self.graph.pairs_inside(self.poses)
         self.agreements: dict[Ids, float] = {}
-        self.pairs_of: dict[int, list[VerifiedPair]] = {i: [] for i in sorted(self.poses)}
+        self.pairs_of: dict[int, list[VerifiedPair]] = {
+            i: [] for i in sorted(self.poses)
+        }
         for pair in self.pairs:
-            self.agreements[pair.ids] = self.graph.agreement(pair, self.poses, self.cameras)
+            self.agreements[pair.ids] = self.graph.agreement(
+                pair, self.poses, self.cameras
+            )
             for image_id in pair.ids:
                 self.pairs_of[image_id].append(pair)
         self.pairs_of_frames = self._pairs_of_frames()
@@ -104,7 +120,9 @@ class _ModelContext:
 
     def _pairs_of_frames(self) -> dict[int, list[VerifiedPair]]:
         """Return the pairs of each frame with others: poses inside a rig hold each other."""
-        found: dict[int, list[VerifiedPair]] = {self.frame_of(i): [] for i in self.pairs_of}
+        found: dict[int, list[VerifiedPair]] = {
+            self.frame_of(i): [] for i in self.pairs_of
+        }
         for image_id, pairs in self.pairs_of.items():
             for pair in pairs:
                 first, second = pair.ids
@@ -146,7 +164,9 @@ def features_of(
         camera = context.cameras[image_id]
         key = camera.camera_id
         focal_px = float(camera.mean_focal_length())
-        log_ratio = _pair_log_ratio(context, image_id) + track_log_ratios.get(image_id, 0.0)
+        log_ratio = _pair_log_ratio(context, image_id) + track_log_ratios.get(
+            image_id, 0.0
+        )
         bridge = bridges.get(image_id)
         found[names[image_id]] = ReliabilityFeatures(
             log_likelihood_ratio=log_ratio - context.priors[key].cost_of(camera),
@@ -155,8 +175,12 @@ def features_of(
             focal_growth=growths.get(key, 1.0),
             focal_px=focal_px,
             fitting_focal_px=fitting_focals_px.get(key, 0.0),
-            pure_rotation_ratio=_pure_rotation_ratio(context, image_id, rotation_ratios),
-            mirrored_original=names[originals[image_id]] if image_id in originals else "",
+            pure_rotation_ratio=_pure_rotation_ratio(
+                context, image_id, rotation_ratios
+            ),
+            mirrored_original=names[originals[image_id]]
+            if image_id in originals
+            else "",
             focal_spread=focal_spreads.get((camera.width, camera.height), 1.0),
             tie_point_log_odds=log_odds.get(image_id, 0.0),
             bridge_edge=" - ".join(names[i] for i in bridge.ids) if bridge else "",
@@ -221,12 +245,16 @@ def _pure_rotation_ratio(
     return float(np.mean(known)) if known else 0.0
 
 
-def _direction_sigmas_deg(context: _ModelContext, tie_points: TiePoints) -> dict[int, float]:
+def _direction_sigmas_deg(
+    context: _ModelContext, tie_points: TiePoints
+) -> dict[int, float]:
     """Return how uncertain the directions from each image to others are, with its priors."""
     recorded = context.priors.keys() & context.task.cameras.keys()
     fixed = frozenset(key for key in recorded if context.task.cameras[key].is_fixed)
     refining = pycolmap.BundleAdjustmentOptions()
-    adjuster = Adjuster(context.priors, NOISE_PX, refining, fixed, tie_points=tie_points)
+    adjuster = Adjuster(
+        context.priors, NOISE_PX, refining, fixed, tie_points=tie_points
+    )
     return direction_sigmas_deg(context.model, adjuster)
 
 
@@ -266,7 +294,9 @@ def _mirrored_pairs(context: _ModelContext) -> list[Ids]:
     return found
 
 
-def _focal_spreads(context: _ModelContext, growths: Mapping[int, float]) -> dict[Size, float]:
+def _focal_spreads(
+    context: _ModelContext, growths: Mapping[int, float]
+) -> dict[Size, float]:
     """Return the longest by the shortest focal length that the model tells, by image size."""
     focals_px: defaultdict[Size, list[float]] = defaultdict(list)
     for key, camera in context.used_cameras.items():
@@ -286,7 +316,9 @@ def _bridge_edges(context: _ModelContext) -> dict[int, VerifiedPair]:
         if context.agreements[pair.ids] >= MIN_SHARE:
             agreeing[pair.ids] = pair
     found = dict[int, VerifiedPair]()
-    ranked = sorted(lone_ties(agreeing), key=lambda ids: (-len(agreeing[ids].matches), ids))
+    ranked = sorted(
+        lone_ties(agreeing), key=lambda ids: (-len(agreeing[ids].matches), ids)
+    )
     for ids in ranked:
         for image_id in _smaller_sides(agreeing.keys() - {ids}, ids):
             found[image_id] = agreeing[ids]

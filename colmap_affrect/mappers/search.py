@@ -89,7 +89,9 @@ class Search:
             grower.finish(mapped.reconstruction)
         return best.models
 
-    def extend_models(self, graph: PairGraph, known: Sequence[MappedModel]) -> list[MappedModel]:
+    def extend_models(
+        self, graph: PairGraph, known: Sequence[MappedModel]
+    ) -> list[MappedModel]:
         """Return the best models of a graph of which some models are known already.
 
         Focal lengths stay near those of the first one. Bridges begin at the known models, too;
@@ -111,7 +113,9 @@ class Search:
             grower.finish(mapped.reconstruction)
         return found
 
-    def with_bridges(self, graph: PairGraph, models: Sequence[MappedModel]) -> list[MappedModel]:
+    def with_bridges(
+        self, graph: PairGraph, models: Sequence[MappedModel]
+    ) -> list[MappedModel]:
         """Register images by bridges from the best models.
 
         Args:
@@ -148,7 +152,9 @@ class Search:
         """
         if not graph.most_connected.issubset(model.reg_image_ids()):
             return False
-        return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(model)
+        return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(
+            model
+        )
 
     @cached_property
     def unknown(self) -> dict[int, CameraPrior]:
@@ -175,14 +181,18 @@ class Search:
         if self.num_starts:
             for number in range(1, max(numbers, default=1)):
                 search = self._with_start(number)
-                searches.append(search if self._shared else replace(search, num_starts=0))
+                searches.append(
+                    search if self._shared else replace(search, num_starts=0)
+                )
         return searches
 
     def _with_start(self, number: int) -> Self:
         """Return a search whose unknown focal lengths begin at one of their starts, or the last."""
         priors = {}
         for key, prior in self.unknown.items():
-            sigma = min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma
+            sigma = (
+                min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma
+            )
             priors[key] = replace(
                 prior,
                 focal_px=prior.starts_px[min(number, len(prior.starts_px) - 1)],
@@ -194,7 +204,9 @@ class Search:
         """Return a search that keeps unknown focal lengths near those of a model."""
         priors = {}
         for key, focal_px in self._unknown_focals(model).items():
-            priors[key] = replace(self.unknown[key], focal_px=focal_px, sigma=SHARED_SIGMA)
+            priors[key] = replace(
+                self.unknown[key], focal_px=focal_px, sigma=SHARED_SIGMA
+            )
         return self._with_priors(priors)
 
     def _with_priors(self, priors: Mapping[int, CameraPrior]) -> Self:
@@ -226,19 +238,27 @@ class Search:
     def _unknown_focals(self, model: pycolmap.Reconstruction) -> dict[int, float]:
         """Return the focal lengths of the used cameras whose prior is unknown, by camera id."""
         used = {camera.camera_id: camera for camera in cameras_of(model).values()}
-        return {k: used[k].mean_focal_length() for k in used.keys() & self.unknown.keys()}
+        return {
+            k: used[k].mean_focal_length() for k in used.keys() & self.unknown.keys()
+        }
 
-    def _grown(self, graph: PairGraph, first: Sequence[VerifiedPair]) -> list[MappedModel]:
+    def _grown(
+        self, graph: PairGraph, first: Sequence[VerifiedPair]
+    ) -> list[MappedModel]:
         """Return models of different images from first pairs, the highest score first."""
         models: dict[frozenset[int], MappedModel] = {}
         scores: dict[frozenset[int], float] = {}
         best_score = 0.0
         num_in_vain = 0
         pairs = first_pairs(first, graph)
-        with closing(_grow_in_order(self.grower(graph), [pair.ids for pair in pairs])) as grown:
+        with closing(
+            _grow_in_order(self.grower(graph), [pair.ids for pair in pairs])
+        ) as grown:
             for model in grown:
                 score = self.scorer.score(model)
-                num_in_vain = 0 if score > best_score + MIN_SCORE_GAIN else num_in_vain + 1
+                num_in_vain = (
+                    0 if score > best_score + MIN_SCORE_GAIN else num_in_vain + 1
+                )
                 best_score = max(best_score, score)
                 images = frozenset(model.reg_image_ids())
                 if images not in models or score > scores[images]:
@@ -249,7 +269,10 @@ class Search:
                 is_complete = len(images) == len(graph.keypoints)
                 if is_complete and self.scorer.is_confirmed(model):
                     break
-        return [models[images] for images in sorted(models, key=lambda images: -scores[images])]
+        return [
+            models[images]
+            for images in sorted(models, key=lambda images: -scores[images])
+        ]
 
 
 def first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[VerifiedPair]:

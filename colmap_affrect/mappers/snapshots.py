@@ -18,7 +18,9 @@ logger = logging.getLogger(__name__)
 SNAPSHOT_FRAMES = 100
 """Images between two snapshots. A model of so many images is kept whatever comes after it, so that
 mapping can go on from a snapshot of it."""
-NUM_KEPT = 2  # a snapshot may be incomplete when a run is killed; the one before is complete
+NUM_KEPT = (
+    2  # a snapshot may be incomplete when a run is killed; the one before is complete
+)
 
 
 @contextmanager
@@ -40,7 +42,9 @@ def with_snapshots(
         yield task
         return
     given = {str(key): record.given for key, record in task.cameras.items()}
-    own = folder / digest_of([rows_digest(task.database_path), options.to_mapping(), given])
+    own = folder / digest_of(
+        [rows_digest(task.database_path), options.to_mapping(), given]
+    )
     remove_own(path for path in folder.glob("*") if path != own)
     own.mkdir(parents=True, exist_ok=True)
     try:
@@ -70,6 +74,8 @@ def largest_snapshot(folder: Path) -> Path | None:
 def drop_old_snapshots(folder: Path) -> None:
     """Remove all but the newest snapshots of the largest models."""
     older = sorted(path for path in folder.iterdir() if path.is_dir())[:-1]
-    complete = [path for path in older if (path / "frames.bin").exists()]  # the newest may be not
+    complete = [
+        path for path in older if (path / "frames.bin").exists()
+    ]  # the newest may be not
     complete.sort(key=lambda path: ((path / "frames.bin").stat().st_size, path.name))
     remove_own(complete[: -(NUM_KEPT - 1)])

@@ -24,7 +24,9 @@ from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
 # What made a model, in the words of a report.
-MEASURED_PAIRS = "with the pairs of measured frames"  # others also verify sides that look the same
+MEASURED_PAIRS = (
+    "with the pairs of measured frames"  # others also verify sides that look the same
+)
 ALL_PAIRS = "with all pairs"
 SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
@@ -32,7 +34,9 @@ OWN_CAMERAS = "with a camera for each photograph"
 COLMAP_MODEL = "from COLMAP's model"
 
 NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from (judged)
-FORWARD_MOTION = "mapper.init_max_forward_motion"  # option of pycolmap that users may give
+FORWARD_MOTION = (
+    "mapper.init_max_forward_motion"  # option of pycolmap that users may give
+)
 LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
 
 logger = logging.getLogger(__name__)
@@ -57,7 +61,11 @@ class SparseMapper(IncrementalMapper):
     options: SparseOptions
 
     def map(
-        self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
+        self,
+        task: MappingTask,
+        output_path: Path,
+        random_seed: int,
+        show: Callable[[int], None],
     ) -> list[MappedModel]:
         """Map once, as :class:`colmap_affrect.mappers.base.Mapper` says.
 
@@ -85,7 +93,9 @@ class SparseMapper(IncrementalMapper):
         is_small = len(graph.keypoints) < LARGE and not task.extend
         if is_small:
             if FORWARD_MOTION not in self.options.mapper_options:
-                native.mapper.init_max_forward_motion = 1.0  # the score decides on such pairs
+                native.mapper.init_max_forward_motion = (
+                    1.0  # the score decides on such pairs
+                )
             return self._map_small(task, graph, native, output_path, show_or_stop)
         search = self._search(task, graph, native, show_or_stop)
         search = replace(search, num_starts=1)
@@ -161,7 +171,9 @@ class SparseMapper(IncrementalMapper):
         if task.extend:
             task.extend.constrain(native)
             if not task.extend.refine:
-                constant_frames = frozenset(image.frame_id for image in task.extend.images)
+                constant_frames = frozenset(
+                    image.frame_id for image in task.extend.images
+                )
         priors = self._priors(task, graph, native)
         adjuster = Adjuster(
             priors,
@@ -171,15 +183,23 @@ class SparseMapper(IncrementalMapper):
             constant_frames,
             tie_points_of(task, graph),
         )
-        return Search(adjuster, ModelScorer(graph, priors), native, self.options.num_seeds, show)
+        return Search(
+            adjuster, ModelScorer(graph, priors), native, self.options.num_seeds, show
+        )
 
     def _priors(
-        self, task: MappingTask, graph: PairGraph, native: pycolmap.IncrementalPipelineOptions
+        self,
+        task: MappingTask,
+        graph: PairGraph,
+        native: pycolmap.IncrementalPipelineOptions,
     ) -> dict[int, CameraPrior]:
         """Return the priors of the focal lengths, by camera id."""
         if not native.ba_refine_focal_length:  # then they are those of the database
             used = {camera.camera_id: camera for camera in graph.cameras.values()}
-            return {k: CameraPrior(float(c.mean_focal_length()), 0.0) for k, c in used.items()}
+            return {
+                k: CameraPrior(float(c.mean_focal_length()), 0.0)
+                for k, c in used.items()
+            }
         priors = camera_priors(graph.cameras.values(), task.cameras, task.lines)
         if not self.options.keep_given_intrinsics:
             for key, prior in priors.items():
@@ -191,13 +211,18 @@ class SparseMapper(IncrementalMapper):
         }
 
     def _constant_cameras(
-        self, task: MappingTask, graph: PairGraph, native: pycolmap.IncrementalPipelineOptions
+        self,
+        task: MappingTask,
+        graph: PairGraph,
+        native: pycolmap.IncrementalPipelineOptions,
     ) -> frozenset[int]:
         """Return the ids of the cameras of which nothing is refined."""
         constant = set[int]()
         if self.options.keep_given_intrinsics:
             constant |= {key for key, record in task.cameras.items() if record.is_fixed}
-        refines_others = native.ba_refine_extra_params or native.ba_refine_principal_point
+        refines_others = (
+            native.ba_refine_extra_params or native.ba_refine_principal_point
+        )
         if not native.ba_refine_focal_length and not refines_others:
             constant |= {camera.camera_id for camera in graph.cameras.values()}
         if task.extend:
@@ -277,7 +302,9 @@ class _HypothesisTest:
             return []
         return self.search.extend_models(graph, self.best)
 
-    def _take(self, hypothesis: _Hypothesis, models: Sequence[MappedModel], score: float) -> None:
+    def _take(
+        self, hypothesis: _Hypothesis, models: Sequence[MappedModel], score: float
+    ) -> None:
         before = self.best[0].moves if self.best else ()
         moves = _without_duplicates((*before, hypothesis.name, *models[0].moves))
         self.best = [replace(mapped, moves=moves) for mapped in models]
@@ -315,7 +342,9 @@ class _HypothesisTest:
         model = _with_own_cameras(self.own, graph, self.search, first.reconstruction)
         if model is None or self.own.scorer.score(model) <= self.score + MIN_SCORE_GAIN:
             return
-        changed = replace(first, reconstruction=model, moves=(*first.moves, OWN_CAMERAS))
+        changed = replace(
+            first, reconstruction=model, moves=(*first.moves, OWN_CAMERAS)
+        )
         self.best = with_own_images([changed, *self.best[1:]])
         self.search = self.own
         self.own = None
@@ -331,7 +360,9 @@ def _extract_colors(
         model.extract_colors_for_all_images(task.image_path)
 
 
-def _joined_by_tie_points(search: Search, models: Sequence[MappedModel]) -> list[MappedModel]:
+def _joined_by_tie_points(
+    search: Search, models: Sequence[MappedModel]
+) -> list[MappedModel]:
     grower = search.grower(search.graph)
     return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 

@@ -62,7 +62,9 @@ class TieJoiner:
         """
         if not self.points.keypoints:
             return list(models)
-        left = sorted(models, key=lambda mapped: -mapped.reconstruction.num_reg_images())
+        left = sorted(
+            models, key=lambda mapped: -mapped.reconstruction.num_reg_images()
+        )
         joined = list[MappedModel]()
         while left:
             mapped = left.pop(0)
@@ -89,7 +91,9 @@ class TieJoiner:
         bridges = BridgeFinder(self.grower.graph, self.grower.native.random_seed)
         return register_bridges(registered, bridges, self.grower, self.scorer)
 
-    def _next_images(self, mapped: MappedModel, left: Sequence[MappedModel]) -> _NewImages | None:
+    def _next_images(
+        self, mapped: MappedModel, left: Sequence[MappedModel]
+    ) -> _NewImages | None:
         """Return the next images that tie points register, those of whole models first."""
         model = mapped.reconstruction
         others = [other.reconstruction for other in left]
@@ -109,7 +113,9 @@ class TieJoiner:
             if image.image_id not in registered:
                 found = self._resected(image, model, positions)
                 if found:
-                    yield _NewImages({image.image_id: found.pose}, {image.image_id: found.camera})
+                    yield _NewImages(
+                        {image.image_id: found.pose}, {image.image_id: found.camera}
+                    )
 
     def _aligned(
         self, other: pycolmap.Reconstruction, positions: Mapping[str, Array]
@@ -177,7 +183,12 @@ class TieJoiner:
         return best
 
     def _resection(
-        self, points2d: Array, points3d: Array, camera: pycolmap.Camera, *, refine_focal: bool
+        self,
+        points2d: Array,
+        points3d: Array,
+        camera: pycolmap.Camera,
+        *,
+        refine_focal: bool,
     ) -> _Resection | None:
         """Estimate a pose.
 
@@ -190,7 +201,9 @@ class TieJoiner:
         Returns:
             Pose and camera; None if too few points agree.
         """
-        estimation = pycolmap.AbsolutePoseEstimationOptions(ransac=self._ransac(AGREEING_PX))
+        estimation = pycolmap.AbsolutePoseEstimationOptions(
+            ransac=self._ransac(AGREEING_PX)
+        )
         refinement = pycolmap.AbsolutePoseRefinementOptions(
             refine_focal_length=refine_focal, loss_function_scale=SIGMA_PX
         )

@@ -22,7 +22,9 @@ AGREEING_PX = 4.0 * SIGMA_PX  # residuals up to which a tie point agrees with a 
 # Shares of tie points that agree (judged).
 AGREES_IF_RIGHT = 0.9  # with right poses: some marks are wrong
 AGREES_BY_CHANCE = 0.05  # with wrong poses
-MIN_NUM_POINTS = 4  # that must agree to register an image: three always do, the others are the test
+MIN_NUM_POINTS = (
+    4  # that must agree to register an image: three always do, the others are the test
+)
 MAX_LOG_ODDS = 2.5
 """Of an image by its tie points. Measured: of images that six tie points alone register, twelve of
 thirteen are right."""
@@ -30,7 +32,9 @@ NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P)
 # A tie point that one image alone sees has the median depth of the points near its mark (judged).
 NEIGHBOR_RADIUS = 0.1  # of the longer side of the image
 NUM_NEIGHBORS = 5
-MAX_NUM_OBSERVED = 2_000  # of an image, among which neighbours are looked for, to save time
+MAX_NUM_OBSERVED = (
+    2_000  # of an image, among which neighbours are looked for, to save time
+)
 
 
 class ImageResidual(NamedTuple):
@@ -79,7 +83,9 @@ class TiePoints:
     def report(self, model: pycolmap.Reconstruction) -> tuple[Residual, ...]:
         """Return the residuals as a report has them, the worst first."""
         found = list[Residual]()
-        for residual in sorted(self.residuals(model), key=lambda residual: -residual.error_px):
+        for residual in sorted(
+            self.residuals(model), key=lambda residual: -residual.error_px
+        ):
             name = model.images[residual.image_id].name
             found.append(Residual(residual.point, name, round(residual.error_px, 2)))
         return tuple(found)
@@ -105,10 +111,15 @@ class TiePoints:
             for image_id, xy in marks.items():
                 others = {i: mark for i, mark in marks.items() if i != image_id}
                 position = triangulated(model, others)
-                if position is None or _max_error_px(model, others, position) > AGREEING_PX:
+                if (
+                    position is None
+                    or _max_error_px(model, others, position) > AGREEING_PX
+                ):
                     continue
                 num_points[image_id] += 1
-                num_far[image_id] += _error_px(model, image_id, xy, position) > AGREEING_PX
+                num_far[image_id] += (
+                    _error_px(model, image_id, xy, position) > AGREEING_PX
+                )
         found = list[int]()
         for image_id, num in num_far.items():
             if num >= max(MIN_NUM_POINTS, num_points[image_id] / 2):
@@ -193,7 +204,9 @@ def _replace_point(
     model.add_point3D(position, track)
 
 
-def _position(surroundings: "_Surroundings", marks: Mapping[int, Array]) -> Array | None:
+def _position(
+    surroundings: "_Surroundings", marks: Mapping[int, Array]
+) -> Array | None:
     """Return the position of a point with marks in some images, None where they do not tell it."""
     position = triangulated(surroundings.model, marks) if len(marks) > 1 else None
     if position is not None:
@@ -203,7 +216,9 @@ def _position(surroundings: "_Surroundings", marks: Mapping[int, Array]) -> Arra
     return surroundings.position(image_id, xy)
 
 
-def _error_px(model: pycolmap.Reconstruction, image_id: int, xy: Array, position: Array) -> float:
+def _error_px(
+    model: pycolmap.Reconstruction, image_id: int, xy: Array, position: Array
+) -> float:
     """Return a reprojection error, at most the diagonal of the image, also of points behind it."""
     image = model.images[image_id]
     camera = model.cameras[image.camera_id]
@@ -217,7 +232,9 @@ def _max_error_px(
     marks: Mapping[int, Array],
     position: Array,
 ) -> float:
-    return max(_error_px(model, image_id, xy, position) for image_id, xy in marks.items())
+    return max(
+        _error_px(model, image_id, xy, position) for image_id, xy in marks.items()
+    )
 
 
 @dataclass(frozen=True)

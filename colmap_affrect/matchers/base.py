@@ -38,7 +38,9 @@ class MatcherContext(NetworkContext):
     """What a matcher works with, beside its options."""
 
     device: str = "auto"  # as given by the user
-    num_comparisons: float = 0.0  # about how many pairs of features will be compared in all
+    num_comparisons: float = (
+        0.0  # about how many pairs of features will be compared in all
+    )
 
 
 @dataclass(frozen=True)
@@ -71,13 +73,19 @@ class Matches:
         if not np.issubdtype(indices.dtype, np.integer):
             return "indices that are no integers"
         if indices.shape != (len(scores), 2) or scores.ndim != 1:
-            return f"indices of shape {indices.shape} and scores of shape {scores.shape}"
+            return (
+                f"indices of shape {indices.shape} and scores of shape {scores.shape}"
+            )
         if (indices < 0).any() or (indices >= (num_first, num_second)).any():
             return "indices of features that there are not"
         rows, columns = indices.T
         if (np.diff(rows) <= 0).any() or len(np.unique(columns)) < len(columns):
             return "features that are matched twice, or not in order"
-        return "" if ((scores >= 0.0) & (scores <= 1.0)).all() else "scores that are not in [0, 1]"
+        return (
+            ""
+            if ((scores >= 0.0) & (scores <= 1.0)).all()
+            else "scores that are not in [0, 1]"
+        )
 
 
 class Matcher(Protocol):

@@ -28,7 +28,9 @@ HOMOGRAPHY_BANDS = 2.0
 never quite plane; judged."""
 GROUP_SIZE = 48
 """Features of image 1 compared at once: with more, products take longer, with fewer Python does."""
-SECOND_IS_OPPOSITE = -1.0  # cosine that stands in for a second neighbour where there is none
+SECOND_IS_OPPOSITE = (
+    -1.0
+)  # cosine that stands in for a second neighbour where there is none
 TINY = np.finfo(float).tiny
 
 
@@ -194,7 +196,9 @@ def _distinctive_rows(
     return np.asarray(rows[ratios < options.max_ratio])
 
 
-def _displaced_geometries(model: epipolar.PairModel, band_px: float) -> list[epipolar.PairModel]:
+def _displaced_geometries(
+    model: epipolar.PairModel, band_px: float
+) -> list[epipolar.PairModel]:
     """Return geometries whose points of image 2 are moved away: one of them has no true matches.
 
     They are moved across most epipolar lines. Of a homography they are moved along both axes: what
@@ -211,10 +215,14 @@ def _displaced_geometries(model: epipolar.PairModel, band_px: float) -> list[epi
         _, eigenvectors = np.linalg.eigh(normals.T @ normals)
         directions = eigenvectors[:, 1:].T
     displacements = DISPLACEMENT_BANDS * band_px * directions
-    return [replace(model, points=(points1, points2 + shift)) for shift in displacements]
+    return [
+        replace(model, points=(points1, points2 + shift)) for shift in displacements
+    ]
 
 
-def _allowed_groups(model: epipolar.PairModel, band_px: float) -> Iterator[tuple[Indices, Bools]]:
+def _allowed_groups(
+    model: epipolar.PairModel, band_px: float
+) -> Iterator[tuple[Indices, Bools]]:
     """Yield groups of features of image 1, and which features of image 2 they may match.
 
     The features of a group have similar epipolar lines or positions, so that they may match few.

@@ -24,7 +24,12 @@ from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.geometry.tilts import of_unit_area
-from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, MatcherOptions, Matches
+from colmap_affrect.matchers.base import (
+    ImageFeatures,
+    MatcherContext,
+    MatcherOptions,
+    Matches,
+)
 from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import one_openmp_thread
 
@@ -158,7 +163,10 @@ class LightGlue:
         is_on_cpu = self._device.type == "cpu"
         limited = one_openmp_thread() if is_on_cpu else self._alone_on_gpu()
         with torch.inference_mode(), limited:
-            batch = {"image0": self._on_device(first), "image1": self._on_device(second)}
+            batch = {
+                "image0": self._on_device(first),
+                "image1": self._on_device(second),
+            }
             output = self._network(batch)
             matched = output["matches"][0].cpu().numpy()
             scores = output["scores"][0].float().cpu().numpy()
@@ -180,7 +188,11 @@ class LightGlue:
         """
         from torch.nn.attention import SDPBackend, sdpa_kernel
 
-        kernels = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
+        kernels = [
+            SDPBackend.FLASH_ATTENTION,
+            SDPBackend.EFFICIENT_ATTENTION,
+            SDPBackend.MATH,
+        ]
         with self._gpu_lock, sdpa_kernel(kernels):
             yield
 
@@ -221,7 +233,9 @@ def kornia_name(name: str) -> str:
     return re.sub(r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1.", name)
 
 
-def network_inputs(features: LocalFeatures, image_size: tuple[int, int]) -> dict[str, Tensor]:
+def network_inputs(
+    features: LocalFeatures, image_size: tuple[int, int]
+) -> dict[str, Tensor]:
     """Return what the network reads of one view, in pixel-centre px as in training.
 
     The image has ``image_size``, (width, height) in px.
@@ -306,7 +320,9 @@ def _nearest(queries: Singles, descriptors: Singles) -> Indices:
     return np.concatenate(nearest)
 
 
-def merged_matches(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matches:
+def merged_matches(
+    parts: list[Matches], keypoints1: Array, keypoints2: Array
+) -> Matches:
     """Merge matches of several pairs of views: one to one, and one match at each position.
 
     Args:

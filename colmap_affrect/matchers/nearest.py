@@ -13,7 +13,11 @@ from typing import Annotated, Literal
 import numpy as np
 
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
-from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within, without_duplicates
+from colmap_affrect.geometry.neighbors import (
+    NeighborLists,
+    neighbors_within,
+    without_duplicates,
+)
 from colmap_affrect.matchers import nearest_8bit
 from colmap_affrect.matchers.base import (
     ImageFeatures,
@@ -142,7 +146,9 @@ def _nearest(
     ):
         found = _nearest_of_listed(queries, image2, listed)
         nearest[listed.rows], ratios[listed.rows], is_doubtful[listed.rows] = found
-    nearest[is_doubtful], ratios[is_doubtful] = _nearest_of_all(queries[is_doubtful], image2)
+    nearest[is_doubtful], ratios[is_doubtful] = _nearest_of_all(
+        queries[is_doubtful], image2
+    )
     return nearest, ratios
 
 
@@ -211,5 +217,7 @@ def _nearest_of_all(queries: Singles, image: MatchableImage) -> tuple[Indices, S
         best_cosines = cosines[np.arange(len(chunk)), best]
         cosines[image.rivals.of(best)] = -1.0
         nearest[begin : begin + step] = best
-        ratios[begin : begin + step] = distance_ratios(best_cosines, cosines.max(axis=1))
+        ratios[begin : begin + step] = distance_ratios(
+            best_cosines, cosines.max(axis=1)
+        )
     return nearest, ratios

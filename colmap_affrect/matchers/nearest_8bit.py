@@ -18,7 +18,9 @@ from colmap_affrect.geometry.arrays import Bools, Bytes, Indices, Singles
 from colmap_affrect.geometry.neighbors import NeighborLists
 from colmap_affrect.parallel.executor import available_cores, one_openmp_thread
 
-MIN_COMPARISONS_PER_CORE = 6e8  # with fewer, loading torch takes longer than it saves (measured)
+MIN_COMPARISONS_PER_CORE = (
+    6e8  # with fewer, loading torch takes longer than it saves (measured)
+)
 ERROR_SIGMAS = 6.0  # of the rounding error, allowed for on each side
 MAX_CODE = 127  # largest signed code
 ZERO_CODE = 128  # signed code 0 as an unsigned one
@@ -98,18 +100,24 @@ def short_lists(
     margin = ERROR_SIGMAS * math.hypot(step, image.step, CODE_STEP) / math.sqrt(12)
     unit = step * image.step
     for begin in range(0, len(codes), NUM_ROWS):
-        cosine_codes = _cosine_codes(codes[begin : begin + NUM_ROWS], image.packed, unit)
+        cosine_codes = _cosine_codes(
+            codes[begin : begin + NUM_ROWS], image.packed, unit
+        )
         listed = _short_list(cosine_codes, margin, rivals, max_ratio)
         if len(listed.rows):
             yield replace(listed, rows=begin + listed.rows)
 
 
-def _short_list(codes: Bytes, margin: float, rivals: NeighborLists, max_ratio: float) -> ShortList:
+def _short_list(
+    codes: Bytes, margin: float, rivals: NeighborLists, max_ratio: float
+) -> ShortList:
     """Return what may pass the test, by (R, N) cosines over ``CODE_STEP``, which are changed.
 
     ``margin`` is the largest error of a cosine.
     """
-    width = 2.0 * margin / CODE_STEP  # codes nearer to each other may be in the other order
+    width = (
+        2.0 * margin / CODE_STEP
+    )  # codes nearer to each other may be in the other order
     best, highest = _largest(codes)
     of_best = rivals.of(best)
     is_near_best = codes[of_best] >= highest[of_best[0]] - width
@@ -127,7 +135,9 @@ def _short_list(codes: Bytes, margin: float, rivals: NeighborLists, max_ratio: f
     rival_rows, rivals_of_best = rivals.of(best[rows])
     entry_rows = np.concatenate([candidate_rows, rival_rows])
     entry_columns = np.concatenate([candidates, rivals_of_best])
-    entries = np.sort(entry_rows << 32 | entry_columns)  # far faster than an order by two keys
+    entries = np.sort(
+        entry_rows << 32 | entry_columns
+    )  # far faster than an order by two keys
     return ShortList(
         rows, runners_up[rows], is_doubtful[rows], entries >> 32, entries & 0xFFFF_FFFF
     )
@@ -212,7 +222,11 @@ def has_fast_8_bit_products() -> bool:
     unit = 1.0 / (128 * MAX_CODE**2)
     try:
         found = _cosine_codes(codes, _packed(codes), unit)
-    except (AttributeError, RuntimeError, TypeError):  # another torch, or one built otherwise
+    except (
+        AttributeError,
+        RuntimeError,
+        TypeError,
+    ):  # another torch, or one built otherwise
         return False
     wide = codes.astype(np.int32)
     expected = np.maximum(unit / CODE_STEP * (wide @ wide.T), 0.0)

@@ -55,7 +55,9 @@ def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
     if not path.is_file():
         raise OptionError(f"{path}: no such file")
     with path.open("rb") as file:
-        is_text = file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE and path.suffix != ".h5"
+        is_text = (
+            file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE and path.suffix != ".h5"
+        )
     if is_text:
         yield _read_list(path, names)
         return
@@ -74,7 +76,9 @@ def _of_hdf5(source: GivenFile, names: Collection[str]) -> GivenMatches:
             if key in source.shapes:
                 yield pair, source.read(key, (None, 2), "iu").astype(np.int64)
                 continue
-            column = source.read(f"{key}/{HLOC}", (num_features[pair[0]],), "iu").astype(np.int64)
+            column = source.read(
+                f"{key}/{HLOC}", (num_features[pair[0]],), "iu"
+            ).astype(np.int64)
             rows = np.flatnonzero(column != -1)
             yield pair, np.stack([rows, column[rows]], axis=1)
 
@@ -91,7 +95,9 @@ def _once(found: Iterator[tuple[Pair, str]]) -> dict[Pair, str]:
     return keys
 
 
-def _hloc_pairs(source: GivenFile, names: Collection[str]) -> Iterator[tuple[Pair, str]]:
+def _hloc_pairs(
+    source: GivenFile, names: Collection[str]
+) -> Iterator[tuple[Pair, str]]:
     """Yield the pairs of a file of hloc with their keys."""
     by_key = {name.replace("/", "-"): name for name in names}
     unknown = []
@@ -110,7 +116,9 @@ def _hloc_pairs(source: GivenFile, names: Collection[str]) -> Iterator[tuple[Pai
     _refuse_unknown(source.path, unknown)
 
 
-def _nested_pairs(source: GivenFile, names: Collection[str]) -> Iterator[tuple[Pair, str]]:
+def _nested_pairs(
+    source: GivenFile, names: Collection[str]
+) -> Iterator[tuple[Pair, str]]:
     """Yield the pairs of a file with a group for each first image."""
     by_key = {name: name for name in names}
     for name in names:
@@ -143,7 +151,9 @@ def _splits(key: str, separator: str, by_key: Mapping[str, str]) -> Iterator[Pai
 
 def _refuse_unknown(path: Path, keys: Collection[str]) -> None:
     if keys:
-        raise StoreError(f"{path}: has matches of images that have no features: {such_as(keys)}")
+        raise StoreError(
+            f"{path}: has matches of images that have no features: {such_as(keys)}"
+        )
 
 
 def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
@@ -170,7 +180,9 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
                 found[pair] = np.array(numbers, np.int64).reshape(-1, 2)
             number = end
     if not found:
-        raise StoreError(f"{path}: holds no matches; give an HDF5 file, or a list of COLMAP")
+        raise StoreError(
+            f"{path}: holds no matches; give an HDF5 file, or a list of COLMAP"
+        )
     return GivenMatches(path, tuple(found), lambda _: iter(found.items()))
 
 

@@ -148,9 +148,13 @@ def most_similar_pairs(
     best_first = np.lexsort((-np.concatenate(similarity), is_extra))
     firsts = np.concatenate(lower)
     seconds = np.concatenate(higher)
-    _, found_first = np.unique((firsts * len(names) + seconds)[best_first], return_index=True)
+    _, found_first = np.unique(
+        (firsts * len(names) + seconds)[best_first], return_index=True
+    )
     ranked = best_first[np.sort(found_first)]  # each pair once
-    num_pairs = max(len(names) * num_neighbors // 2, np.count_nonzero(~is_extra[ranked]))
+    num_pairs = max(
+        len(names) * num_neighbors // 2, np.count_nonzero(~is_extra[ranked])
+    )
     pairs = []
     for chosen in ranked[:num_pairs]:
         one = names[firsts[chosen]]
@@ -169,7 +173,9 @@ def ordered_for_reuse(pairs: Iterable[Pair], num_images: int) -> PairList:
     return listed.at(np.lexsort((high, low, high // num_images, low // num_images)))
 
 
-def read_pairs(path: Path, names: Sequence[str], image_path: Path | None = None) -> PairList:
+def read_pairs(
+    path: Path, names: Sequence[str], image_path: Path | None = None
+) -> PairList:
     """Read a pair list as COLMAP and hloc write it: two names per line.
 
     Separated by spaces, a tab or a comma; names may contain spaces. A number behind them, a score,
@@ -277,7 +283,9 @@ def split_line(line: str, known: Collection[str]) -> Pair | None:
     return None
 
 
-def _split_of_others(line: str, known: Collection[str], folders: Sequence[str]) -> Pair | None:
+def _split_of_others(
+    line: str, known: Collection[str], folders: Sequence[str]
+) -> Pair | None:
     """Return the two names of a line that has a score, backslashes, or paths into a folder."""
     if len(line) > LONGEST_LINE:
         return None

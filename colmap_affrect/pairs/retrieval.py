@@ -18,7 +18,9 @@ from colmap_affrect.pairs.lists import Pair, most_similar_pairs
 from colmap_affrect.progress import Progress
 
 NUM_WORDS = 256
-NUM_SAMPLED_IMAGES = 512  # the vocabulary of larger sets is built from that many of their images
+NUM_SAMPLED_IMAGES = (
+    512  # the vocabulary of larger sets is built from that many of their images
+)
 NUM_SAMPLES = 1 << 15  # descriptors that the vocabulary is built from
 NUM_ITERATIONS = 10
 VECTORS_AT_ONCE = 512  # compared with as many others at a time, which bounds memory
@@ -31,7 +33,9 @@ def build_vocabulary(samples: Singles, random: np.random.Generator) -> Singles:
         return words
     labels = nearest_words(samples, words).astype(np.int32)
     ends = (cv2.TERM_CRITERIA_MAX_ITER, NUM_ITERATIONS, 0.0)
-    found = cv2.kmeans(samples, len(words), labels, ends, 1, cv2.KMEANS_USE_INITIAL_LABELS)
+    found = cv2.kmeans(
+        samples, len(words), labels, ends, 1, cv2.KMEANS_USE_INITIAL_LABELS
+    )
     return np.asarray(found[2], dtype=np.float32)
 
 
@@ -69,7 +73,9 @@ def similarities(vectors: NDArray[np.float16]) -> Iterator[Singles]:
 
     for begin in begins:
         queries = centered(begin)
-        yield from np.concatenate([queries @ centered(other).T for other in begins], axis=1)
+        yield from np.concatenate(
+            [queries @ centered(other).T for other in begins], axis=1
+        )
 
 
 def _unit_rows(rows: Singles) -> Singles:
@@ -116,4 +122,6 @@ def retrieved_pairs(
 
 def _original_descriptors(features: LocalFeatures) -> Singles:
     """Return the (N, D) descriptors of the image itself; with those of warps recall is lower."""
-    return np.asarray(features.descriptors[features.rectification_ids == 0], dtype=np.float32)
+    return np.asarray(
+        features.descriptors[features.rectification_ids == 0], dtype=np.float32
+    )

@@ -37,8 +37,17 @@ CONNECT_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 5.0
 POLL_S = 1.0  # that a result is waited for before somebody looks whether the cluster is there
 TRANSFER_S = 60.0  # that a finished result may take to come here
-TASKS_PER_THREAD = 2  # one that is being worked on and one that waits, so that no worker has to
-PACKAGES = ("colmap-affrect", "distributed", "numpy", "opencv-python-headless", "torch", "kornia")
+TASKS_PER_THREAD = (
+    2  # one that is being worked on and one that waits, so that no worker has to
+)
+PACKAGES = (
+    "colmap-affrect",
+    "distributed",
+    "numpy",
+    "opencv-python-headless",
+    "torch",
+    "kornia",
+)
 """Packages whose versions must be the same everywhere."""
 
 
@@ -81,7 +90,9 @@ _loading = threading.Lock()
 
 
 @lru_cache(maxsize=1)
-def _function(pickled: bytes, expected: tuple[tuple[str, str], ...]) -> Callable[[Any], Any]:
+def _function(
+    pickled: bytes, expected: tuple[tuple[str, str], ...]
+) -> Callable[[Any], Any]:
     """Unpickle a function once per process; the next one replaces it and frees its memory."""
     require_environment(dict(expected))
     threadpool_limits(1, user_api="blas")
@@ -111,14 +122,18 @@ def connected(address: str) -> Iterator[Cluster]:
             f"--scheduler: {error.name} is not installed; pip install 'colmap-affrect[cluster]'"
         ) from error
     if not re.fullmatch(r"(tcp|tls)://.+:\d+", address):
-        raise OptionError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
+        raise OptionError(
+            f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786"
+        )
     security = Security()  # as dask's configuration has it
     for name in ("distributed", "distributed.client"):  # errors that matter are raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
     # Tasks may contain large images: dask need not warn of that.
     with config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
         _require_scheduler(address, security)
-        client = Client(address, timeout=CONNECT_TIMEOUT_S, security=security, set_as_default=False)
+        client = Client(
+            address, timeout=CONNECT_TIMEOUT_S, security=security, set_as_default=False
+        )
         try:
             cluster = _with_workers(client, address)
             try:
@@ -196,7 +211,10 @@ class Cluster:
                 self._client.run(_function.cache_clear, on_error="ignore")
 
     def map(
-        self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
+        self,
+        function: Callable[[Task], Result],
+        tasks: Iterable[Task],
+        files: Sequence[Path] = (),
     ) -> Iterator[Result]:
         """Yield the results of tasks in their order, as every executor does.
 
@@ -219,7 +237,9 @@ class Cluster:
 
         def submit(task: Task) -> Future:
             key = f"{name}-{next(numbers)}"
-            return self._client.submit(_work, *job, pickle.dumps(task), key=key, pure=False)
+            return self._client.submit(
+                _work, *job, pickle.dumps(task), key=key, pure=False
+            )
 
         def num_tasks() -> int:  # that may be on their way
             return TASKS_PER_THREAD * self._watch.num_threads()

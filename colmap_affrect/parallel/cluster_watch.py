@@ -30,7 +30,9 @@ class ClusterWatch:
         self._client = client
         self._address = address
         self._clock = clock
-        self._heard: dict[str, tuple[float, float]] = {}  # when, by the scheduler and by us
+        self._heard: dict[
+            str, tuple[float, float]
+        ] = {}  # when, by the scheduler and by us
         self._asked_s = -ASK_EVERY_S
         self._lost_since_s: float | None = None
         self._has_warned = False
@@ -69,16 +71,26 @@ class ClusterWatch:
         if lost_s >= WARN_AFTER_S and not self._has_warned:
             self._has_warned = True
             left_s = GIVE_UP_AFTER_S - lost_s
-            logger.warning("%s: %s; this waits for %.0f s more", self._address, fault, left_s)
+            logger.warning(
+                "%s: %s; this waits for %.0f s more", self._address, fault, left_s
+            )
 
     def _fault(self) -> str:
         """Return who is not there and how to start it, empty if all is well."""
         start = f"start some with 'dask worker {self._address}' on each machine"
         try:
             workers = self._workers()
-        except (OSError, RuntimeError, AttributeError):  # the last two of a client that has closed
+        except (
+            OSError,
+            RuntimeError,
+            AttributeError,
+        ):  # the last two of a client that has closed
             return "the scheduler does not answer any more; start 'dask scheduler' and workers"
-        heard = [worker for address, worker in workers.items() if self._is_heard(address, worker)]
+        heard = [
+            worker
+            for address, worker in workers.items()
+            if self._is_heard(address, worker)
+        ]
         if heard:
             self._num_threads = max(1, sum(int(worker["nthreads"]) for worker in heard))
             return ""

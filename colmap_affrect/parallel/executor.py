@@ -30,7 +30,10 @@ class Executor(Protocol):
     """Where the work on images and pairs is done."""
 
     def map(
-        self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
+        self,
+        function: Callable[[Task], Result],
+        tasks: Iterable[Task],
+        files: Sequence[Path] = (),
     ) -> Iterator[Result]:
         """Yield the results of tasks in their order; few tasks are in flight.
 
@@ -51,7 +54,10 @@ class Threads:
     num_threads: int
 
     def map(
-        self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
+        self,
+        function: Callable[[Task], Result],
+        tasks: Iterable[Task],
+        files: Sequence[Path] = (),
     ) -> Iterator[Result]:
         """Yield the results of tasks in their order, see :func:`map_ordered`.
 

@@ -7,21 +7,44 @@ from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import signature
 from numbers import Integral, Real
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from colmap_affrect.errors import OptionError
 
 MAX_SHOWN = 60  # characters of a value that is refused
-NUMBERS: Mapping[Any, type] = {float: Real, int: Integral}  # numpy's scalars are such, too
-WORDS = (str, bytes)  # sequences of characters, which nobody means by a sequence of names
+NUMBERS: Mapping[Any, type] = {
+    float: Real,
+    int: Integral,
+}  # numpy's scalars are such, too
+WORDS = (
+    str,
+    bytes,
+)  # sequences of characters, which nobody means by a sequence of names
 ABSTRACT = "collections.abc"
-LOOKED_INTO = (list, tuple, set, frozenset, dict)  # others may be slow, or gone after one look
+LOOKED_INTO = (
+    list,
+    tuple,
+    set,
+    frozenset,
+    dict,
+)  # others may be slow, or gone after one look
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-def checks_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def checks_arguments(
+    function: Callable[Arguments, Result],
+) -> Callable[Arguments, Result]:
     """Have a function raise OptionError for arguments of other types than its annotations say."""
     names = signature(function)
     kinds: dict[str, Any] = {}
@@ -55,7 +78,9 @@ def require_type(name: str, value: Any, kind: Any) -> None:
     if get_origin(kind) is Literal:
         known = ", ".join(map(str, get_args(kind)))
         raise OptionError(f"{name} {_shown(value)} is not one of {known}")
-    raise OptionError(f"{name}: {_shown(value)} is {type(value).__name__}; give {_name_of(kind)}")
+    raise OptionError(
+        f"{name}: {_shown(value)} is {type(value).__name__}; give {_name_of(kind)}"
+    )
 
 
 def require_bools(**given: Any) -> None:

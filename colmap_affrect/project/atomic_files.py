@@ -23,7 +23,9 @@ logger = logging.getLogger(__name__)
 
 PAGE_BYTES = 4096
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
-NEW_SUFFIX = ".affrect-new"  # of files that are being written; a killed program leaves them
+NEW_SUFFIX = (
+    ".affrect-new"  # of files that are being written; a killed program leaves them
+)
 JOURNAL_MARK = b"AFFRECT2"
 JOURNAL_HEADER = struct.Struct("<8sQQ")
 """Mark, number of old bytes that stay unless a page changes them, and size of the file; numbered
@@ -98,8 +100,13 @@ def require_space(path: Path, num_bytes: int, named: Path | None = None) -> None
     try:
         if shutil.disk_usage(path.parent).free < num_bytes:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        with _new_beside(path) as (file, _), suppress(AttributeError):  # not on all systems
-            os.posix_fallocate(file.fileno(), 0, num_bytes)  # which a quota may not allow
+        with (
+            _new_beside(path) as (file, _),
+            suppress(AttributeError),
+        ):  # not on all systems
+            os.posix_fallocate(
+                file.fileno(), 0, num_bytes
+            )  # which a quota may not allow
     except OSError as error:
         raise cannot_write(named or path, error) from error
 
@@ -201,7 +208,9 @@ class FileTransaction(io.RawIOBase):
         """Change the size, as :class:`io.RawIOBase`."""
         self._size = self._position if size is None else size
         self._kept_size = min(self._kept_size, self._size)
-        for number in [number for number in self._pages if number * PAGE_BYTES >= self._size]:
+        for number in [
+            number for number in self._pages if number * PAGE_BYTES >= self._size
+        ]:
             del self._pages[number]
         if (last := self._size // PAGE_BYTES) in self._pages:
             rest = self._size % PAGE_BYTES
@@ -216,7 +225,10 @@ class FileTransaction(io.RawIOBase):
     def commit(self) -> None:
         """Make all changes; OSError when they cannot be written: what is in the journal counts."""
         header = JOURNAL_HEADER.pack(JOURNAL_MARK, self._kept_size, self._size)
-        pages = (struct.pack("<Q", number) + page for number, page in sorted(self._pages.items()))
+        pages = (
+            struct.pack("<Q", number) + page
+            for number, page in sorted(self._pages.items())
+        )
         content = header + b"".join(pages)
         _replace(journal_of(self._path), [content, hashlib.sha256(content).digest()])
         apply_journal(self._path)

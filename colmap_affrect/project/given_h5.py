@@ -33,25 +33,37 @@ class GivenFile:
     def groups_with(self, dataset: str) -> list[str]:
         """Return the sorted paths of the groups that have a dataset."""
         ending = f"/{dataset}"
-        found = sorted(key.removesuffix(ending) for key in self.shapes if key.endswith(ending))
+        found = sorted(
+            key.removesuffix(ending) for key in self.shapes if key.endswith(ending)
+        )
         if self.shapes and not found:
-            raise StoreError(f"{self.path}: holds no '{dataset}' of images; is it a file of hloc?")
+            raise StoreError(
+                f"{self.path}: holds no '{dataset}' of images; is it a file of hloc?"
+            )
         return found
 
-    def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
+    def read(
+        self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu"
+    ) -> NDArray[Any]:
         """Read numbers of some of numpy's kinds, of a shape in which None is any size."""
         stored = self.shapes[key]
         expected = tuple(stored[:1]) if shape[0] is None else shape[:1]
         if stored != expected + shape[1:]:
             wanted = str(shape).replace("None", "N")
-            raise StoreError(f"{self.path}: {key} has shape {stored}, expected {wanted}")
+            raise StoreError(
+                f"{self.path}: {key} has shape {stored}, expected {wanted}"
+            )
         if np.prod([float(size) for size in stored]) > MAX_VALUES:
-            raise StoreError(f"{self.path}: {key} of shape {stored} is too large to be true")
+            raise StoreError(
+                f"{self.path}: {key} of shape {stored} is too large to be true"
+            )
         with damage(self.path, MEND):
             num_bytes = self.file[key].nbytes
             stored_bytes = self.file[key].id.get_storage_size()
             if num_bytes > max(LARGE_BYTES, MOST_COMPRESSED * stored_bytes):
-                raise ValueError(f"{key} of shape {stored} was never written, but for a small part")
+                raise ValueError(
+                    f"{key} of shape {stored} was never written, but for a small part"
+                )
             if self.file[key].dtype.kind not in kinds:
                 raise ValueError(f"{key} does not hold numbers, or no whole ones")
             return np.asarray(self.file[key][()])
@@ -66,7 +78,9 @@ def opened(path: Path) -> Iterator[GivenFile]:
 
     def visit(key: str, item: h5py.Group | h5py.Dataset) -> None:
         if key.count("/") > MAX_DEPTH:
-            raise StoreError(f"{path}: has groups in groups, more than {MAX_DEPTH} deep; {MEND}")
+            raise StoreError(
+                f"{path}: has groups in groups, more than {MAX_DEPTH} deep; {MEND}"
+            )
         if isinstance(item, h5py.Dataset):
             if item.external or item.is_virtual:
                 raise StoreError(f"{path}: data in other files are not followed: {key}")

@@ -37,7 +37,10 @@ class GroupStore:
             with self._opened(self.path, "r") as file:
                 yield file
             return
-        with atomic_files.uninterrupted(), atomic_files.FileTransaction(self.path) as changes:
+        with (
+            atomic_files.uninterrupted(),
+            atomic_files.FileTransaction(self.path) as changes,
+        ):
             with self._opened(changes, "r+" if self.path.exists() else "w") as file:
                 yield file
             try:
@@ -46,7 +49,9 @@ class GroupStore:
                 raise atomic_files.cannot_write(self.path, error) from error
 
     @contextmanager
-    def _opened(self, where: Path | atomic_files.FileTransaction, mode: str) -> Iterator[h5py.File]:
+    def _opened(
+        self, where: Path | atomic_files.FileTransaction, mode: str
+    ) -> Iterator[h5py.File]:
         mend = f"unless another program has it open, {made_again(self.stage, self.path.parent)}"
         with damage(self.path, mend):
             atomic_files.apply_journal(self.path)
@@ -70,7 +75,9 @@ class GroupStore:
                         checked(group, name)
 
     @classmethod
-    def _write(cls, file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
+    def _write(
+        cls, file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any
+    ) -> None:
         if key in file:
             del file[key]
         group = file.create_group(key)

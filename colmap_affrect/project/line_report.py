@@ -18,7 +18,9 @@ from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.options import documented
 
 FILM_MM = 36.0  # longer side of small-format film, for which lenses are compared
-SEGMENTS = "line_segments"  # (N, 4) starts and ends, longer sides from the middle of the image
+SEGMENTS = (
+    "line_segments"  # (N, 4) starts and ends, longer sides from the middle of the image
+)
 LIKELIHOODS = "line_log_likelihoods"  # (F, S) of focal lengths and shifts
 ROTATIONS = "line_rotations"  # (F, S, 3, 3)
 LINE_DATASETS = (SEGMENTS, LIKELIHOODS, ROTATIONS)  # of an image, beside its features
@@ -57,7 +59,9 @@ class LineReport:
             )
         lens = f"{self.focal_px:,.0f} px ({self.focal_mm:.0f} mm for film of 36 mm)"
         if self.is_known:
-            text = f"the lines tell a focal length of {lens} within {self.focal_sigma:.0%}"
+            text = (
+                f"the lines tell a focal length of {lens} within {self.focal_sigma:.0%}"
+            )
         else:
             text = f"the lines do not tell the focal length: {lens} within {self.focal_sigma:.0%}"
         if self.is_shifted and self.shift_px is not None:

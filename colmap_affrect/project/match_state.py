@@ -12,7 +12,9 @@ from pydantic import TypeAdapter
 from colmap_affrect.options import EffortName
 
 Names = tuple[str, str]  # of a pair of images
-Worth = tuple[int, int]  # inliers; where there are none, how many matches confirm each other
+Worth = tuple[
+    int, int
+]  # inliers; where there are none, how many matches confirm each other
 Size = tuple[int, int]  # width and height in px
 Cell = tuple[int, int]  # column and row
 
@@ -42,7 +44,9 @@ class LookedAt:
     def is_enough(self) -> bool:
         """Whether nothing is left to try with them, or nothing is there to go on from without."""
         is_better = self.score > self.score_without
-        return is_better and (self.is_sure or self.score_without < NOTHING_TO_GO_ON_FROM)
+        return is_better and (
+            self.is_sure or self.score_without < NOTHING_TO_GO_ON_FROM
+        )
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,9 @@ class MatchState:
 
         Of images that have gone nothing is left; others may get their names.
         """
-        backgrounds = tuple(known for known in self.backgrounds if known[0] not in images)
+        backgrounds = tuple(
+            known for known in self.backgrounds if known[0] not in images
+        )
         return MatchState(
             stationary=self.stationary,
             still_cameras=self.still_cameras,

@@ -22,13 +22,22 @@ from colmap_affrect.project.atomic_files import (
     uninterrupted,
 )
 from colmap_affrect.project.paths import resolved
-from colmap_affrect.project.regular_files import NotAFileError, open_regular, require_regular
+from colmap_affrect.project.regular_files import (
+    NotAFileError,
+    open_regular,
+    require_regular,
+)
 
 RESULTS = "results"  # folder of these in such a folder, whose names are the user's
 LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works there
-MARKS = {"config.toml": b"format_version", "run.log": b"colmap-affrect"}  # files of ours begin so
+MARKS = {
+    "config.toml": b"format_version",
+    "run.log": b"colmap-affrect",
+}  # files of ours begin so
 LONGEST_NAME = 255  # bytes that file systems take
-MAX_NAME_BYTES = LONGEST_NAME - 35  # there has to be room for what is beside it meanwhile
+MAX_NAME_BYTES = (
+    LONGEST_NAME - 35
+)  # there has to be room for what is beside it meanwhile
 SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
 BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}  # in folders that look empty
@@ -85,7 +94,9 @@ def refuse_what_waits(path: Path) -> None:
         if not path.is_dir():
             require_regular(path)
     except NotAFileError as error:
-        raise OptionError(f"{path}: {error}; remove it, or give another folder") from error
+        raise OptionError(
+            f"{path}: {error}; remove it, or give another folder"
+        ) from error
 
 
 @contextmanager
@@ -101,7 +112,9 @@ def new_results(
     """
     for target in targets:
         refuse_link(target)
-        if any(p.name == "sparse" and is_output_folder(p.parent) for p in target.parents):
+        if any(
+            p.name == "sparse" and is_output_folder(p.parent) for p in target.parents
+        ):
             raise OptionError(
                 f"{target}: lies beside the models of a run, which mapping removes; give another "
                 "name or folder"
@@ -111,7 +124,9 @@ def new_results(
             _refuse_existing(target)
     with ExitStack() as stack:
         parents = dict.fromkeys(target.parent for target in targets)
-        folders = {parent: stack.enter_context(temporary_folder(parent)) for parent in parents}
+        folders = {
+            parent: stack.enter_context(temporary_folder(parent)) for parent in parents
+        }
         for temporary in folders.values():  # what is beside it may have any name
             try:
                 (temporary / RESULTS).mkdir()
@@ -122,7 +137,9 @@ def new_results(
         for target in targets:  # native writers say nothing of a full disk
             require_space(folders[target.parent] / "rest", SPARE_BYTES, target)
         with uninterrupted():
-            for target in () if replaces else targets:  # somebody may have made one meanwhile
+            for target in (
+                () if replaces else targets
+            ):  # somebody may have made one meanwhile
                 _refuse_existing(target)
             try:
                 for path, target in zip(made, targets, strict=True):
@@ -133,7 +150,9 @@ def new_results(
 
 def _refuse_existing(target: Path) -> None:
     if os.path.lexists(target):
-        raise OptionError(f"{target}: exists, and is left as it is; give another name or folder")
+        raise OptionError(
+            f"{target}: exists, and is left as it is; give another name or folder"
+        )
 
 
 @contextmanager
@@ -174,7 +193,13 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 def database_files(path: Path) -> list[Path]:
     """Return a database of SQLite and the files that it may have beside it."""
-    return [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal"))]
+    return [
+        path,
+        *(
+            path.with_name(path.name + suffix)
+            for suffix in ("-wal", "-shm", "-journal")
+        ),
+    ]
 
 
 def remove_own(paths: Iterable[Path]) -> None:

@@ -26,8 +26,12 @@ def as_path(given: PathLike, argument: str = "") -> Path:
     except TypeError as error:
         kind = type(given).__name__
         named = f"{argument}={given!r}" if argument else repr(given)
-        raise OptionError(f"{named}: give a path as str or os.PathLike, not {kind}") from error
-    if not os.fspath(given):  # Path takes it for the current folder, and nobody means that
+        raise OptionError(
+            f"{named}: give a path as str or os.PathLike, not {kind}"
+        ) from error
+    if not os.fspath(
+        given
+    ):  # Path takes it for the current folder, and nobody means that
         raise OptionError("an empty text is no path; the current folder is '.'")
     if "\0" in str(path):
         raise OptionError(f"{str(path)!r}: no path holds the character 0")

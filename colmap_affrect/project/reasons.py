@@ -77,7 +77,9 @@ def texts_of(doubts: Mapping[str, Iterable[Doubt]]) -> dict[str, str]:
     return {name: text_of(of_image) for name, of_image in doubts.items()}
 
 
-def mappings_of(doubts: Mapping[str, Iterable[Doubt]]) -> dict[str, list[dict[str, Any]]]:
+def mappings_of(
+    doubts: Mapping[str, Iterable[Doubt]],
+) -> dict[str, list[dict[str, Any]]]:
     """Return what ``report.json`` has of the reasons of each image."""
     found = dict[str, list[dict[str, Any]]]()
     for name, of_image in doubts.items():

@@ -24,7 +24,9 @@ class Content(NamedTuple):
     """What files hold."""
 
     digest: str = ""  # sha256 of the digests of the files; empty if not known
-    stamp: str = ""  # their sizes and times: while these stay, nobody has to read the files
+    stamp: str = (
+        ""  # their sizes and times: while these stay, nobody has to read the files
+    )
 
 
 def file_sha256(path: Path) -> str:
@@ -47,7 +49,9 @@ def stamp_of(paths: Iterable[Path]) -> str:
     return ", ".join(_or_empty(_stamp, path) for path in paths)
 
 
-def content_of(paths: Iterable[Path], known: Content | None = None, options: str = "") -> Content:
+def content_of(
+    paths: Iterable[Path], known: Content | None = None, options: str = ""
+) -> Content:
     """Return what files hold, without reading them if sizes and times are those that are known.
 
     Args:
@@ -73,11 +77,15 @@ def _or_empty(read: Callable[[Path], str], path: Path) -> str:
         return ""
 
 
-Stage = Literal["copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"]
+Stage = Literal[
+    "copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"
+]
 STAGES: tuple[str, ...] = get_args(Stage)
 FORMAT_VERSION = 13  # counts up when a stage records other options than before
 MADE_FROM = "made_from"  # digests of given files
-MAPPED = "mapped"  # what the models that are there were made from, and how many they are
+MAPPED = (
+    "mapped"  # what the models that are there were made from, and how many they are
+)
 PLANNED = "planned"  # options of stages that have not begun
 KEYS = ("recipe", *STAGES, PLANNED, MADE_FROM, MAPPED)
 
@@ -182,10 +190,14 @@ def first_difference(
     old = flat({key: value for key, value in known.items() if key not in free})
     new = flat({key: value for key, value in now.items() if key not in free})
     # The name of a part first: with another one most other options differ too.
-    for key in sorted(old.keys() | new.keys(), key=lambda k: (k.rpartition(".")[2] != "name", k)):
+    for key in sorted(
+        old.keys() | new.keys(), key=lambda k: (k.rpartition(".")[2] != "name", k)
+    ):
         before = old.get(key)
         after = new.get(key)
-        if key.startswith(f"{WEIGHTS}.") and not (before and after):  # of a level that waits
+        if key.startswith(f"{WEIGHTS}.") and not (
+            before and after
+        ):  # of a level that waits
             continue
         if before != after and not (key in PLACES and before and after):
             return f"{key}={before!r}, and it is {after!r} now"

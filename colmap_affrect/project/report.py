@@ -58,7 +58,9 @@ CONTRADICTED: Mapping[str, tuple[Sequence[str], str, str]] = {
 }
 """What may be wrong of a camera: its sources, where its number is from, and what helps. What the
 user gives is usually held; that of a database only has a prior."""
-MAX_EXIF_ERROR = 1.27  # of a focal length: three standard deviations of what EXIF usually has
+MAX_EXIF_ERROR = (
+    1.27  # of a focal length: three standard deviations of what EXIF usually has
+)
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
 REPORTED_PACKAGES = (
@@ -102,7 +104,9 @@ def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
                 f"{what} may be wrong: {first['focal_px']:.0f} px {by}, "
                 f"{first['refined_px']:.0f} px in the model{more}; {remedy}"
             )
-    lenses_mm = sorted({camera["lens_mm"] for camera in cameras if camera.get("lens_mm")})
+    lenses_mm = sorted(
+        {camera["lens_mm"] for camera in cameras if camera.get("lens_mm")}
+    )
     shared = [camera for camera in cameras if _is_found(camera)]
     num_found = len({camera["refined_px"] for camera in shared})
     if num_found < len(shared):
@@ -129,7 +133,11 @@ def as_mapped(cameras: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
         key: object = number
         if _is_found(camera):
             key = camera["refined_px"], camera["focal_px"], camera["why"]
-        names = [*found[key]["names"], *camera["names"]] if key in found else camera["names"]
+        names = (
+            [*found[key]["names"], *camera["names"]]
+            if key in found
+            else camera["names"]
+        )
         found[key] = {**camera, "names": names}
     return list(found.values())
 
@@ -297,7 +305,9 @@ class ModelSummary:
     @property
     def sure(self) -> tuple[str, ...]:
         """Names of the images that are right with a probability of ``SURE`` or more."""
-        return tuple(name for name, share in self.probabilities.items() if share >= SURE)
+        return tuple(
+            name for name, share in self.probabilities.items() if share >= SURE
+        )
 
     @property
     def likely(self) -> set[str]:
@@ -306,10 +316,18 @@ class ModelSummary:
 
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
-        lines = _some(f"joined      {name} {one.text()}" for name, one in self.bridges.items())
-        lines += _some(f"unsure      {line}" for line in by_story(texts_of(self.unsure)))
-        lines += _some(f"doubtful    {line}" for line in by_story(texts_of(self.doubtful)))
-        alike = (f"one view    {a} and {b}: no depth between them" for a, b in self.one_view)
+        lines = _some(
+            f"joined      {name} {one.text()}" for name, one in self.bridges.items()
+        )
+        lines += _some(
+            f"unsure      {line}" for line in by_story(texts_of(self.unsure))
+        )
+        lines += _some(
+            f"doubtful    {line}" for line in by_story(texts_of(self.doubtful))
+        )
+        alike = (
+            f"one view    {a} and {b}: no depth between them" for a, b in self.one_view
+        )
         lines += _some(alike)
         return [
             f"sure        {len(self.sure)}, right with a probability of {SURE:.0%} or more",
@@ -394,7 +412,9 @@ class ReconstructionReport(Summarized):
             return ""
         num_usable = self.images_total - len(self.failures)
         if num_usable == 1:
-            unreadable = f": {len(self.failures)} cannot be read" if self.failures else ""
+            unreadable = (
+                f": {len(self.failures)} cannot be read" if self.failures else ""
+            )
             return f"one image cannot make a model{unreadable}"
         if not self.num_verified_pairs:
             return "no model was found: no pair of images is verified"
@@ -409,17 +429,23 @@ class ReconstructionReport(Summarized):
     def added(self) -> tuple[str, ...]:
         """Names of the images that came into the model that was extended."""
         before = set(self.extended)
-        return tuple(name for name in self.registered_names if before and name not in before)
+        return tuple(
+            name for name in self.registered_names if before and name not in before
+        )
 
     @property
     def failures(self) -> dict[str, str]:
         """Images that could not be read, with the reason."""
-        return {name: why for stage in self.stages for name, why in stage.failures.items()}
+        return {
+            name: why for stage in self.stages for name, why in stage.failures.items()
+        }
 
     @property
     def warnings(self) -> dict[str, str]:
         """Images that were worked on in another way than asked for, with the reason."""
-        return {name: why for stage in self.stages for name, why in stage.warnings.items()}
+        return {
+            name: why for stage in self.stages for name, why in stage.warnings.items()
+        }
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
@@ -432,11 +458,15 @@ class ReconstructionReport(Summarized):
             "images_registered": len(largest.registered_names),
             **{key: getattr(largest, key) for key in OF_LARGEST},
             **found,
-            "unregistered": {name: why.to_mapping() for name, why in self.unregistered.items()},
+            "unregistered": {
+                name: why.to_mapping() for name, why in self.unregistered.items()
+            },
             "unsure": mappings_of(largest.unsure),
             "doubtful": mappings_of(largest.doubtful),
             "points3D": largest.num_points3D,
-            "bridges": {name: asdict(bridge) for name, bridge in largest.bridges.items()},
+            "bridges": {
+                name: asdict(bridge) for name, bridge in largest.bridges.items()
+            },
             "tie_points": [asdict(residual) for residual in largest.tie_points],
             "num_models": len(self.models),
             "models": [list(model.registered_names) for model in self.models],
@@ -455,7 +485,9 @@ class ReconstructionReport(Summarized):
         registered = len(self.registered_names)
         lines = [f"registered  {registered} of {self.images_total} images"]
         if self.extended:
-            lines += [f"extended    {len(self.extended)} were there, {len(self.added)} came in"]
+            lines += [
+                f"extended    {len(self.extended)} were there, {len(self.added)} came in"
+            ]
             lines += [f"            new {name}" for name in self.added]
         missing = {name: why.text() for name, why in self.unregistered.items()}
         lines += _some(f"        not {line}" for line in by_story(missing))
@@ -464,14 +496,22 @@ class ReconstructionReport(Summarized):
         if self.guided:
             before = self.guided["matches_before"]
             after = self.guided["matches_after"]
-            pairs = f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"
-            lines += [f"guided      {pairs} matched again: {after} inliers, {before} before"]
+            pairs = (
+                f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"
+            )
+            lines += [
+                f"guided      {pairs} matched again: {after} inliers, {before} before"
+            ]
         if self.matched_again:
             texts = [one.text() for one in self.matched_again]
             lines += [f"again       {', '.join(texts)} (effort {self.effort})"]
         if self.cameras:
-            sources = Counter(str(camera["source"]) for camera in self.cameras).most_common()
-            texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]
+            sources = Counter(
+                str(camera["source"]) for camera in self.cameras
+            ).most_common()
+            texts = [
+                f"{count} {SOURCES.get(source, source)}" for source, count in sources
+            ]
             lines += [f"cameras     focal lengths: {', '.join(texts)}"]
             lines += [f"            {note}" for note in camera_notes(self.cameras)]
         if self.models:
@@ -479,13 +519,20 @@ class ReconstructionReport(Summarized):
         if len(self.models) > 1:
             sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
             lines += [f"models      {len(self.models)}, of {sizes} images"]
-        given = [f"{key}={value}" for key, value in self.mapping["mapper_options"].items()]
+        given = [
+            f"{key}={value}" for key, value in self.mapping["mapper_options"].items()
+        ]
         chosen = ", ".join([self.preset, f"{self.mapping['name']} mapper", *given])
         lines += [f"preset      {chosen}"] if chosen != USUAL else []
         if with_warnings:
-            lines += _some(f"warning     {name}: {why}" for name, why in self.warnings.items())
+            lines += _some(
+                f"warning     {name}: {why}" for name, why in self.warnings.items()
+            )
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines += [f"seconds     {seconds}"]
         for one in self.advice[:MAX_ADVICE]:
-            lines += ["try         " + "\n            ".join(filter(None, (one.why, one.command)))]
+            lines += [
+                "try         "
+                + "\n            ".join(filter(None, (one.why, one.command)))
+            ]
         return "\n".join(lines)

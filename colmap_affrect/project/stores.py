@@ -27,8 +27,17 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.lines import Lines
-from colmap_affrect.project.group_store import GroupStore, checked, entries_of, has_entry
-from colmap_affrect.project.line_report import LINE_DATASETS, line_datasets, lines_from_datasets
+from colmap_affrect.project.group_store import (
+    GroupStore,
+    checked,
+    entries_of,
+    has_entry,
+)
+from colmap_affrect.project.line_report import (
+    LINE_DATASETS,
+    line_datasets,
+    lines_from_datasets,
+)
 from colmap_affrect.project.match_state import STATE_JSON, MatchState, Names, Worth
 from colmap_affrect.project.record import Content, stamp_of
 
@@ -49,7 +58,9 @@ class PairMatches:
     indices: Indices  # (M, 2) int64, strictly rising in column 0
     scores: Singles  # (M,) float32 in [0, 1], larger is better
     num_keypoints1: int  # number of features of the first image
-    level: int = 0  # of escalation, whose features were looked at together with those of level 0
+    level: int = (
+        0  # of escalation, whose features were looked at together with those of level 0
+    )
     of_some: bool = False  # only of the features with the largest responses
 
 
@@ -73,7 +84,9 @@ def _entries_of(path: Path, _: str) -> Entries:
 
 
 def _content(group: h5py.Group) -> Content:
-    return Content(str(group.attrs.get("content", "")), str(group.attrs.get("stamp", "")))
+    return Content(
+        str(group.attrs.get("content", "")), str(group.attrs.get("stamp", ""))
+    )
 
 
 def _level_ends(group: h5py.Group) -> dict[int, int]:
@@ -101,7 +114,9 @@ class FeatureStore(GroupStore):
     stage = "extract"
 
     def _entries(self) -> Entries:
-        return _entries_of(self.path, stamp_of([self.path])) if self.path.exists() else {}
+        return (
+            _entries_of(self.path, stamp_of([self.path])) if self.path.exists() else {}
+        )
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
@@ -161,7 +176,9 @@ class FeatureStore(GroupStore):
             there = self._features(group)
             first_id = int(there.rectification_ids.max(initial=0))
             ids = features.rectification_ids
-            added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
+            added = replace(
+                features, rectification_ids=np.where(ids, ids + first_id, 0)
+            )
             both = union(of_one_size([there, added]))
             ends[level] = len(both)
             more = _line_datasets(group)
@@ -224,7 +241,9 @@ class FeatureStore(GroupStore):
         """Return which features are of each level that an image has, in their order."""
         with self._open("r") as file:
             ends = _level_ends(self._group(file, name))
-        return dict(zip(ends, map(range, [0, *ends.values()], ends.values()), strict=True))
+        return dict(
+            zip(ends, map(range, [0, *ends.values()], ends.values()), strict=True)
+        )
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
@@ -315,7 +334,9 @@ class MatchStore(GroupStore):
         known: dict[str, Any] = {"tried": 0}
         learned = None
         if has_entry(file, key):
-            known = {name: file[key].attrs[name] for name in KEPT if name in file[key].attrs}
+            known = {
+                name: file[key].attrs[name] for name in KEPT if name in file[key].attrs
+            }
             learned = _read_learned(file[key], pair.names)
         known["tried"] |= 1 << pair.level
         known |= {"level": pair.level, "of_some": pair.of_some}
@@ -350,19 +371,27 @@ class MatchStore(GroupStore):
         """Return the level of these by pair, without reading them; -1 where there are none."""
         with self._open("r") as file:
             groups = {names: file[pair_key(*names)] for names in pairs}
-            return {n: int(group.attrs.get(LEARNED + "level", -1)) for n, group in groups.items()}
+            return {
+                n: int(group.attrs.get(LEARNED + "level", -1))
+                for n, group in groups.items()
+            }
 
     def measured_worths(self, pairs: Iterable[Names]) -> dict[Names, Worth]:
         """Return what the best measured matches of pairs are worth that use others."""
         found = {}
         with self._open("r") as file:
             for names in pairs:
-                inliers, consistent = file[pair_key(*names)].attrs.get("measured_worth", (0, 0))
+                inliers, consistent = file[pair_key(*names)].attrs.get(
+                    "measured_worth", (0, 0)
+                )
                 found[names] = int(inliers), int(consistent)
         return found
 
     def choose(
-        self, chosen: Iterable[PairMatches], measured_worths: Mapping[Names, Worth], **changes: Any
+        self,
+        chosen: Iterable[PairMatches],
+        measured_worths: Mapping[Names, Worth],
+        **changes: Any,
     ) -> None:
         """Let other matches take the place of those of their pairs, all or none.
 
@@ -392,7 +421,9 @@ class MatchStore(GroupStore):
             _write_state(file, _read_state(file).without_pairs(gone))
             for key, group in list(entries_of(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
-                is_escalated = group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs
+                is_escalated = (
+                    group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs
+                )
                 if is_asked or is_escalated:
                     del file[key]
 
@@ -419,7 +450,9 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             return sum(len(group) for group in file.values())
 
-    def levels(self, pairs: Iterable[Names], attribute: str = "level") -> dict[Names, int]:
+    def levels(
+        self, pairs: Iterable[Names], attribute: str = "level"
+    ) -> dict[Names, int]:
         """Return the level that the matches of each pair are from, or its ``tried`` ones."""
         with self._open("r") as file:
             return {pair: int(file[pair_key(*pair)].attrs[attribute]) for pair in pairs}
@@ -430,7 +463,9 @@ class MatchStore(GroupStore):
             for name1, name2 in pairs:
                 key = pair_key(name1, name2)
                 if not has_entry(file, key):
-                    raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
+                    raise StoreError(
+                        f"{self.path}: no matches of {name1}, {name2}; run match"
+                    )
                 yield _read_matches(file[key], (name1, name2))
 
 
@@ -452,7 +487,9 @@ def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatc
     rows = np.flatnonzero(matches0 >= 0)
     indices = np.stack([rows, matches0[rows]], axis=1)
     scores = checked(group, f"{prefix}matching_scores0")[rows].astype(np.float32)
-    return PairMatches(names, indices, scores, len(matches0), int(group.attrs[f"{prefix}level"]))
+    return PairMatches(
+        names, indices, scores, len(matches0), int(group.attrs[f"{prefix}level"])
+    )
 
 
 def _read_learned(group: h5py.Group, names: Names) -> Learned | None:
@@ -484,7 +521,9 @@ class GuidedStore(GroupStore):
                 datasets = {"exact": pair.exact}
                 names = np.asarray(pair.names, dtype=h5py.string_dtype())
                 key = pair_key(*pair.names)
-                self._write(file, key, datasets, names=names, num_inliers=pair.num_inliers)
+                self._write(
+                    file, key, datasets, names=names, num_inliers=pair.num_inliers
+                )
 
     def read(self) -> list[GuidedPair]:
         """Read all pairs."""
@@ -495,5 +534,7 @@ class GuidedStore(GroupStore):
             for _, group in sorted(entries_of(file), key=lambda item: item[0]):
                 (first, second) = group.attrs["names"]
                 num = int(group.attrs["num_inliers"])
-                found.append(GuidedPair((str(first), str(second)), checked(group, "exact"), num))
+                found.append(
+                    GuidedPair((str(first), str(second)), checked(group, "exact"), num)
+                )
         return found

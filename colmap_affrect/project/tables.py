@@ -30,7 +30,11 @@ class Row(NamedTuple):
 
 
 def read_table(
-    path: Path, where: str, columns: Sequence[str], key: str = "name", usual: Sequence[str] = ()
+    path: Path,
+    where: str,
+    columns: Sequence[str],
+    key: str = "name",
+    usual: Sequence[str] = (),
 ) -> list[Row]:
     """Read a CSV file whose first line names its columns, in any order.
 
@@ -84,13 +88,21 @@ def _read_lines(path: Path, where: str) -> list[tuple[int, list[str]]]:
     return lines
 
 
-def _check_header(header: Sequence[str], where: str, columns: Sequence[str], key: str) -> None:
+def _check_header(
+    header: Sequence[str], where: str, columns: Sequence[str], key: str
+) -> None:
     """Refuse a header with other columns, twice the same one, or without the key; OptionError."""
     if len(header) == 1 and ";" in header[0]:
-        raise OptionError(f"{where}: separate cells by commas, and write numbers with a point")
+        raise OptionError(
+            f"{where}: separate cells by commas, and write numbers with a point"
+        )
     for column in header:
         if column not in columns:
-            raise OptionError(f"{where}: unknown column '{column}'{suggestion(column, columns)}")
+            raise OptionError(
+                f"{where}: unknown column '{column}'{suggestion(column, columns)}"
+            )
     if (key and key not in header) or len(set(header)) < len(header):
         must = key or columns[0]
-        raise OptionError(f"{where}: its first line must have the column '{must}', and each once")
+        raise OptionError(
+            f"{where}: its first line must have the column '{must}', and each once"
+        )

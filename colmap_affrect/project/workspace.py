@@ -64,20 +64,34 @@ class Workspace:
         self.guided = path / "guided.h5"  # what guided matching found, by pair
         self.pairs = path / "pairs.txt"  # those to match
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
-        self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
+        self.snapshots = (
+            path / "sparse.snapshots"
+        )  # from which an interrupted mapping goes on
         self.best = path / "sparse.best"  # the best models so far, with their matches
         self.learned = path / "sparse.learned"  # models of learned matches alone
-        self.config, self.log = path / "config.toml", path / "run.log"  # options; of all runs
-        self.report, self.page = path / "report.json", path / "report.html"  # of the last run
-        self.cameras = path / "cameras.json"  # what is known of the database's, and from where
-        self.is_changed = False  # the database, by another program, and is to be mapped so
+        self.config, self.log = (
+            path / "config.toml",
+            path / "run.log",
+        )  # options; of all runs
+        self.report, self.page = (
+            path / "report.json",
+            path / "report.html",
+        )  # of the last run
+        self.cameras = (
+            path / "cameras.json"
+        )  # what is known of the database's, and from where
+        self.is_changed = (
+            False  # the database, by another program, and is to be mapped so
+        )
         self._record: dict[str, Any] | None = None
 
     @classmethod
     def beside(cls, database_path: Path) -> Self:
         """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
         if database_path.is_dir():  # '.' and '/' have no names
-            raise OptionError(f"{database_path}: is a folder; give the path of a database")
+            raise OptionError(
+                f"{database_path}: is a folder; give the path of a database"
+            )
         return cls(database_path.with_suffix(".affrect"), database_path)
 
     def branch(self, path: Path) -> "Workspace":
@@ -116,7 +130,10 @@ class Workspace:
         with suppress(OSError):  # not there, or refused when it is to be used
             paths = list(self.path.iterdir())
             for path in paths:
-                if path.name.partition(".")[0] in OWN_STEMS or path.name == outputs.LOCK:
+                if (
+                    path.name.partition(".")[0] in OWN_STEMS
+                    or path.name == outputs.LOCK
+                ):
                     outputs.refuse_link(path)
                     outputs.refuse_what_waits(path)
             foreign = [path.name for path in paths if not _may_be_ours(path)]
@@ -214,7 +231,11 @@ class Workspace:
         """Return the options on record for a stage, begun or not; None if there are none."""
         record = self.recorded()
         options = record.get(stage, record.get(PLANNED, {}).get(stage))
-        return None if options is None else {k: v for k, v in options.items() if k != WEIGHTS}
+        return (
+            None
+            if options is None
+            else {k: v for k, v in options.items() if k != WEIGHTS}
+        )
 
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage; OptionError when it was not run."""
@@ -222,14 +243,18 @@ class Workspace:
             first = f"run 'colmap-affrect {stage}' with this --output-path first"
             if self.users_database:
                 first = "call extract_features first, or move this folder along with its database"
-            raise OptionError(f"{self.path}: the {stage} stage has not been run there; {first}")
+            raise OptionError(
+                f"{self.path}: the {stage} stage has not been run there; {first}"
+            )
         return dict(self.recorded()[stage])
 
     def photographs(self) -> Path | None:
         """Return the folder of the photographs on record, None where none is known."""
         with suppress(WorkspaceError):
             record = self.recorded()
-            path = {**record.get("copy", {}), **record.get("extract", {})}.get("image_path")
+            path = {**record.get("copy", {}), **record.get("extract", {})}.get(
+                "image_path"
+            )
             return Path(path) if path else None
         return None
 
@@ -306,9 +331,17 @@ class Workspace:
                 raise ConflictError(
                     f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
                 )
-        changed = {**record, stage: dict(options), "recipe": recipe or record.get("recipe", "")}
+        changed = {
+            **record,
+            stage: dict(options),
+            "recipe": recipe or record.get("recipe", ""),
+        }
         planned = {**changed.pop(PLANNED, {}), **(plan or {})}
-        later = {name: dict(values) for name, values in planned.items() if name not in changed}
+        later = {
+            name: dict(values)
+            for name, values in planned.items()
+            if name not in changed
+        }
         self._write_record({**changed, PLANNED: later} if later else changed)
 
     def rewind(self, why: str = "what it was made from has changed") -> None:
@@ -320,13 +353,17 @@ class Workspace:
         if self.users_database:
             raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
         self.record_mapped(None)
-        outputs.remove_own(path for path in self._results("verify") if path != self.sparse)
+        outputs.remove_own(
+            path for path in self._results("verify") if path != self.sparse
+        )
         self._write_record(rewound(self.recorded(), "verify"))
 
     @property
     def _remedy(self) -> str:
         if self.users_database:
-            return "use a new database (from_database= takes over its images and cameras)"
+            return (
+                "use a new database (from_database= takes over its images and cameras)"
+            )
         return "use --overwrite to redo it and the stages after it, or another --output-path"
 
     def _refuse_foreign_results(self, stage: str) -> None:
@@ -346,9 +383,13 @@ class Workspace:
     def refuse_foreign_models(self) -> None:
         """Refuse to remove models beside which others have put something; ConflictError."""
         files = list(self.sparse.glob("*"))
-        for folder in [path for path in files if path.is_dir() and path.name.isdecimal()]:
+        for folder in [
+            path for path in files if path.is_dir() and path.name.isdecimal()
+        ]:
             files.remove(folder)
-            files += [path for path in folder.iterdir() if path.name not in FILES_OF_MODEL]
+            files += [
+                path for path in folder.iterdir() if path.name not in FILES_OF_MODEL
+            ]
         if foreign := [path for path in files if not path.name.startswith(".")]:
             raise ConflictError(
                 f"{foreign[0]}: was not made by this run and would be removed with its models; "
@@ -381,4 +422,8 @@ def _may_be_ours(path: Path) -> bool:
     """Return whether a file may be in an empty folder, or that of a run that was killed early."""
     if path.name == "run.log":
         return not path.stat().st_size
-    return path.name in outputs.OF_SYSTEMS or path.name.startswith(".") or path.suffix == NEW_SUFFIX
+    return (
+        path.name in outputs.OF_SYSTEMS
+        or path.name.startswith(".")
+        or path.suffix == NEW_SUFFIX
+    )

@@ -29,8 +29,12 @@ if TYPE_CHECKING:
     __all__ += ["__version__"]
     __all__ += _core.__all__
 else:
-    __all__ += [name for name in pycolmap.__all__ if name not in (*__all__, "match_vocabtree")]
-    globals().update({name: getattr(pycolmap, name) for name in __all__ if name not in globals()})
+    __all__ += [
+        name for name in pycolmap.__all__ if name not in (*__all__, "match_vocabtree")
+    ]
+    globals().update(
+        {name: getattr(pycolmap, name) for name in __all__ if name not in globals()}
+    )
 
     def __getattr__(name: str) -> Any:
         if name == "match_vocabtree":

@@ -25,4 +25,6 @@ def reconstruct(
 if TYPE_CHECKING:
     from pycolmap.panorama import *  # type: ignore[assignment] # noqa: F403
 else:
-    globals().update({n: v for n, v in vars(_copy).items() if n[0] != "_" and n not in globals()})
+    globals().update(
+        {n: v for n, v in vars(_copy).items() if n[0] != "_" and n not in globals()}
+    )

@@ -9,7 +9,13 @@ from typing import Annotated, ClassVar, Literal
 import cv2
 import numpy as np
 
-from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan, ShapeGrid
+from colmap_affrect.data import (
+    Mask,
+    Photograph,
+    Rectification,
+    RectificationPlan,
+    ShapeGrid,
+)
 from colmap_affrect.geometry.affine import fit_canvas, image_corners, rectifying_affine
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.tilts import asift_covering, near_optimal_covering
@@ -18,7 +24,9 @@ from colmap_affrect.rectifiers import base
 from colmap_affrect.rectifiers.regions import Region
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
-GAP_BLOCKS = 5  # parts of a region that are closer than this are warped together; judged
+GAP_BLOCKS = (
+    5  # parts of a region that are closer than this are warped together; judged
+)
 
 
 class IdentityOptions(base.RectifierOptions):
@@ -94,7 +102,9 @@ def plan_whole_image(
     items = []
     for tilt, angle in centers.tolist():
         linear = rectifying_affine(tilt, angle, area_preserving=options.area_preserving)
-        matrix, canvas_size = fit_canvas(linear, image_corners(image_size), margin_px=0.0)
+        matrix, canvas_size = fit_canvas(
+            linear, image_corners(image_size), margin_px=0.0
+        )
         items.append(Rectification(matrix, canvas_size, None, tilt, angle))
     return RectificationPlan(image_size, tuple(items))
 
@@ -118,7 +128,9 @@ class DenseShapes(base.WithInputs):
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan one warp for each part of each region."""
-        return plan_dense_shapes(self.shapes.grid(photograph.gray), photograph.size, self.options)
+        return plan_dense_shapes(
+            self.shapes.grid(photograph.gray), photograph.size, self.options
+        )
 
 
 def plan_dense_shapes(
@@ -146,7 +158,9 @@ def plan_dense_shapes(
             continue
         # The canvas of a warp is the bounding box of its region. Of a region with several parts one
         # canvas for each is far smaller than one for all.
-        parts = _connected_parts(blocks, GAP_BLOCKS) if options.min_part_frac else [blocks]
+        parts = (
+            _connected_parts(blocks, GAP_BLOCKS) if options.min_part_frac else [blocks]
+        )
         for part in parts:
             if np.count_nonzero(part) >= min_part_blocks:
                 region = _region_of_blocks(part, grid.step_px, image_size)
@@ -154,7 +168,9 @@ def plan_dense_shapes(
     return RectificationPlan(image_size, tuple(items), replaces_original=True)
 
 
-def _region_of_blocks(blocks: Mask, step_px: int, image_size: tuple[int, int]) -> Region:
+def _region_of_blocks(
+    blocks: Mask, step_px: int, image_size: tuple[int, int]
+) -> Region:
     """Return the pixels that blocks of a grid cover.
 
     Args:

@@ -58,7 +58,9 @@ class AffineWarpOptions(RectifierOptions):
     """Warp by diag(sqrt t, 1 / sqrt t), which keeps the area; False: by diag(1, 1 / t), which
     never magnifies (the paper)."""
 
-    def warp(self, region: Region, tilt: float, angle_rad: float, segment_id: int) -> Rectification:
+    def warp(
+        self, region: Region, tilt: float, angle_rad: float, segment_id: int
+    ) -> Rectification:
         """Plan the warp of a region by the rectifying map of a tilt class.
 
         Args:
@@ -70,7 +72,9 @@ class AffineWarpOptions(RectifierOptions):
         Returns:
             The warp, on a canvas that just holds the region.
         """
-        linear = rectifying_affine(tilt, angle_rad, area_preserving=self.area_preserving)
+        linear = rectifying_affine(
+            tilt, angle_rad, area_preserving=self.area_preserving
+        )
         matrix, canvas_size = fit_canvas(linear, region.outline(), MARGIN_PX)
         return Rectification(
             matrix, canvas_size, region.mask, tilt, angle_rad, region.origin, segment_id
@@ -80,9 +84,9 @@ class AffineWarpOptions(RectifierOptions):
 class CoverOptions(AffineWarpOptions):
     """Greedy cover of the affine shapes of a photograph in the space of tilts."""
 
-    shape_source: Annotated[SerializeAsAny[ShapeOptions], BeforeValidator(SHAPES.options)] = (
-        SecondMomentOptions()
-    )
+    shape_source: Annotated[
+        SerializeAsAny[ShapeOptions], BeforeValidator(SHAPES.options)
+    ] = SecondMomentOptions()
     """Where affine shapes come from: its name, or a section with ``name`` and options."""
     tilt_radius: Annotated[float, within(1.05, 10.0)] = 1.7
     """Radius r of a covering ball as a tilt ratio. Paper: 1.7."""

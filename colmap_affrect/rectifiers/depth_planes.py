@@ -19,7 +19,12 @@ from colmap_affrect.geometry import planes
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.options import Options, within
-from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, Warps, WithInputs
+from colmap_affrect.rectifiers.base import (
+    CoverOptions,
+    RectifierOptions,
+    Warps,
+    WithInputs,
+)
 from colmap_affrect.rectifiers.regions import Region, homography_rectification
 
 MAX_DEPTH_SIZE_PX = 640
@@ -79,7 +84,9 @@ class DepthPlanes(WithInputs):
         camera_matrix = photograph.camera_matrix
         items: list[Rectification] = []
         for number, segment in enumerate(segments):
-            homography = planes.fronto_parallel_homography(segment.normal, camera_matrix)
+            homography = planes.fronto_parallel_homography(
+                segment.normal, camera_matrix
+            )
             items.append(homography_rectification(segment.region, homography, number))
         outside = None
         if self.options.keep_original == "outside":
@@ -107,7 +114,9 @@ def planar_segments(
     """
     given_size = (depth.shape[1], depth.shape[0])
     depth, shrunk_from_given = planes.shrink_depth(depth, MAX_DEPTH_SIZE_PX)
-    depth_from_image = shrunk_from_given @ resized_from_original(photograph.size, given_size)
+    depth_from_image = shrunk_from_given @ resized_from_original(
+        photograph.size, given_size
+    )
     clusters = planes.cluster_normals(
         planes.normals_from_depth(depth, depth_from_image @ photograph.camera_matrix),
         num_candidates=options.num_candidates,
@@ -121,7 +130,9 @@ def planar_segments(
     min_area_px = options.min_region_frac * labels.size
     segments = []
     for label, normal in enumerate(clusters.normals):
-        cosines = planes.viewing_cosines(normal, photograph.camera_matrix, photograph.size)
+        cosines = planes.viewing_cosines(
+            normal, photograph.camera_matrix, photograph.size
+        )
         is_on_plane = (labels == label) & (cosines >= min_cosine)
         for region in connected_regions(is_on_plane, min_area_px):
             segments.append(PlanarSegment(region, normal))
@@ -130,7 +141,9 @@ def planar_segments(
 
 def connected_regions(mask: Mask, min_area_px: float) -> Iterator[Region]:
     """Yield the 4-connected regions that have enough pixels."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        mask.astype(np.uint8), connectivity=4
+    )
     for label, (left, top, width, height, area) in enumerate(stats.tolist()):
         is_background = label == 0
         if is_background or area < min_area_px:

@@ -61,11 +61,15 @@ def extract_rectified(
     views = _views(image, warps, mask)
     detected = [extractor.detect(view) for view in views]
     keep = _kept(detected, warps, plan, max_num_rectified)
-    selected = [features.select(kept) for features, kept in zip(detected, keep, strict=True)]
+    selected = [
+        features.select(kept) for features, kept in zip(detected, keep, strict=True)
+    ]
     described = extractor.describe([view[0] for view in views], selected)
     first_id = 0 if with_original else 1
     parts = []
-    for number, (features, warp_plan) in enumerate(zip(described, warps, strict=True), first_id):
+    for number, (features, warp_plan) in enumerate(
+        zip(described, warps, strict=True), first_id
+    ):
         parts.append(_mapped_back(features, warp_plan).with_rectification_id(number))
     return union(parts)
 
@@ -96,7 +100,9 @@ def _warped_mask(
     return np.minimum(inside, warp_mask(whole_image, image_size))
 
 
-def _mapped_back(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:
+def _mapped_back(
+    features: LocalFeatures, rectification: Rectification | None
+) -> LocalFeatures:
     """Map LAFs of a warp back into the image; those of the image itself (None) stay."""
     if rectification is None:
         return features
@@ -137,7 +143,9 @@ def _kept(
 
 
 def _is_usable(
-    features: LocalFeatures, rectification: Rectification | None, plan: RectificationPlan
+    features: LocalFeatures,
+    rectification: Rectification | None,
+    plan: RectificationPlan,
 ) -> Mask:
     """Return which features, LAFs in image px, belong to their part of the image.
 
@@ -153,7 +161,9 @@ def _is_usable(
     return np.asarray(in_image & rectification.in_region(features.keypoints))
 
 
-def _keep_strongest(keep: list[Mask], features: list[LocalFeatures], limit: int) -> None:
+def _keep_strongest(
+    keep: list[Mask], features: list[LocalFeatures], limit: int
+) -> None:
     """Clear in ``keep`` all but the ``limit`` strongest features of several views.
 
     Args:

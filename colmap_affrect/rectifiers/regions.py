@@ -42,7 +42,9 @@ class Region:
         return in_mask(self.mask, points, self.origin)
 
 
-def homography_rectification(region: Region, homography: Array, segment_id: int) -> Rectification:
+def homography_rectification(
+    region: Region, homography: Array, segment_id: int
+) -> Rectification:
     """Plan the warp of a region by a homography, scaled so that the canvas has twice its area.
 
     Args:

@@ -59,7 +59,9 @@ class _Case:
     def may_change_cameras(self) -> bool:
         """Whether cameras are not taken from a database or a list."""
         inputs = self.inputs
-        return bool(inputs and not (inputs.from_database or inputs.cameras.cameras_path))
+        return bool(
+            inputs and not (inputs.from_database or inputs.cameras.cameras_path)
+        )
 
 
 def advice(
@@ -84,11 +86,17 @@ def advice(
         What may help, the most promising first.
     """
     num_keypoints = context.graph.num_keypoints
-    lost = [n for n in missing if n in num_keypoints and n not in context.by_hand.left_out]
+    lost = [
+        n for n in missing if n in num_keypoints and n not in context.by_hand.left_out
+    ]
     num_usable = sum(map(bool, num_keypoints.values()))
     case = _Case(context, lost, len(num_keypoints), models, strongest, untried, effort)
     if (missing or case.doubts) and num_usable < 2:
-        return (Advice("more photographs: two that can be read and show the same make a model"),)
+        return (
+            Advice(
+                "more photographs: two that can be read and show the same make a model"
+            ),
+        )
     found = _of_effort(case)
     if not models and strongest >= ENOUGH:
         why = "more photographs, from other places: the matches of these show no depth"
@@ -100,7 +108,9 @@ def advice(
 
 
 def _of_fitting_focal(case: _Case) -> list[Advice]:
-    contradicted = [doubt for doubt in case.doubts if doubt.code == "focal_contradicted"]
+    contradicted = [
+        doubt for doubt in case.doubts if doubt.code == "focal_contradicted"
+    ]
     if not (case.may_change_cameras and contradicted):
         return []
     fitting_px = f"{contradicted[0].values['fitting_px']:.0f}"
@@ -110,7 +120,9 @@ def _of_fitting_focal(case: _Case) -> list[Advice]:
 
 def _of_other_recipe(case: _Case) -> list[Advice]:
     model = case.model
-    helped = case.lost or [n for n in model.doubtful if model.gains.get(n, 0.0) >= MIN_GAIN]
+    helped = case.lost or [
+        n for n in model.doubtful if model.gains.get(n, 0.0) >= MIN_GAIN
+    ]
     return _of_recipe(case.context, such_as(helped)) if helped else []
 
 
@@ -126,7 +138,9 @@ def _of_tie_points(case: _Case) -> list[Advice]:
         why += "; seven, each in two photographs of both, join two models"
     if table and not any(model.tie_points for model in case.models):
         why = f"no point of {table.name} is seen by two photographs of one model: {why}"
-    return [Advice(why, _again(context, "--tie-points", str(table or "tie-points.csv")))]
+    return [
+        Advice(why, _again(context, "--tie-points", str(table or "tie-points.csv")))
+    ]
 
 
 def _of_bridges(case: _Case) -> list[Advice]:
@@ -143,7 +157,9 @@ def _of_unknown_focal(case: _Case) -> list[Advice]:
     if not (case.may_change_cameras and case.has_doubt(["focal_unknown"])):
         return []
     why = "give lens and film, plate or sensor; if you do not know them, try a normal lens"
-    return [Advice(why, _anew(case.context, "--focal-mm", "50", "--film-width-mm", "36"))]
+    return [
+        Advice(why, _anew(case.context, "--focal-mm", "50", "--film-width-mm", "36"))
+    ]
 
 
 def _of_masks(case: _Case) -> list[Advice]:
@@ -185,7 +201,9 @@ def _of_effort(case: _Case) -> list[Advice]:
     why = f"not tried, at most about {max(1, round(minutes))} min more: {levels}"
     greater = EFFORT_NAMES[EFFORT_NAMES.index(case.effort) + 1]
     if context.command[1:2] != ("run",):
-        return [Advice(f"{why}; give the command of the run again, with --effort {greater}")]
+        return [
+            Advice(f"{why}; give the command of the run again, with --effort {greater}")
+        ]
     command = _without(context.command, ["--max-time"])
     if len(command) == len(context.command):  # the effort was used up
         command = [*_without(command, ["--effort"]), "--effort", greater]
@@ -227,8 +245,14 @@ def _without(command: Sequence[str], flags: Collection[str]) -> list[str]:
 def _anew(context: Context, *words: str) -> str:
     """Return a command for other options, which take the place of those that were given."""
     path = context.workspace.path
-    numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
-    new = (*words, "--output-path", str(next(place for place in numbered if not place.exists())))
+    numbered = (
+        path.with_name(f"{path.name}-{number}") for number in itertools.count(2)
+    )
+    new = (
+        *words,
+        "--output-path",
+        str(next(place for place in numbered if not place.exists())),
+    )
     return shlex.join([*_without(_run_command(context), new[::2]), *new])
 
 

@@ -122,7 +122,9 @@ def _region_labels(plan: RectificationPlan) -> dict[Point, str]:
             left, top = item.region_origin
             middle = (columns.mean() + left, rows.mean() + top)
             numbers[middle].append(str(number))
-    return {middle: ", ".join(same[:MAX_NUM_NUMBERS]) for middle, same in numbers.items()}
+    return {
+        middle: ", ".join(same[:MAX_NUM_NUMBERS]) for middle, same in numbers.items()
+    }
 
 
 def _features(level: InspectedLevel, colors: Sequence[Color]) -> Panel:
@@ -131,8 +133,12 @@ def _features(level: InspectedLevel, colors: Sequence[Color]) -> Panel:
     palette = [DARK, *colors]
     feature_colors = [palette[number] for number in features.rectification_ids.tolist()]
     num_shown = min(len(features), MAX_NUM_FEATURES)
-    title = f"the strongest {num_shown} of {len(features)} features; gray: without a warp"
-    panel = Panel.fit(_faded(level.photograph.gray, FEATURE_FADING), PANELS_PER_ROW, title)
+    title = (
+        f"the strongest {num_shown} of {len(features)} features; gray: without a warp"
+    )
+    panel = Panel.fit(
+        _faded(level.photograph.gray, FEATURE_FADING), PANELS_PER_ROW, title
+    )
     panel.draw_features(features, feature_colors, MAX_NUM_FEATURES)
     return panel
 
@@ -168,7 +174,9 @@ def warp_colors(plan: RectificationPlan) -> list[Color]:
     numbers: dict[tuple[float, float] | int, int] = {}  # of colours, by tilt or segment
     colors = []
     for item in plan.items:
-        key = (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
+        key = (
+            (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
+        )
         number = numbers.setdefault(key, len(numbers))
         colors.append(rgb(PALETTE[number % len(PALETTE)]))
     return colors
@@ -224,7 +232,9 @@ def inspect_image(
     workspace.begin()
     lines = []
     with new_results(*sheets, replaces=True) as new_sheets:
-        for number, photograph, sheet in zip(numbers, photographs, new_sheets[1:], strict=True):
+        for number, photograph, sheet in zip(
+            numbers, photographs, new_sheets[1:], strict=True
+        ):
             level = inspect_level(extractor, photograph, number)
             name = extractor.options.levels[number].rectifier.name
             line = f"level {number}, {name}: {_summary(level)}"
@@ -234,7 +244,9 @@ def inspect_image(
     return "\n".join([*lines, *map(str, sheets)])
 
 
-def _draw_lines(photograph: Photograph, original_size: tuple[int, int], sheet: Path) -> str:
+def _draw_lines(
+    photograph: Photograph, original_size: tuple[int, int], sheet: Path
+) -> str:
     """Draw the straight lines of a photograph; return what they say."""
     found = lines_of(photograph.gray, photograph.mask)
     report = line_report(found, original_size)
@@ -242,7 +254,9 @@ def _draw_lines(photograph: Photograph, original_size: tuple[int, int], sheet: P
     return f"lines: {report.sentence()}"
 
 
-def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int) -> InspectedLevel:
+def inspect_level(
+    extractor: ImageExtractor, photograph: Photograph, number: int
+) -> InspectedLevel:
     """Carry out one level of a recipe as extraction does, and keep what it works with.
 
     Args:

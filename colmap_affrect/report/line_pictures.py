@@ -52,15 +52,21 @@ class LineReports(Summarized):
 
     def summary(self) -> str:
         """Return a line for each photograph."""
-        lines = [f"{shown(name)}: {one.sentence()}" for name, one in self.photographs.items()]
-        lines += [f"{shown(name)}: not read: {why}" for name, why in self.failures.items()]
+        lines = [
+            f"{shown(name)}: {one.sentence()}" for name, one in self.photographs.items()
+        ]
+        lines += [
+            f"{shown(name)}: not read: {why}" for name, why in self.failures.items()
+        ]
         lines += [str(path) for path in self.pictures.values()]
         return "\n".join(lines)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content as plain values."""
         return {
-            "photographs": {name: asdict(one) for name, one in self.photographs.items()},
+            "photographs": {
+                name: asdict(one) for name, one in self.photographs.items()
+            },
             "failures": self.failures,
             "pictures": {name: str(path) for name, path in self.pictures.items()},
         }
@@ -86,13 +92,21 @@ def camera_from_lines(
         ImageError: the photograph cannot be read.
         OptionError: the array is no photograph, or the mask has another size.
     """
-    gray = _gray_values(image) if isinstance(image, np.ndarray) else read_gray(as_path(image))
+    gray = (
+        _gray_values(image)
+        if isinstance(image, np.ndarray)
+        else read_gray(as_path(image))
+    )
     if mask is not None and mask.shape != gray.shape:
-        raise OptionError(f"mask: has the shape {mask.shape}, and the photograph {gray.shape}")
+        raise OptionError(
+            f"mask: has the shape {mask.shape}, and the photograph {gray.shape}"
+        )
     return line_report(lines_of(gray, mask), (gray.shape[1], gray.shape[0]))
 
 
-def report_lines(paths: Sequence[PathLike], output_path: PathLike | None = None) -> LineReports:
+def report_lines(
+    paths: Sequence[PathLike], output_path: PathLike | None = None
+) -> LineReports:
     """Measure the straight lines of photographs; what cannot be read is passed over.
 
     Args:
@@ -142,7 +156,9 @@ def _gray_values(image: NDArray[Any]) -> GrayImage:
         )
     if image.ndim == 2:
         return np.ascontiguousarray(image)
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
+    return np.asarray(
+        cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8
+    )
 
 
 def line_sheet(

@@ -22,7 +22,9 @@ INLIER_COLORS = {
     1: "#e3b341", 30: "#f08c3c", 60: "#e2604f", 120: "#cf4080", 240: "#a14bb5", 480: "#6f60dd",
 }  # fmt: skip
 """Colours of pairs by their smallest number of inliers; all stand out from white and black."""
-FOLDERS = re.compile(r"(?<![^\s'\"(=\[])(?:[A-Za-z]:[\\/]|~?/)(?:[^/\\\s'\"]+[/\\])*(?=[^\s/])")
+FOLDERS = re.compile(
+    r"(?<![^\s'\"(=\[])(?:[A-Za-z]:[\\/]|~?/)(?:[^/\\\s'\"]+[/\\])*(?=[^\s/])"
+)
 """The folders at the beginning of a path of this machine."""
 
 
@@ -36,7 +38,9 @@ class Page:
     image_path: Path | None  # their folder; without it there are no thumbnails
     views: Sequence[View3D]  # models, which the script draws
     inlier_matrix: str = ""  # base64: (N, N) uint16 numbers of inliers
-    tie_points: Mapping[str, Any] | None = None  # what the tool for tie points begins with
+    tie_points: Mapping[str, Any] | None = (
+        None  # what the tool for tie points begins with
+    )
     can_mark: bool = False  # whether the page has that tool
 
 
@@ -67,7 +71,9 @@ def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
         return shown(without_folders(value, folders)) if type(value) is str else value
 
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader([page.template.parent, TEMPLATES], encoding="utf-8"),
+        loader=jinja2.FileSystemLoader(
+            [page.template.parent, TEMPLATES], encoding="utf-8"
+        ),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,

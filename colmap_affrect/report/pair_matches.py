@@ -55,9 +55,13 @@ class PairReader:
         self.graph = graph
         self.run = context if has_stores else None
         self.model = (
-            read_given_model(model_path) if model_path.exists() else pycolmap.Reconstruction()
+            read_given_model(model_path)
+            if model_path.exists()
+            else pycolmap.Reconstruction()
         )
-        self.agreement = agreements(self.graph, self.model)  # share of inliers, by verified pair
+        self.agreement = agreements(
+            self.graph, self.model
+        )  # share of inliers, by verified pair
 
     def read(self, names: Pair) -> MatchedPair:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
@@ -79,14 +83,19 @@ class PairReader:
         tie_points = self._tie_points(names, keypoints)
         num_tie_points = len(tie_points[0])
         if not is_matched and not len(inliers) and not num_tie_points:
-            raise OptionError(f"{names[0]}, {names[1]}: never matched; give another pair")
+            raise OptionError(
+                f"{names[0]}, {names[1]}: never matched; give another pair"
+            )
         kinds = self._feature_kinds(names, keypoints, inliers)
         kinds[(kinds != MatchKind.FOREIGN) & ~rows_in(inliers, raw)] = MatchKind.GUIDED
         rejected = raw[~rows_in(raw, inliers)]
         matches = np.concatenate([inliers, rejected])
         return MatchedPair(
             sizes,
-            [np.concatenate([keypoints[k][matches[:, k]], tie_points[k]]) for k in (0, 1)],
+            [
+                np.concatenate([keypoints[k][matches[:, k]], tie_points[k]])
+                for k in (0, 1)
+            ],
             np.concatenate(
                 [
                     kinds,
@@ -97,7 +106,9 @@ class PairReader:
             self._text(names, len(raw), len(inliers)),
         )
 
-    def _feature_kinds(self, names: Pair, keypoints: list[Array], matches: Indices) -> Indices:
+    def _feature_kinds(
+        self, names: Pair, keypoints: list[Array], matches: Indices
+    ) -> Indices:
         """Return the kinds of matches by their features: foreign if these are not of the run.
 
         Args:
@@ -108,7 +119,9 @@ class PairReader:
         kinds = np.full(len(matches), MatchKind.OWN)
         for side, name in enumerate(names):
             ids = self.run.features.read(name).rectification_ids if self.run else ()
-            if not self.run or len(ids) != len(keypoints[side]):  # another program changed it
+            if not self.run or len(ids) != len(
+                keypoints[side]
+            ):  # another program changed it
                 return np.full(len(matches), MatchKind.FOREIGN)
             feature_kinds = np.where(ids, MatchKind.WARPED, MatchKind.OWN)
             for level, rows in self.run.features.level_ranges(name).items():
@@ -140,7 +153,9 @@ class PairReader:
         text = f"{num_raw} raw matches"
         if self.run:
             pair = (min(names), max(names))
-            with suppress(StoreError):  # another program has matched the pair, and not the run
+            with suppress(
+                StoreError
+            ):  # another program has matched the pair, and not the run
                 level = self.run.matches.levels([pair])[pair]
                 text += f" of level {level} ({self.run.extraction.levels[level].name})"
         text += f", {num_inliers} inliers"

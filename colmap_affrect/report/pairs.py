@@ -102,18 +102,28 @@ def draw_matches(pair: MatchedPair, photographs: Sequence[ColorImage]) -> ColorI
         points[:, 0] += side * WIDTH_PX // 2
         ends.append(np.rint(points).astype(int).tolist())
     is_rejected = pair.kinds == MatchKind.REJECTED
-    for rows in (np.flatnonzero(is_rejected), np.flatnonzero(~is_rejected)):  # inliers on top
-        spread = np.linspace(0, len(rows) - 1, min(len(rows), MAX_NUM_LINES)).astype(int)
+    for rows in (
+        np.flatnonzero(is_rejected),
+        np.flatnonzero(~is_rejected),
+    ):  # inliers on top
+        spread = np.linspace(0, len(rows) - 1, min(len(rows), MAX_NUM_LINES)).astype(
+            int
+        )
         for row in rows[spread].tolist():
             color = rgb(COLORS[pair.kinds[row]])
             cv2.line(picture, ends[0][row], ends[1][row], color, 1, cv2.LINE_AA)
             for points in ends:
-                cv2.circle(picture, points[row], POINT_RADIUS_PX, color, -1, cv2.LINE_AA)
+                cv2.circle(
+                    picture, points[row], POINT_RADIUS_PX, color, -1, cv2.LINE_AA
+                )
     return picture
 
 
 def draw_pair(
-    path: Path, names: Pair, image_path: Path | None = None, picture_path: Path | None = None
+    path: Path,
+    names: Pair,
+    image_path: Path | None = None,
+    picture_path: Path | None = None,
 ) -> str:
     """Draw a pair of a run, or of any database, as PNG.
 
@@ -144,7 +154,9 @@ def draw_pair(
     stems = [name.replace("/", "-").rpartition(".")[0] for name in names]
     target = picture_path or path / "pairs" / fitting_name("--".join(stems), ".png")
     if target.suffix != ".png" or not (is_run or picture_path):
-        raise OptionError("--output-path: give the name of a new file that ends in .png")
+        raise OptionError(
+            "--output-path: give the name of a new file that ends in .png"
+        )
     text = f"{names[0]} and {names[1]}: {pair.text}"
     photographs = [read_color(image_path / name, SHEET_SIDE_PX) for name in names]
     picture = draw_matches(pair, photographs)
@@ -191,7 +203,9 @@ def draw_pairs_to_check(
     photograph = cache(lambda name: read_color(image_path / name, SIDE_PX))
     pictures = []
     for names, why in chosen.items():
-        with suppress(AffrectError):  # unreadable, or rejected by hand and never matched
+        with suppress(
+            AffrectError
+        ):  # unreadable, or rejected by hand and never matched
             pair = reader.read(names)
             drawn = draw_matches(pair, [photograph(name) for name in names])
             picture = Picture.from_image(shrink_to(drawn, 2 * SIDE_PX))

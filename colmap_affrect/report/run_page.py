@@ -63,7 +63,9 @@ class RunContent:
     image_path: Path | None = None  # folder of the photographs, if known
     marks: Marks = field(default_factory=dict)  # of the tie points by hand
     pairs_to_check: Sequence[PairPicture] = ()
-    cameras: Mapping[str, pycolmap.Camera] = field(default_factory=dict)  # in the database
+    cameras: Mapping[str, pycolmap.Camera] = field(
+        default_factory=dict
+    )  # in the database
 
 
 def write_run_page(
@@ -91,7 +93,9 @@ def write_run_page(
     views = _views(workspace, report)
     known = set(names)
     num_inliers = {
-        pair: count for pair, count in content.num_inliers.items() if known.issuperset(pair)
+        pair: count
+        for pair, count in content.num_inliers.items()
+        if known.issuperset(pair)
     }
     cameras = content.cameras
     page = Page(
@@ -112,9 +116,11 @@ def write_run_page(
             **_cameras(report, names),
             "lines": list(report.lines.items())[:MAX_NUM_CAMERAS],
             "num_lines_known": sum(one.is_known for one in report.lines.values()),
-            "wants_marks": bool(content.marks) or len(model.registered_names) < len(names),
+            "wants_marks": bool(content.marks)
+            or len(model.registered_names) < len(names),
             "residuals": [
-                f"{one.point} in {one.image}: {one.error_px:.1f} px" for one in model.tie_points
+                f"{one.point} in {one.image}: {one.error_px:.1f} px"
+                for one in model.tie_points
             ],
         },
         names=names,
@@ -131,7 +137,9 @@ def _views(workspace: Workspace, report: ReconstructionReport) -> list[View3D]:
     """Read the largest models, with the kinds of their cameras."""
     views = []
     for number, model in enumerate(report.models[:MAX_NUM_MODELS]):
-        kinds = {name: _card(name, report, model).kind for name in model.registered_names}
+        kinds = {
+            name: _card(name, report, model).kind for name in model.registered_names
+        }
         views.append(read_view(workspace.sparse / str(number), kinds))
     return views
 
@@ -141,7 +149,9 @@ def _kinds_legend(views: Sequence[View3D]) -> dict[str, str]:
     counts = Counter[str]()
     for view in views:
         counts.update(view.kinds.values())
-    return {kind: f"{text} ({counts[kind]})" for kind, text in KINDS.items() if counts[kind]}
+    return {
+        kind: f"{text} ({counts[kind]})" for kind, text in KINDS.items() if counts[kind]
+    }
 
 
 def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
@@ -228,7 +238,9 @@ def _tie_points(
     rows = []
     for point, points in marks.items():
         for name, (x, y) in points.items():
-            rows.append([point, index[name], float(x), float(y), errors_px.get((point, name))])
+            rows.append(
+                [point, index[name], float(x), float(y), errors_px.get((point, name))]
+            )
     photographs = []
     for name in names:
         camera = cameras.get(name)
@@ -253,5 +265,7 @@ def inlier_matrix(names: Sequence[str], num_inliers: Mapping[Pair, int]) -> str:
     for (name1, name2), inliers in num_inliers.items():
         row = index[name1]
         column = index[name2]
-        counts[row, column] = counts[column, row] = min(inliers, np.iinfo(np.uint16).max)
+        counts[row, column] = counts[column, row] = min(
+            inliers, np.iinfo(np.uint16).max
+        )
     return base64_text(counts.tobytes())

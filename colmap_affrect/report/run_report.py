@@ -50,7 +50,9 @@ class RunReport(ReconstructionReport):
         if not self.models:
             raise NoModelError(self.why_no_model)
         if number not in range(len(self.models)):
-            raise OptionError(f"number={number!r}: the models are 0 to {len(self.models) - 1}")
+            raise OptionError(
+                f"number={number!r}: the models are 0 to {len(self.models) - 1}"
+            )
         return pycolmap.Reconstruction(Workspace(self.output_path).sparse / str(number))
 
     def to_mapping(self) -> dict[str, Any]:
@@ -62,9 +64,8 @@ class RunReport(ReconstructionReport):
     def __repr__(self) -> str:
         registered = f"{len(self.registered_names)} of {self.images_total} images"
         where = str(self.output_path)
-        return (
-            f"RunReport(registered={registered!r}, status={self.status!r}, output_path={where!r})"
-        )
+        state = f"registered={registered!r}, status={self.status!r}"
+        return f"RunReport({state}, output_path={where!r})"
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: counts, photographs, what to try next."""
@@ -103,10 +104,23 @@ class RunReport(ReconstructionReport):
             chance = model.probabilities.get(name) if model else None
             percent = "" if chance is None else f"{chance:.0%}"
             why = text_of(model.doubtful.get(name, ())) if model else ""
-            rows.append([_text(name), percent, _text(f"doubtful: {why}" if why else "registered")])
-        rows += [[_text(name), "", _text(why.text())] for name, why in self.unregistered.items()]
-        more = f"<p>and {len(rows) - MAX_ROWS:,} more</p>" if len(rows) > MAX_ROWS else ""
-        table = _table(["photograph", "probability", "what became of it"], rows[:MAX_ROWS])
+            rows.append(
+                [
+                    _text(name),
+                    percent,
+                    _text(f"doubtful: {why}" if why else "registered"),
+                ]
+            )
+        rows += [
+            [_text(name), "", _text(why.text())]
+            for name, why in self.unregistered.items()
+        ]
+        more = (
+            f"<p>and {len(rows) - MAX_ROWS:,} more</p>" if len(rows) > MAX_ROWS else ""
+        )
+        table = _table(
+            ["photograph", "probability", "what became of it"], rows[:MAX_ROWS]
+        )
         return f"<details><summary>Photographs</summary>{table}{more}</details>"
 
     def _link(self) -> str:
@@ -115,7 +129,9 @@ class RunReport(ReconstructionReport):
         if page is None:
             return f"Results: <code>{_text(str(self.output_path))}</code>"
         relative = os.path.relpath(page)
-        if relative.startswith(os.pardir):  # notebooks show files below their folder only
+        if relative.startswith(
+            os.pardir
+        ):  # notebooks show files below their folder only
             return f"To look at: <code>{_text(str(page))}</code>"
         address = escape(Path(relative).as_posix(), quote=True)
         return f'To look at: <a href="{address}" target="_blank">{_text(relative)}</a>'
@@ -158,7 +174,9 @@ def cameras_of_report(
     return tuple(found)
 
 
-def lines_of_report(features: FeatureStore, names: Sequence[str]) -> dict[str, LineReport]:
+def lines_of_report(
+    features: FeatureStore, names: Sequence[str]
+) -> dict[str, LineReport]:
     """Return what straight lines say of photographs, without those that older versions read."""
     found = {}
     sizes = features.image_sizes()

@@ -17,12 +17,24 @@ from colmap_affrect.report.upright import upright_of_run
 
 # What is in the view, and how it is drawn, was chosen by eye.
 MAX_NUM_POINTS = 20_000  # that are drawn of a model; a page stays below some MB
-POINT_PERCENTILE = 90.0  # share of the points, by distance from their median, that is in the view
-RADIUS_MARGIN = 1.15  # radius of the view per distance of the farthest camera or point from it
-MIN_COMMON_UP = 1e-6  # length of the mean up vector that gives one; cameras held in all ways: none
-CAMERA_DEPTH = 0.07  # depth of the pyramids that stand for cameras, in radii of the view
-MAX_HALF_WIDTH = 0.8  # half width of a pyramid per depth; wider cameras would hide the model
-DARKEST = 60  # gray value of black points: colours have to show on light and on dark ground
+POINT_PERCENTILE = (
+    90.0  # share of the points, by distance from their median, that is in the view
+)
+RADIUS_MARGIN = (
+    1.15  # radius of the view per distance of the farthest camera or point from it
+)
+MIN_COMMON_UP = (
+    1e-6  # length of the mean up vector that gives one; cameras held in all ways: none
+)
+CAMERA_DEPTH = (
+    0.07  # depth of the pyramids that stand for cameras, in radii of the view
+)
+MAX_HALF_WIDTH = (
+    0.8  # half width of a pyramid per depth; wider cameras would hide the model
+)
+DARKEST = (
+    60  # gray value of black points: colours have to show on light and on dark ground
+)
 COLOR_RANGE = 140  # gray value of white points less that of black ones
 NO_COLOR = 128  # gray value of all points of a model without colours
 
@@ -32,10 +44,16 @@ class View3D:
     """A model ready for the page; lengths in units of the radius of the view."""
 
     num_points: int = 0
-    points: str = ""  # base64: (N, 3) uint16 positions from -1 to 1, then (N, 3) uint8 colours
-    cameras: tuple[tuple[str, Array], ...] = ()  # names; (5, 3) centre and corners of pyramids
+    points: str = (
+        ""  # base64: (N, 3) uint16 positions from -1 to 1, then (N, 3) uint8 colours
+    )
+    cameras: tuple[
+        tuple[str, Array], ...
+    ] = ()  # names; (5, 3) centre and corners of pyramids
     note: str = ""  # why there is nothing to draw; empty if there is
-    kinds: Mapping[str, str] = field(default_factory=dict)  # colours of cameras, by photograph
+    kinds: Mapping[str, str] = field(
+        default_factory=dict
+    )  # colours of cameras, by photograph
 
     def script_data(self, index: Mapping[str, int]) -> dict[str, Any]:
         """Return what the script of the page reads, as JSON has it.
@@ -90,7 +108,9 @@ def fit_upright(model: pycolmap.Reconstruction, up: Floats | None = None) -> Non
     middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
     farthest = float(np.linalg.norm(shown - middle, axis=1).max())
     radius = RADIUS_MARGIN * max(farthest, 1e-9)
-    model.transform(pycolmap.Sim3d(1 / radius, pycolmap.Rotation3d(rotation), -middle / radius))
+    model.transform(
+        pycolmap.Sim3d(1 / radius, pycolmap.Rotation3d(rotation), -middle / radius)
+    )
 
 
 def _upright_from_world(axes: Array, up: Floats | None) -> Floats:

@@ -10,7 +10,10 @@ import numpy as np
 from colmap_affrect.data import ColorImage, LocalFeatures
 from colmap_affrect.geometry.affine import project, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Bytes
-from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, resized_from_original
+from colmap_affrect.geometry.conventions import (
+    MEASUREMENT_SIGMAS,
+    resized_from_original,
+)
 
 Color = tuple[int, int, int]  # red, green, blue
 Point = tuple[float, float]  # x, y, px
@@ -54,10 +57,14 @@ class Panel:
         panel_width = max(1, round(scale * width))
         panel_height = max(1, round(scale * height))
         interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-        resized = cv2.resize(image, (panel_width, panel_height), interpolation=interpolation)
+        resized = cv2.resize(
+            image, (panel_width, panel_height), interpolation=interpolation
+        )
         panel: ColorImage = np.empty((panel_height, panel_width, 3), np.uint8)
         panel[:] = resized.reshape(panel_height, panel_width, -1)
-        panel_from_image = resized_from_original((width, height), (panel_width, panel_height))
+        panel_from_image = resized_from_original(
+            (width, height), (panel_width, panel_height)
+        )
         return cls(panel, title, panel_from_image)
 
     def draw_features(

@@ -9,7 +9,13 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Array, Floats
-from colmap_affrect.geometry.lines import FOCALS, MIN_EVIDENCE, SHIFTS, Lines, upright_of
+from colmap_affrect.geometry.lines import (
+    FOCALS,
+    MIN_EVIDENCE,
+    SHIFTS,
+    Lines,
+    upright_of,
+)
 from colmap_affrect.geometry.upright import agreed_up, upright_rotation
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.stores import FeatureStore
@@ -42,7 +48,9 @@ def upright_of_run(model_path: Path, model: pycolmap.Reconstruction) -> Upright 
     if not workspace.features.exists():
         return None
     try:
-        if " " in workspace.made_from("map"):  # it extends another model, whose frame it keeps
+        if " " in workspace.made_from(
+            "map"
+        ):  # it extends another model, whose frame it keeps
             return None
         return _upright(model, FeatureStore(workspace.features))
     except AffrectError as error:
@@ -66,7 +74,11 @@ def _upright(model: pycolmap.Reconstruction, features: FeatureStore) -> Upright 
         axes = _axes(image)
         held.append(-axes[:, 1])
         lines = features.lines(image.name) if image.name in known else None
-        up = None if lines is None else _up_in_camera(lines, model.cameras[image.camera_id])
+        up = (
+            None
+            if lines is None
+            else _up_in_camera(lines, model.cameras[image.camera_id])
+        )
         if up is not None:
             names.append(str(image.name))
             directions.append(axes @ up)

@@ -79,17 +79,24 @@ class Inputs(Options):
             return list_images(folder, listed if self.image_list_path else None)
         known = read_names(Path(self.from_database))
         if not known:
-            raise ImageError(f"{self.from_database}: holds no images; import some first")
+            raise ImageError(
+                f"{self.from_database}: holds no images; import some first"
+            )
         if not self.image_list_path:
             return checked_names(folder, known, self.from_database)
         names = list_images(folder, listed)
         unknown = sorted(set(names) - set(known))
         if unknown:
-            raise OptionError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
+            raise OptionError(
+                f"{listed}: lists {unknown[0]}, which {self.from_database} has not"
+            )
         return names
 
     def contents(
-        self, names: Iterable[str], options: ExtractionOptions, known: Mapping[str, Content]
+        self,
+        names: Iterable[str],
+        options: ExtractionOptions,
+        known: Mapping[str, Content],
     ) -> dict[str, Content]:
         """Return what the files of images hold, read where it may not be what is ``known``.
 
@@ -119,7 +126,11 @@ class Inputs(Options):
     @property
     def camera_files(self) -> list[Path]:
         """The files that cameras and images of the database are taken from."""
-        given = [Path(path) for path in (self.from_database, self.cameras.cameras_path) if path]
+        given = [
+            Path(path)
+            for path in (self.from_database, self.cameras.cameras_path)
+            if path
+        ]
         return [file for path in given for file in source_files(path)]
 
     def check(self) -> None:
@@ -155,7 +166,9 @@ class Inputs(Options):
 def source_files(path: Path) -> list[Path]:
     """Return the files of a database, a table, or the folder of a model."""
     files = path.iterdir() if path.is_dir() else database_files(path)
-    return sorted(file for file in files if file.is_file() and not file.name.endswith("-shm"))
+    return sorted(
+        file for file in files if file.is_file() and not file.name.endswith("-shm")
+    )
 
 
 class Resources(Options):
@@ -177,7 +190,11 @@ class Resources(Options):
     def usable_levels(self, options: ExtractionOptions) -> list[int]:
         """Return the first level, and those of escalation whose files of weights are here."""
         there = {key for key in options.weights if find(key, self.weights_path)}
-        return [k for k, level in enumerate(options.levels) if not k or level.weights <= there]
+        return [
+            k
+            for k, level in enumerate(options.levels)
+            if not k or level.weights <= there
+        ]
 
     def how_to_complete(self, options: ExtractionOptions) -> str:
         """Return how to get what other levels wait for; empty if none does."""
@@ -201,7 +218,10 @@ class OnRecord(Generic[Built]):
     """Options of a stage, as an attribute of a :class:`Context`, built from its section."""
 
     def __init__(
-        self, stage: str, build: Callable[[Any, str], Built], beside: type[Options] | None = None
+        self,
+        stage: str,
+        build: Callable[[Any, str], Built],
+        beside: type[Options] | None = None,
     ) -> None:
         """Take what builds them of values and of where these are; not of others ``beside`` them."""
         self._stage = stage
@@ -213,7 +233,9 @@ class OnRecord(Generic[Built]):
         if self._stage == "extract":
             workspace.require("extract")
         record = workspace.planned(self._stage) or {}
-        values = {key: value for key, value in record.items() if key not in self._others}
+        values = {
+            key: value for key, value in record.items() if key not in self._others
+        }
         return self._build(values, str(workspace.config))
 
 
@@ -237,13 +259,19 @@ class Context:
 
     workspace: Workspace  # the output folder
     resources: Resources = field(default_factory=Resources)  # weights and device
-    executor: Executor | None = None  # for images and pairs, e.g. a cluster; None: threads here
+    executor: Executor | None = (
+        None  # for images and pairs, e.g. a cluster; None: threads here
+    )
     progress: Progress = SILENT  # where to show progress
-    deadline_s: float = math.inf  # of time.monotonic(): from then on nothing more is tried
+    deadline_s: float = (
+        math.inf
+    )  # of time.monotonic(): from then on nothing more is tried
     effort: EffortName = "normal"  # how much is tried for images in need
     by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
     command: tuple[str, ...] = ()  # words of the command line, for advice
-    graph: ViewGraph = field(default_factory=lambda: ViewGraph(Path()))  # of the database
+    graph: ViewGraph = field(
+        default_factory=lambda: ViewGraph(Path())
+    )  # of the database
 
     def __post_init__(self) -> None:
         """Begin another graph where the folder, and so the database, is another."""
@@ -278,7 +306,9 @@ class Context:
     def num_verified_inliers(self) -> dict[Pair, int]:
         """Return the number of inliers of each verified pair; another program has its threshold."""
         is_foreign = self.workspace.is_foreign
-        return self.graph.num_inliers(1 if is_foreign else self.verification.min_num_inliers)
+        return self.graph.num_inliers(
+            1 if is_foreign else self.verification.min_num_inliers
+        )
 
     def verified_inliers(self) -> dict[Pair, Indices]:
         """Return the (M, 2) features of each verified pair that are inliers."""

@@ -28,13 +28,17 @@ def add_images(
     """Add images that the database lacks; return those that COLMAP does not take, with reasons."""
     start_database(workspace, inputs)
     original = Path(inputs.from_database) if inputs.from_database else None
-    rejected = import_images(workspace.database, Path(inputs.image_path), names, inputs.cameras)
+    rejected = import_images(
+        workspace.database, Path(inputs.image_path), names, inputs.cameras
+    )
     graph.forget()
     record_cameras(
         graph.cameras,
         workspace.cameras,
         None if original else inputs.initial_cameras,
-        read_camera_records(original.with_name(workspace.cameras.name)) if original else None,
+        read_camera_records(original.with_name(workspace.cameras.name))
+        if original
+        else None,
     )
     reason = f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})"
     return dict.fromkeys(rejected, reason)
@@ -46,18 +50,26 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
     graph = context.graph
     counts = store.num_keypoints()
     has_database = context.workspace.database.exists()
-    if has_database and context.workspace.cameras.exists() and counts == graph.num_keypoints:
+    if (
+        has_database
+        and context.workspace.cameras.exists()
+        and counts == graph.num_keypoints
+    ):
         return {}
     rejected = add_images(context.workspace, graph, context.inputs, list(counts))
     known = graph.num_keypoints
-    lacking = [name for name in counts if name in graph.ids and counts[name] != known.get(name)]
+    lacking = [
+        name for name in counts if name in graph.ids and counts[name] != known.get(name)
+    ]
     if not lacking:
         return rejected
     ids = graph.ids
     with graph.opened() as database:
         for name in lacking:
             ends = [part.stop for part in store.level_ranges(name).values()]
-            colmap_database.write_keypoints(database, ids[name], store.read_frames(name), ends)
+            colmap_database.write_keypoints(
+                database, ids[name], store.read_frames(name), ends
+            )
     return rejected
 
 

@@ -73,7 +73,11 @@ class RunOptions(InputOptions):
 
     def later_stages(self) -> dict[str, Options]:
         """Return the options of the stages after extraction that the recipe does not say."""
-        return {"pairs": self.pairs, "verify": self.verification, "map": self.mapper_options()}
+        return {
+            "pairs": self.pairs,
+            "verify": self.verification,
+            "map": self.mapper_options(),
+        }
 
 
 class InputKeywords(TypedDict, total=False):

@@ -26,7 +26,9 @@ class ImageRows:
 
     ids: dict[str, int]
     cameras: dict[str, pycolmap.Camera]
-    num_keypoints: dict[str, int]  # of the images that have keypoints on record, also none
+    num_keypoints: dict[
+        str, int
+    ]  # of the images that have keypoints on record, also none
 
 
 class ViewGraph:
@@ -129,11 +131,16 @@ class ViewGraph:
             By pair of image names (M, 2) features of both images.
         """
         found = self._all_inliers()
-        return {pair: rows for pair, rows in found.items() if len(rows) >= min_num_inliers}
+        return {
+            pair: rows for pair, rows in found.items() if len(rows) >= min_num_inliers
+        }
 
     def num_inliers(self, min_num_inliers: int) -> dict[Pair, int]:
         """Return the number of inliers of each pair that has at least so many."""
-        return {pair: len(matches) for pair, matches in self.inliers(min_num_inliers).items()}
+        return {
+            pair: len(matches)
+            for pair, matches in self.inliers(min_num_inliers).items()
+        }
 
     def digest(self) -> str:
         """Return a SHA-256 of all rows but descriptors."""
@@ -177,7 +184,9 @@ def _read_images(database: pycolmap.Database) -> ImageRows:
     )
 
 
-def _read_inliers(database: pycolmap.Database, images: ImageRows) -> dict[Pair, Indices]:
+def _read_inliers(
+    database: pycolmap.Database, images: ImageRows
+) -> dict[Pair, Indices]:
     names = {image_id: name for name, image_id in images.ids.items()}
     found = dict[Pair, Indices]()
     for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):

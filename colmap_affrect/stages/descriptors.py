@@ -58,7 +58,10 @@ def match_descriptors(
     Raises:
         OptionError: for arrays that do not fit.
     """
-    sets = {"image 1": (keypoints1, descriptors1), "image 2": (keypoints2, descriptors2)}
+    sets = {
+        "image 1": (keypoints1, descriptors1),
+        "image 2": (keypoints2, descriptors2),
+    }
     pair = ("image 1", "image 2")
     return match_feature_sets(sets, [pair], options)[pair]
 
@@ -85,7 +88,9 @@ def match_feature_sets(
     Raises:
         OptionError: for arrays that do not fit, or pairs of other images.
     """
-    listed = exhaustive_pairs(list(features)) if pairs is None else list(map(_two, pairs))
+    listed = (
+        exhaustive_pairs(list(features)) if pairs is None else list(map(_two, pairs))
+    )
     for name in {name for pair in listed for name in pair}:
         if name not in features:
             raise OptionError(f"{name}: is in a pair, and has no features")
@@ -98,7 +103,9 @@ def match_feature_sets(
 
 
 def matched(
-    pairs: Sequence[Pair], read: Callable[[str], Arrays], options: NearestOptions | None = None
+    pairs: Sequence[Pair],
+    read: Callable[[str], Arrays],
+    options: NearestOptions | None = None,
 ) -> Iterator[tuple[Pair, Matches]]:
     """Yield the matches of pairs; the arrays of images are read in the calling thread.
 
@@ -140,19 +147,30 @@ def _as_features(name: str, given: Arrays) -> ImageFeatures:
     """Check the arrays of an image, and return them as a matcher takes them."""
     try:
         points, rows = map(_as_array, given)
-    except (TypeError, ValueError, RuntimeError) as error:  # of numpy and torch, or not two
+    except (
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # of numpy and torch, or not two
         why = " ".join(str(error).split())
         raise OptionError(
             f"{name}: give keypoints and descriptors as two arrays ({why})"
         ) from error
-    if points.ndim != 2 or points.shape[1] < 2 or rows.ndim != 2 or len(rows) != len(points):
+    if (
+        points.ndim != 2
+        or points.shape[1] < 2
+        or rows.ndim != 2
+        or len(rows) != len(points)
+    ):
         raise OptionError(
             f"{name}: keypoints {points.shape} and descriptors {rows.shape} do not fit; give "
             "(N, 2) places and (N, D) descriptors"
         )
     if points.dtype.kind not in "fiu":
         raise OptionError(f"{name}: keypoints are {points.dtype}; give numbers of px")
-    if rows.dtype.kind not in "fiu" or (rows.dtype.kind in "iu" and rows.shape[1] != SIFT_SIZE):
+    if rows.dtype.kind not in "fiu" or (
+        rows.dtype.kind in "iu" and rows.shape[1] != SIFT_SIZE
+    ):
         raise OptionError(
             f"{name}: descriptors are {rows.dtype} of {rows.shape[1]} values; whole numbers are "
             "taken for SIFT of 128 values, of others give floats (of bits -1.0 and 1.0)"
@@ -182,7 +200,9 @@ def unit_rows(descriptors: Floats) -> Singles:
     exact = descriptors.astype(np.float64)
     with np.errstate(all="ignore"):  # what is not finite stays so
         _, exponents = np.frexp(np.abs(exact).max(axis=1, keepdims=True, initial=0.0))
-        rows = np.ldexp(exact, -exponents).astype(np.float32)  # whose squares are no 0 or infinity
+        rows = np.ldexp(exact, -exponents).astype(
+            np.float32
+        )  # whose squares are no 0 or infinity
         lengths = np.linalg.norm(rows, axis=1, keepdims=True)
         return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))
 
@@ -232,7 +252,9 @@ def match_database(
         with progress.stage("match", len(todo), "pairs") as advance:
             try:
                 for (first, second), found in matched(todo, read, options):
-                    colmap_database.write_matches(database, ids[first], ids[second], found.indices)
+                    colmap_database.write_matches(
+                        database, ids[first], ids[second], found.indices
+                    )
                     advance(1)
             except OptionError as error:
                 raise DatabaseError(f"{path}: {error}") from error
@@ -243,7 +265,9 @@ def _unmatched(
     database: pycolmap.Database, pairs: Sequence[Pair], ids: Mapping[str, int]
 ) -> list[Pair]:
     """Return the pairs of which no matches are on record, not even none."""
-    numbers = np.array([[ids[name] for name in pair] for pair in pairs], np.int64).reshape(-1, 2)
+    numbers = np.array(
+        [[ids[name] for name in pair] for pair in pairs], np.int64
+    ).reshape(-1, 2)
     lacking = colmap_database.lack_matches(database, numbers)
     return [pair for pair, lacks in zip(pairs, lacking, strict=True) if lacks]
 
@@ -274,15 +298,22 @@ def write_given_matches(
     """
     images = {image.name: image for image in database.read_all_images()}
     cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    counts = {n: database.num_keypoints_for_image(i.image_id) for n, i in images.items()}
+    counts = {
+        n: database.num_keypoints_for_image(i.image_id) for n, i in images.items()
+    }
     for pair, indices in given.read(counts):
         first, second = (images[name] for name in pair)
         try:
-            colmap_database.write_matches(database, first.image_id, second.image_id, indices)
+            colmap_database.write_matches(
+                database, first.image_id, second.image_id, indices
+            )
         except DatabaseError as error:
             raise StoreError(f"{given.path}: {pair[0]}, {pair[1]}: {error}") from error
         if match_type == "inliers":
-            known = [cameras[image.camera_id].has_prior_focal_length for image in (first, second)]
+            known = [
+                cameras[image.camera_id].has_prior_focal_length
+                for image in (first, second)
+            ]
             geometry = pycolmap.TwoViewGeometry()
             kinds = pycolmap.TwoViewGeometryConfiguration
             geometry.config = kinds.CALIBRATED if all(known) else kinds.UNCALIBRATED

@@ -28,7 +28,10 @@ from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.session.context import Context, Inputs
-from colmap_affrect.session.database_export import start_database, write_images_and_keypoints
+from colmap_affrect.session.database_export import (
+    start_database,
+    write_images_and_keypoints,
+)
 from colmap_affrect.stages import one_image
 from colmap_affrect.stages.one_image import ExtractedImage, ImageExtractor, ImageTask
 
@@ -57,7 +60,9 @@ def extract(
     inputs.check()
     workspace.require_own(folder)
     if inputs.from_database and not workspace.database.exists():
-        refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)  # before it is on record
+        refuse_unusable(
+            Path(inputs.from_database), FATAL_FOR_IMAGES
+        )  # before it is on record
     if image_names:
         names = checked_names(folder, image_names, "image_names")
     else:
@@ -74,15 +79,21 @@ def extract(
     weights = digests(extractor.weights)
     given = {**inputs.to_mapping(), **options.to_mapping(), WEIGHTS: weights}
     _record(workspace, given, recipe, later or {}, overwrite)
-    warnings = notes | _forget_changed(context, inputs, contents, are_all=not image_names)
+    warnings = notes | _forget_changed(
+        context, inputs, contents, are_all=not image_names
+    )
     start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
     if not (inputs.image_list_path or image_names):
-        warnings |= not_named(folder, names) if inputs.from_database else left_out(folder)
+        warnings |= (
+            not_named(folder, names) if inputs.from_database else left_out(folder)
+        )
     if whole:
-        warnings["masks"] = f"{len(whole)} images have none and are used whole, as {whole[0]} is"
+        warnings["masks"] = (
+            f"{len(whole)} images have none and are used whole, as {whole[0]} is"
+        )
     _log_warnings(warnings)
     failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
     if len(failures) == len(names):
@@ -106,7 +117,9 @@ def _record(
     plan = dict[str, Any]()
     for stage, options in {**recipe.later_stages, **later}.items():
         plan[stage] = options.to_mapping()
-    workspace.record_options("extract", given, plan=plan, recipe=recipe.name, overwrite=overwrite)
+    workspace.record_options(
+        "extract", given, plan=plan, recipe=recipe.name, overwrite=overwrite
+    )
 
 
 def _log_warnings(warnings: Mapping[str, str]) -> None:
@@ -165,7 +178,10 @@ def _extract_missing(
 
 
 def extract_images(
-    context: Context, inputs: Inputs, extractor: ImageExtractor, images: Sequence[tuple[str, int]]
+    context: Context,
+    inputs: Inputs,
+    extractor: ImageExtractor,
+    images: Sequence[tuple[str, int]],
 ) -> Generator[ExtractedImage | ImageError, None, None]:
     """Yield the features of images, or why one cannot be used, in order.
 
@@ -197,7 +213,9 @@ def extract_images(
         return ImageTask(inputs.photographs, name, level, intrinsics, size)
 
     tasks = (task(*image) for image in images)
-    for (name, level), found in zip(images, executor.map(extractor, tasks, files), strict=True):
+    for (name, level), found in zip(
+        images, executor.map(extractor, tasks, files), strict=True
+    ):
         if isinstance(found, ExtractedImage):
             logger.debug("%s: %d features (level %d)", name, len(found.features), level)
             if found.warning:
@@ -271,12 +289,16 @@ def _forget_changed(
         if changed or gone:
             store.remove({*changed, *gone})
     left = known.keys() & contents.keys() - set(changed)
-    if other := {name: contents[name] for name in left if known[name] != contents[name]}:
+    if other := {
+        name: contents[name] for name in left if known[name] != contents[name]
+    }:
         store.record_contents(other)
     workspace.record_made_from(cameras=cameras)
     if not lines:
         return {}
-    return {inputs.image_path: f"{', '.join(lines)}; all that hangs on them is made again"}
+    return {
+        inputs.image_path: f"{', '.join(lines)}; all that hangs on them is made again"
+    }
 
 
 def _counted(names: Sequence[str], what: str) -> list[str]:

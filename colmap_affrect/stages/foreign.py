@@ -14,7 +14,12 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.checks import FATAL, refuse_unusable
-from colmap_affrect.colmap.database_copy import add_frames, copy_database, has_matches, read_names
+from colmap_affrect.colmap.database_copy import (
+    add_frames,
+    copy_database,
+    has_matches,
+    read_names,
+)
 from colmap_affrect.colmap.initial_cameras import InitialCameras, record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.errors import DatabaseError, OptionError
@@ -43,7 +48,9 @@ class ForeignDatabase:
 
     path: Path
     image_path: Path | None = None  # folder of the photographs
-    cameras: CameraOptions = field(default_factory=CameraOptions)  # for images of the database
+    cameras: CameraOptions = field(
+        default_factory=CameraOptions
+    )  # for images of the database
     matches_path: Path | None = None  # matches of its keypoints
     match_type: MatchType = "raw"  # what those are
     match_list_path: Path | None = None  # pairs to match by descriptors; None: all
@@ -79,7 +86,9 @@ class ForeignDatabase:
         """Return a digest of all files that are given."""
         database = content_of(source_files(self.path)).digest
         others = [self.matches_path, self.match_list_path]
-        others.append(Path(self.cameras.cameras_path) if self.cameras.cameras_path else None)
+        others.append(
+            Path(self.cameras.cameras_path) if self.cameras.cameras_path else None
+        )
         found = [content_of(source_files(path)).digest for path in others if path]
         return digest_of([database, *found]) if found else database
 
@@ -143,7 +152,9 @@ def copy_verified(
         raise DatabaseError(f"{source}: has no matches; match its images first")
     todo = len(colmap_database.unverified_pairs(workspace.database))
     if todo:
-        logger.warning("%s: %d pairs have matches only; they are verified now", source, todo)
+        logger.warning(
+            "%s: %d pairs have matches only; they are verified now", source, todo
+        )
     with context.progress.stage("verify", todo, "pairs") as advance:
         verify(workspace.database, verification, advance=advance)
     context.graph.forget()
@@ -195,4 +206,6 @@ def _match(context: Context, foreign: ForeignDatabase) -> None:
         pairs = read_pairs(foreign.match_list_path, names, foreign.image_path)
     num = match_database(path, pairs, progress=context.progress)
     if num:
-        logger.warning("%s: has no matches; %d pairs are matched now", foreign.path, num)
+        logger.warning(
+            "%s: has no matches; %d pairs are matched now", foreign.path, num
+        )

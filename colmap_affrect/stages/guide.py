@@ -59,7 +59,9 @@ def guide(context: Context, options: GuidedOptions | None = None) -> StageReport
     return StageReport("guide", time.perf_counter() - start, len(todo), num_done)
 
 
-def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, Indices]:
+def exact_inliers(
+    context: Context, guided: Iterable[GuidedPair]
+) -> dict[Pair, Indices]:
     """Return the inliers of each verified pair without the matches of :func:`current` ones."""
     exact = {pair.names: pair.exact for pair in guided if pair.num_inliers}
     return {**context.verified_inliers(), **exact}
@@ -75,7 +77,9 @@ def current(context: Context) -> list[GuidedPair]:
         return []
     counts = context.graph.num_inliers(0)
     return [
-        pair for pair in context.guided.read() if pair.num_inliers in (0, counts.get(pair.names))
+        pair
+        for pair in context.guided.read()
+        if pair.num_inliers in (0, counts.get(pair.names))
     ]
 
 
@@ -122,7 +126,9 @@ class GuidedMatcher:
         descriptors2, shapes2 = self._images(task.names[1])
         descriptors = (descriptors1, descriptors2)
         shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
-        return guided_matches(descriptors, shapes, task.model, task.inliers, self._options)
+        return guided_matches(
+            descriptors, shapes, task.model, task.inliers, self._options
+        )
 
     def _read(self, name: str) -> tuple[Singles, Array]:
         """Return descriptors and, where frames were measured one by one, their linear parts."""
@@ -149,9 +155,14 @@ class Guiding:
         max_size_px = context.extraction.max_image_size_px
         sizes = context.features.image_sizes()
         # Bands are as wide as features are exact: in pixels of the images as they were extracted.
-        self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
+        self.scales = {
+            name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()
+        }
         self.verifier = PairVerifier(
-            context.graph.ids, context.graph.cameras, context.verification, extracted_px(context)
+            context.graph.ids,
+            context.graph.cameras,
+            context.verification,
+            extracted_px(context),
         )
 
     def todo(self) -> tuple[list[Pair], int]:
@@ -178,7 +189,9 @@ class Guiding:
         if not pairs:
             return set()
         asked = {frozenset(pair) for pair in pairs}
-        listed = [pair for pair in self.context.listed_pairs() if frozenset(pair) in asked]
+        listed = [
+            pair for pair in self.context.listed_pairs() if frozenset(pair) in asked
+        ]
         levels = self.context.matches.levels(listed)
         return {frozenset(pair) for pair, level in levels.items() if level}
 
@@ -231,9 +244,14 @@ class Guiding:
             for names in pairs:
                 first = self.ids[names[0]]
                 second = self.ids[names[1]]
-                keypoints = (database.read_keypoints(first), database.read_keypoints(second))
+                keypoints = (
+                    database.read_keypoints(first),
+                    database.read_keypoints(second),
+                )
                 geometry = database.read_two_view_geometry(first, second)
-                model = pair_model(geometry, (cameras[first], cameras[second]), keypoints)
+                model = pair_model(
+                    geometry, (cameras[first], cameras[second]), keypoints
+                )
                 if not model:
                     continue
                 inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
@@ -254,9 +272,13 @@ class Guiding:
             geometry = self.verifier.geometry(task.names, frames, matches)
             if _is_better(geometry, task):
                 geometries[task.names] = geometry
-        counts = {names: len(geometry.inlier_matches) for names, geometry in geometries.items()}
+        counts = {
+            names: len(geometry.inlier_matches)
+            for names, geometry in geometries.items()
+        }
         self.context.guided.write(
-            GuidedPair(task.names, task.inliers, counts.get(task.names, 0)) for task, _ in found
+            GuidedPair(task.names, task.inliers, counts.get(task.names, 0))
+            for task, _ in found
         )
         self._write(geometries)
 
@@ -266,7 +288,9 @@ class Guiding:
         with self.context.graph.opened(for_pairs=True) as database:
             for names, geometry in geometries.items():
                 first, second = names
-                database.update_two_view_geometry(self.ids[first], self.ids[second], geometry)
+                database.update_two_view_geometry(
+                    self.ids[first], self.ids[second], geometry
+                )
 
 
 def _is_better(geometry: pycolmap.TwoViewGeometry, task: GuidedTask) -> bool:

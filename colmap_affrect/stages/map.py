@@ -79,7 +79,9 @@ def map_images(
     return StageReport("map", wall_s, len(models)), models
 
 
-def _models_before(sparse_path: Path, summaries: Sequence[ModelSummary]) -> list[MappedModel]:
+def _models_before(
+    sparse_path: Path, summaries: Sequence[ModelSummary]
+) -> list[MappedModel]:
     """Return the models that are there, to begin with."""
     models = list[MappedModel]()
     for folder, summary in zip(model_folders(sparse_path), summaries, strict=True):
@@ -88,7 +90,9 @@ def _models_before(sparse_path: Path, summaries: Sequence[ModelSummary]) -> list
     return models
 
 
-def _task(context: Context, extend: Extension | None, before: Sequence[MappedModel]) -> MappingTask:
+def _task(
+    context: Context, extend: Extension | None, before: Sequence[MappedModel]
+) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace = context.workspace
     by_hand = context.by_hand
@@ -104,7 +108,9 @@ def _task(context: Context, extend: Extension | None, before: Sequence[MappedMod
         workspace.photographs(),
         read_existing(extend, path) if extend else None,
         before,
-        unmeasured_pairs=frozenset() if copied else frozenset(unmeasured_pairs(context)),
+        unmeasured_pairs=frozenset()
+        if copied
+        else frozenset(unmeasured_pairs(context)),
         cameras=read_camera_records(workspace.cameras),
         may_share=not copied and context.inputs.may_share,
         tie_points=tie_points,
@@ -133,15 +139,21 @@ def _inputs(context: Context, extend: Extension | None) -> MappedFrom:
     return context.to_map(OWN if own else extend.digest())
 
 
-def agreements(verified: ViewGraph, model: pycolmap.Reconstruction) -> dict[Pair, float]:
+def agreements(
+    verified: ViewGraph, model: pycolmap.Reconstruction
+) -> dict[Pair, float]:
     """Return the share of inliers that agrees with a model by verified pair of a database.
 
     The strongest pairs of each photograph in the model count, the lower id of the database first.
     """
     with verified.reading() as database:
         graph = PairGraph.of(database, 1)
-    ids = {name: image_id for image_id, name in graph.names.items()}  # the model may have others
-    same = {i: ids[image.name] for i, image in model.images.items() if image.name in ids}
+    ids = {
+        name: image_id for image_id, name in graph.names.items()
+    }  # the model may have others
+    same = {
+        i: ids[image.name] for i, image in model.images.items() if image.name in ids
+    }
     poses = {same[i]: pose for i, pose in poses_of(model).items() if i in same}
     cameras = {same[i]: camera for i, camera in cameras_of(model).items() if i in same}
     pairs = graph.pairs_inside(poses)
@@ -190,7 +202,9 @@ def unregistered(
     return reasons
 
 
-def _why_not_mapped(context: Context, name: str, others: Sequence[ModelSummary]) -> Missing | None:
+def _why_not_mapped(
+    context: Context, name: str, others: Sequence[ModelSummary]
+) -> Missing | None:
     """Return why an image could not be in the largest model; None where it could."""
     for number, model in enumerate(others, start=1):
         if name in model.registered_names:

@@ -18,8 +18,18 @@ from colmap_affrect.errors import OptionError, PartError
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
-from colmap_affrect.matchers.base import MATCHERS, ImageFeatures, MatcherContext, MatcherOptions
-from colmap_affrect.pairs.lists import USUAL_IMAGES_IN_MEMORY, Pair, PairList, ordered_for_reuse
+from colmap_affrect.matchers.base import (
+    MATCHERS,
+    ImageFeatures,
+    MatcherContext,
+    MatcherOptions,
+)
+from colmap_affrect.pairs.lists import (
+    USUAL_IMAGES_IN_MEMORY,
+    Pair,
+    PairList,
+    ordered_for_reuse,
+)
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
@@ -31,18 +41,25 @@ from colmap_affrect.project.stores import (
 )
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.session.context import Context, Resources, require_same_files
-from colmap_affrect.session.database_export import write_images_and_keypoints, write_matches
+from colmap_affrect.session.database_export import (
+    write_images_and_keypoints,
+    write_matches,
+)
 from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
 
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
-MANY_MATCHES = 300  # of the features matched first: photographs of different things have up to 76
+MANY_MATCHES = (
+    300  # of the features matched first: photographs of different things have up to 76
+)
 NUM_TRIED = 40  # pairs matched by all features before many are
 MIN_GROWTH = 1.1  # of the matches that confirm each other, by all features; small scans have none
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
-BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
+BYTES_PER_FEATURE = (
+    870  # of a feature ready for matching, with descriptors of 128 and coarse ones
+)
 
 Found = TypeVar("Found")
 
@@ -74,10 +91,14 @@ def match(
         write_matches(context, database, pairs)
     wall_s = time.perf_counter() - start
     num_before = len(pairs) - missing.num
-    return StageReport("match", wall_s, missing.num, num_before, warnings=missing.warnings)
+    return StageReport(
+        "match", wall_s, missing.num, num_before, warnings=missing.warnings
+    )
 
 
-def _record_options(context: Context, options: MatcherOptions, *, overwrite: bool) -> None:
+def _record_options(
+    context: Context, options: MatcherOptions, *, overwrite: bool
+) -> None:
     try:
         context.extraction.matchers(options)
     except OptionError as error:
@@ -98,7 +119,9 @@ class _Missing:
     warnings: dict[str, str]
 
 
-def _match_missing(context: Context, pairs: PairList, options: MatcherOptions) -> _Missing:
+def _match_missing(
+    context: Context, pairs: PairList, options: MatcherOptions
+) -> _Missing:
     """Match the pairs that are not stored, by some of their features first, and learn what stands.
 
     The state has the digest of the list once all is done, so that an idle run looks at no pair.
@@ -176,7 +199,9 @@ def not_well_tied(matches: MatchStore, pairs: Sequence[Pair]) -> list[Pair]:
     many = {pair for pair, num in nums.items() if num >= MANY_MATCHES}
     count = Counter(name for pair in many for name in pair)
     well_tied = {name for name, num in count.items() if num >= NUM_WELL_TIED}
-    return [pair for pair in nums if pair not in many and not well_tied.issuperset(pair)]
+    return [
+        pair for pair in nums if pair not in many and not well_tied.issuperset(pair)
+    ]
 
 
 def _is_in_vain(
@@ -208,7 +233,9 @@ def num_confirming(features: FeatureStore, names: Pair, indices: Any) -> int:
 
 
 def write_batches(
-    found: Iterable[Found], write: Callable[[list[Found]], None], advance: Callable[[int], None]
+    found: Iterable[Found],
+    write: Callable[[list[Found]], None],
+    advance: Callable[[int], None],
 ) -> None:
     """Write what is found of pairs batch by batch, also the last one when the search is stopped."""
     batch = list[Found]()
@@ -228,7 +255,11 @@ def write_batches(
 
 
 def matched_at_level(
-    context: Context, pairs: Sequence[Pair], options: MatcherOptions, level: int, max_num: int = 0
+    context: Context,
+    pairs: Sequence[Pair],
+    options: MatcherOptions,
+    level: int,
+    max_num: int = 0,
 ) -> Generator[PairMatches, None, None]:
     """Match by the features of a level, and leave out what never moves.
 
@@ -272,7 +303,9 @@ class Matching:
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     max_num_features: int = 0  # of each image, those of the largest responses; 0: all
-    num_comparisons: float = 0  # about how many pairs of features there will be to compare
+    num_comparisons: float = (
+        0  # about how many pairs of features there will be to compare
+    )
     num_kept: int = USUAL_IMAGES_IN_MEMORY
 
 
@@ -291,8 +324,12 @@ def iterate_matches(
     if limit:
         counts = {name: min(count, limit) for name, count in counts.items()}
     num_comparisons = sum(counts[first] * counts[second] for first, second in pairs)
-    num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    known = replace(matching, num_comparisons=num_comparisons, num_kept=max(2, num_kept))
+    num_kept = (
+        CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
+    )
+    known = replace(
+        matching, num_comparisons=num_comparisons, num_kept=max(2, num_kept)
+    )
     matcher = CachedMatcher(known)
     ordered = ordered_for_reuse(pairs, max(1, num_kept // 2))
     yield from executor.map(matcher, ordered, [matching.store.path])
@@ -312,7 +349,9 @@ class PreparedImage:
 class CachedMatcher:
     """Matches pairs, and keeps the images that it has prepared; a copy elsewhere has none."""
 
-    def __init__(self, matching: Matching, sent: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, matching: Matching, sent: Mapping[str, str] | None = None
+    ) -> None:
         """Load the networks; ``sent`` are the digests of the weights that they must have."""
         options = matching.options
         resources = matching.resources
@@ -321,7 +360,9 @@ class CachedMatcher:
         self._weights = resolve(options.weights, resources.weights_path)
         if sent is not None:
             require_same_files(self._weights, sent)
-        context = MatcherContext(self._weights, resources.device, matching.num_comparisons)
+        context = MatcherContext(
+            self._weights, resources.device, matching.num_comparisons
+        )
         self.matcher = MATCHERS.make(options, context)
         self._images = lru_cache(matching.num_kept)(self._prepare)
         self._lock = threading.Lock()
@@ -362,4 +403,6 @@ class CachedMatcher:
             indices = np.sort(indices[order[:limit]])
         features = everything.select(indices)
         image = ImageFeatures(features, store.image_size(name), matching.extractor)
-        return PreparedImage(self.matcher.prepare(image), features.lafs, indices, end, is_part)
+        return PreparedImage(
+            self.matcher.prepare(image), features.lafs, indices, end, is_part
+        )

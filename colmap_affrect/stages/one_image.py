@@ -10,13 +10,28 @@ from typing import Any
 
 import numpy as np
 
-from colmap_affrect.data import LocalFeatures, Mask, Photograph, RectificationPlan, in_mask
+from colmap_affrect.data import (
+    LocalFeatures,
+    Mask,
+    Photograph,
+    RectificationPlan,
+    in_mask,
+)
 from colmap_affrect.errors import MEMORY_HINT, DepthError, ImageError, lacks_memory
-from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
+from colmap_affrect.features.base import (
+    EXTRACTORS,
+    SHAPES,
+    FeatureExtractor,
+    NetworkContext,
+)
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.conventions import camera_matrix, is_inside, resized_from_original
+from colmap_affrect.geometry.conventions import (
+    camera_matrix,
+    is_inside,
+    resized_from_original,
+)
 from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.images import reading
 from colmap_affrect.images.depth import DepthMaps
@@ -25,7 +40,12 @@ from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.parallel.executor import available_cores, available_memory_bytes
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions, Level
-from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
+from colmap_affrect.rectifiers.base import (
+    RECTIFIERS,
+    CoverOptions,
+    Rectifier,
+    RectifierInputs,
+)
 from colmap_affrect.rectifiers.execute import extract_rectified
 from colmap_affrect.session.context import Resources, require_same_files
 
@@ -51,7 +71,9 @@ class ImageTask:
     photographs: Photographs  # where it and its masks are
     name: str  # of the photograph
     level: int = 0  # of escalation: above 0 only the features that its rectifier adds
-    intrinsics: Array | None = None  # (3, 3) in pixel-centre px as stored; None: COLMAP's guess
+    intrinsics: Array | None = (
+        None  # (3, 3) in pixel-centre px as stored; None: COLMAP's guess
+    )
     camera_size: tuple[int, int] | None = None  # (width, height) of its camera, if any
 
 
@@ -64,15 +86,23 @@ class ImageExtractor:
     """
 
     options: ExtractionOptions  # of the recipe
-    extractors: Mapping[int, FeatureExtractor]  # by level, but those that wait for weights
+    extractors: Mapping[
+        int, FeatureExtractor
+    ]  # by level, but those that wait for weights
     rectifiers: Mapping[int, Rectifier]  # of the same levels
-    weights: Mapping[str, Path] = field(default_factory=dict)  # files of the networks by key
+    weights: Mapping[str, Path] = field(
+        default_factory=dict
+    )  # files of the networks by key
     resources: Resources = field(default_factory=Resources)  # that it was prepared with
     # held while networks run, which take one image at a time
     network_lock: AbstractContextManager[Any] = field(default_factory=Lock)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _prepared_elsewhere, (self.options, self.resources, digests(self.weights))
+        return _prepared_elsewhere, (
+            self.options,
+            self.resources,
+            digests(self.weights),
+        )
 
     def __call__(self, task: ImageTask) -> ExtractedImage | ImageError:
         """Extract the features of a photograph, or return why it cannot be used."""
@@ -80,7 +110,12 @@ class ImageExtractor:
         try:
             mask = task.photographs.mask(task.name)
             found = self.extract_file(
-                path, task.name, task.intrinsics, task.level, mask, with_lines=task.level == 0
+                path,
+                task.name,
+                task.intrinsics,
+                task.level,
+                mask,
+                with_lines=task.level == 0,
             )
         except ImageError as error:
             return error
@@ -124,7 +159,11 @@ class ImageExtractor:
             ImageError: the file cannot be read, or its mask has another size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
-        with self.network_lock if self.options.levels[level].uses_networks else nullcontext():
+        with (
+            self.network_lock
+            if self.options.levels[level].uses_networks
+            else nullcontext()
+        ):
             plan, warning = self.plan(photograph, level)
             features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
@@ -136,7 +175,9 @@ class ImageExtractor:
             keep &= in_mask(mask, features.keypoints)
         kept = features.select(keep)
         lines = lines_of(photograph.gray, photograph.mask) if with_lines else None
-        return ExtractedImage(kept, original_size, warning, photograph.stretched, lines=lines)
+        return ExtractedImage(
+            kept, original_size, warning, photograph.stretched, lines=lines
+        )
 
     def photograph(
         self,
@@ -148,7 +189,9 @@ class ImageExtractor:
     ) -> tuple[Photograph, tuple[int, int]]:
         """Read an image at the size of processing; also return its stored (width, height)."""
         stored = reading.decode(path)
-        black_and_white = reading.tones(stored) if self.options.stretch_contrast else None
+        black_and_white = (
+            reading.tones(stored) if self.options.stretch_contrast else None
+        )
         image = reading.in_eight_bits(stored, black_and_white)
         original_size = (image.shape[1], image.shape[0])
         chosen = self.options.levels[level]
@@ -156,17 +199,25 @@ class ImageExtractor:
         gray = reading.shrink_to(image, limit)
         color = None
         if chosen.features.in_color:
-            color = reading.read_color(path, limit, stretch=self.options.stretch_contrast)
+            color = reading.read_color(
+                path, limit, stretch=self.options.stretch_contrast
+            )
         size = (gray.shape[1], gray.shape[0])
-        original_camera = camera_matrix(original_size) if intrinsics is None else intrinsics
+        original_camera = (
+            camera_matrix(original_size) if intrinsics is None else intrinsics
+        )
         camera = resized_from_original(original_size, size) @ original_camera
         if mask is not None:
             mask = reading.shrink_mask(mask, size)
         stretched = black_and_white is not None
-        found = Photograph(gray, name or path.name, path, camera, mask, color, stretched)
+        found = Photograph(
+            gray, name or path.name, path, camera, mask, color, stretched
+        )
         return found, original_size
 
-    def plan(self, photograph: Photograph, level: int = 0) -> tuple[RectificationPlan, str]:
+    def plan(
+        self, photograph: Photograph, level: int = 0
+    ) -> tuple[RectificationPlan, str]:
         """Decide which warps to look at; without a usable depth map none, and say why."""
         if min(photograph.size) < MIN_RECTIFIABLE_PX:
             return RectificationPlan(photograph.size), ""
@@ -240,7 +291,9 @@ def prepare(
         source = None
         if isinstance(item, CoverOptions):
             source = shapes(item.shape_source, level.features)
-        return RECTIFIERS.make(item, RectifierInputs(source, depth if item.uses_depth else None))
+        return RECTIFIERS.make(
+            item, RectifierInputs(source, depth if item.uses_depth else None)
+        )
 
     rectifiers = {k: rectifier(level) for k, level in levels.items()}
     return ImageExtractor(options, extractors, rectifiers, weights, resources)

@@ -61,7 +61,9 @@ def choose_pairs(
     warnings = _forget_lost(context, there - pairs)
     lists.write_pairs(workspace.pairs, sorted(pairs))
     workspace.record_made_from(pairs=digest)
-    return StageReport("pairs", time.perf_counter() - start, len(pairs), warnings=warnings)
+    return StageReport(
+        "pairs", time.perf_counter() - start, len(pairs), warnings=warnings
+    )
 
 
 def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
@@ -88,7 +90,10 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
 
 
 def _say_lonely(
-    context: Context, names: Sequence[str], pairs: Collection[Pair], options: PairOptions
+    context: Context,
+    names: Sequence[str],
+    pairs: Collection[Pair],
+    options: PairOptions,
 ) -> None:
     """Say which photographs have no neighbour by their positions; AffrectError where none has."""
     near = f"within {options.max_distance_m:g} m of another one"
@@ -106,7 +111,9 @@ def _say_lonely(
         )  # fmt: skip
 
 
-def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pair]) -> set[Pair]:
+def _similar_pairs(
+    context: Context, options: PairOptions, there: Collection[Pair]
+) -> set[Pair]:
     """Return the pairs chosen by features; none when all images have pairs already."""
     features = context.features
     progress = context.progress
@@ -120,12 +127,16 @@ def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pai
 def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:
     """Add pairs to those that are matched already, as pycolmap's matchers do."""
     context.workspace.record_options("pairs", PairOptions().to_mapping())
-    lists.write_pairs(context.workspace.pairs, sorted(_pairs_there(context).union(pairs)))
+    lists.write_pairs(
+        context.workspace.pairs, sorted(_pairs_there(context).union(pairs))
+    )
 
 
 def _pairs_there(context: Context) -> set[Pair]:
     path = context.workspace.pairs
-    return set(context.listed_pairs()) if path.exists() and path.stat().st_size else set()
+    return (
+        set(context.listed_pairs()) if path.exists() and path.stat().st_size else set()
+    )
 
 
 def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
@@ -135,6 +146,8 @@ def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
     context.workspace.rewind()
     context.graph.forget()
     context.matches.remove(pairs=lost)
-    why = f"{len(lost)} pairs are not listed any more, such as {' and '.join(min(lost))}"
+    why = (
+        f"{len(lost)} pairs are not listed any more, such as {' and '.join(min(lost))}"
+    )
     logger.warning("%s: %s", context.workspace.pairs, why)
     return {str(context.workspace.pairs): why}

@@ -28,7 +28,9 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
-MAX_MOTION_FRAC = 0.005  # of the longer side; less is no motion: scans are not cut to the pixel
+MAX_MOTION_FRAC = (
+    0.005  # of the longer side; less is no motion: scans are not cut to the pixel
+)
 NUM_CELLS = 48  # cells along the longer side
 MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
@@ -40,8 +42,12 @@ MIN_FRAC = 0.001
 shrunk before features are found in them."""
 CONNECTED = 1  # cells by which those are grown that are looked at together
 MIN_EVIDENCE = 3.0  # nats, twenty to one, that a place stands still to the pixel
-MAX_SHARE_OF_PHOTOGRAPH = 0.5  # where more of what is matched never moves, the camera stands still
-MIN_MOVING = 15  # matches of a pair that move together elsewhere, which may make a model
+MAX_SHARE_OF_PHOTOGRAPH = (
+    0.5  # where more of what is matched never moves, the camera stands still
+)
+MIN_MOVING = (
+    15  # matches of a pair that move together elsewhere, which may make a model
+)
 MAX_SHARE_BESIDE = 0.2
 """Of all cells. Matches from beside one place to beside another, or from one to another, are left
 out only where these cells are so few: one in 25 of the scene's goes with them then, and of a
@@ -187,7 +193,9 @@ class StationaryFilter:
     def _learn_backgrounds(self, pairs: Sequence[Pair]) -> None:
         """Find where each photograph shows what stands still, and nothing that hides it."""
         votes: dict[str, _Votes] = defaultdict(_Votes.none)
-        for found in self._matches.read([p for p in pairs if self._common_size(p) in self._places]):
+        for found in self._matches.read(
+            [p for p in pairs if self._common_size(p) in self._places]
+        ):
             size = self._sizes[found.names[0]]
             are_still, first, second = self._still(found.names, found.indices, size)
             for name, cells in zip(found.names, (first, second), strict=True):
@@ -196,7 +204,9 @@ class StationaryFilter:
         for name, of_image in votes.items():
             background = of_image.background(self._places[self._sizes[name]])
             if background.any():
-                self._backgrounds[name] = background | self._backgrounds.get(name, background)
+                self._backgrounds[name] = background | self._backgrounds.get(
+                    name, background
+                )
 
     def _keep(self) -> None:
         """Put what is known on record."""
@@ -219,8 +229,12 @@ class StationaryFilter:
         # By size and cell: numbers of pairs with a match, and with one that does not move; images.
         matched: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
         still: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
-        images: dict[Size, Mask] = defaultdict(lambda: np.zeros((*cells, len(numbers)), bool))
-        for found in self._matches.read([pair for pair in pairs if self._common_size(pair)]):
+        images: dict[Size, Mask] = defaultdict(
+            lambda: np.zeros((*cells, len(numbers)), bool)
+        )
+        for found in self._matches.read(
+            [pair for pair in pairs if self._common_size(pair)]
+        ):
             size = self._sizes[found.names[0]]
             are_still, first, _ = self._still(found.names, found.indices, size)
             matched[size] += _mask(first)
@@ -230,7 +244,9 @@ class StationaryFilter:
                 images[size][unmoved, numbers[name]] = True
         places = {}
         for size, counts in matched.items():
-            likely = (still[size] >= MIN_NUM_PAIRS) & (still[size] >= MIN_SHARE * counts)
+            likely = (still[size] >= MIN_NUM_PAIRS) & (
+                still[size] >= MIN_SHARE * counts
+            )
             likely &= images[size].sum(2) >= MIN_NUM_IMAGES
             if likely.any():
                 exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
@@ -252,22 +268,30 @@ class StationaryFilter:
         limit_px = MAX_MOTION_FRAC * max(size)
         tolerance_px = _tolerance_px(size)
         own, connected = np.zeros((2, NUM_CELLS, NUM_CELLS))
-        for found in self._matches.read([p for p in pairs if self._common_size(p) == size]):
+        for found in self._matches.read(
+            [p for p in pairs if self._common_size(p) == size]
+        ):
             are_still, first, _ = self._still(found.names, found.indices, size)
             cells = first[are_still]
             if not _at(likely, cells).any():
                 continue
             points, others = self._ends(found.names, found.indices[are_still])
-            ratios = stationary_log_ratios(points, others - points, tolerance_px, limit_px)
+            ratios = stationary_log_ratios(
+                points, others - points, tolerance_px, limit_px
+            )
             own += _means(cells, ratios)
-            connected += _means(cells, means_of_regions(cells, ratios, NUM_CELLS, CONNECTED))
+            connected += _means(
+                cells, means_of_regions(cells, ratios, NUM_CELLS, CONNECTED)
+            )
         return np.minimum(own, connected)
 
     def _moves_elsewhere(self, pairs: Sequence[Pair], size: Size, places: Mask) -> bool:
         """Tell whether enough matches of some pairs move together outside of places."""
         num_pairs = 0
         names = set[str]()
-        for found in self._matches.read([p for p in pairs if self._common_size(p) == size]):
+        for found in self._matches.read(
+            [p for p in pairs if self._common_size(p) == size]
+        ):
             are_still, first, second = self._still(found.names, found.indices, size)
             are_moving = ~(are_still | _at(places, first) | _at(places, second))
             points, others = self._ends(found.names, found.indices[are_moving])
@@ -277,11 +301,17 @@ class StationaryFilter:
                 names.update(found.names)
         return num_pairs >= MIN_NUM_PAIRS and len(names) >= MIN_NUM_IMAGES
 
-    def _still(self, names: Pair, indices: Indices, size: Size) -> tuple[Mask, Indices, Indices]:
+    def _still(
+        self, names: Pair, indices: Indices, size: Size
+    ) -> tuple[Mask, Indices, Indices]:
         """Return which matches do not move; also the (M, 2) cells, column and row, of both ends."""
         first, second = self._ends(names, indices)
         motions = self._motions(names, indices)
-        return motions <= MAX_MOTION_FRAC * max(size), _cells(first, size), _cells(second, size)
+        return (
+            motions <= MAX_MOTION_FRAC * max(size),
+            _cells(first, size),
+            _cells(second, size),
+        )
 
     def _motions(self, names: Pair, indices: Indices) -> Array:
         """Return the (M,) px by which matches move."""
@@ -290,7 +320,9 @@ class StationaryFilter:
 
     def _ends(self, names: Pair, indices: Indices) -> tuple[Floats, Floats]:
         """Return the (M, 2) px of matches in both images."""
-        first, second = (self._points(name)[indices[:, side]] for side, name in enumerate(names))
+        first, second = (
+            self._points(name)[indices[:, side]] for side, name in enumerate(names)
+        )
         return first, second
 
     def _common_size(self, pair: Pair) -> Size | None:

@@ -4,16 +4,26 @@ import time
 from collections.abc import Sequence
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import ExtractedPx, VerificationOptions, verify_pairs
+from colmap_affrect.colmap.verification import (
+    ExtractedPx,
+    VerificationOptions,
+    verify_pairs,
+)
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.session.context import Context
-from colmap_affrect.session.database_export import write_images_and_keypoints, write_matches
+from colmap_affrect.session.database_export import (
+    write_images_and_keypoints,
+    write_matches,
+)
 
 
 def verify_matches(
-    context: Context, options: VerificationOptions | None = None, *, overwrite: bool = False
+    context: Context,
+    options: VerificationOptions | None = None,
+    *,
+    overwrite: bool = False,
 ) -> StageReport:
     """Estimate the two-view geometries of all matched pairs.
 
@@ -37,7 +47,11 @@ def verify_matches(
 
 
 def update_verified(
-    context: Context, pairs: Sequence[Pair], *, replaces: bool = False, shows: bool = False
+    context: Context,
+    pairs: Sequence[Pair],
+    *,
+    replaces: bool = False,
+    shows: bool = False,
 ) -> int:
     """Bring the database up to what is stored, and verify the pairs that are not verified there.
 
@@ -56,7 +70,9 @@ def update_verified(
         write_matches(context, database, pairs, replaces=replaces)
         todo = colmap_database.pairs_to_verify(database)
         if len(todo):
-            colmap_database.require_database_space(context.workspace.database, len(todo))
+            colmap_database.require_database_space(
+                context.workspace.database, len(todo)
+            )
         progress = context.progress if shows else SILENT
         with progress.stage("verify", len(todo), "pairs") as advance:
             verify_pairs(database, todo, context.verification, sizes_px, advance)

@@ -21,15 +21,21 @@ def main() -> int:
     """Return the exit code of colmap-affrect."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--image", required=True, help="container image with colmap-affrect, see docs/cluster.md"
+        "--image",
+        required=True,
+        help="container image with colmap-affrect, see docs/cluster.md",
     )
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--cores", type=int, default=8, help="of each worker")
     parser.add_argument("--memory", default="16Gi", help="of each worker")
     parser.add_argument(
-        "--claim", required=True, help="persistent volume claim with photographs and results"
+        "--claim",
+        required=True,
+        help="persistent volume claim with photographs and results",
     )
-    parser.add_argument("--mount-path", default="/shared", help="of the claim in the workers")
+    parser.add_argument(
+        "--mount-path", default="/shared", help="of the claim in the workers"
+    )
     parser.add_argument("arguments", nargs="+", help="of colmap-affrect run, after --")
     options = parser.parse_args()
     spec = make_cluster_spec(

@@ -30,10 +30,14 @@ def border_mask(width: int, height: int, border: float, caption: float) -> np.nd
 
 def main() -> None:
     """Write a mask for every photograph below a folder."""
-    parser = argparse.ArgumentParser(description="Masks without borders and captions of scans.")
+    parser = argparse.ArgumentParser(
+        description="Masks without borders and captions of scans."
+    )
     parser.add_argument("image_path", type=Path, help="folder of the photographs")
     parser.add_argument("mask_path", type=Path, help="folder for the masks")
-    parser.add_argument("--border", type=float, default=0.03, help="share of the shorter side")
+    parser.add_argument(
+        "--border", type=float, default=0.03, help="share of the shorter side"
+    )
     parser.add_argument(
         "--caption", type=float, default=0.0, help="share of the height, at the foot"
     )

@@ -65,11 +65,17 @@ def write_set(
         folder.mkdir(parents=True, exist_ok=True)
     images, calibrations, lists = folders
     registered = sorted(
-        (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
+        (model.image(image_id) for image_id in model.reg_image_ids()),
+        key=lambda image: image.name,
     )
-    stems = {image.name: image.name.rsplit(".", 1)[0].replace("/", "_") for image in registered}
+    stems = {
+        image.name: image.name.rsplit(".", 1)[0].replace("/", "_")
+        for image in registered
+    }
     if len(set(stems.values())) < len(stems):
-        raise SystemExit("two photographs would have the same name without folder and suffix")
+        raise SystemExit(
+            "two photographs would have the same name without folder and suffix"
+        )
     for image in registered:
         if image.camera.model.name not in CAMERA_MODELS:
             raise SystemExit(
@@ -77,7 +83,9 @@ def write_set(
                 "colmap-affrect export --format undistorted"
             )
         suffix = PurePosixPath(image.name).suffix
-        shutil.copyfile(image_path / image.name, images / f"{stems[image.name]}{suffix}")
+        shutil.copyfile(
+            image_path / image.name, images / f"{stems[image.name]}{suffix}"
+        )
         write_calibration(calibrations / f"calibration_{stems[image.name]}.h5", image)
     seen = {image.name: image for image in points_model.images.values()}
     names = [image.name for image in registered if image.name in seen]
@@ -95,16 +103,24 @@ def write_set(
 
 def main() -> None:
     """Read the models, write the set and print how many pairs each bin has."""
-    parser = argparse.ArgumentParser(description="An evaluation set from a COLMAP model.")
+    parser = argparse.ArgumentParser(
+        description="An evaluation set from a COLMAP model."
+    )
     parser.add_argument("model_path", type=Path, help="true poses and intrinsics")
     parser.add_argument("image_path", type=Path, help="folder of the photographs")
-    parser.add_argument("scene_path", type=Path, help="folder to write, named as the scene")
-    parser.add_argument("--points", type=Path, help="model with points of the same photographs")
+    parser.add_argument(
+        "scene_path", type=Path, help="folder to write, named as the scene"
+    )
+    parser.add_argument(
+        "--points", type=Path, help="model with points of the same photographs"
+    )
     options = parser.parse_args()
     model = pycolmap.Reconstruction(options.model_path)
     points_model = pycolmap.Reconstruction(options.points) if options.points else model
     if not points_model.num_points3D():
-        raise SystemExit(f"{options.points or options.model_path}: has no points; give --points")
+        raise SystemExit(
+            f"{options.points or options.model_path}: has no points; give --points"
+        )
     counts = write_set(model, points_model, options.image_path, options.scene_path)
     for limit, count in enumerate(counts - np.append(counts[1:], 0)):
         print(f"covisibility 0.{limit}: {count} pairs")

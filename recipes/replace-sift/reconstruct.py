@@ -16,10 +16,14 @@ import colmap_affrect
 
 def main() -> None:
     """Make features, match all pairs, map, and say what was registered."""
-    parser = argparse.ArgumentParser(description="A pycolmap script with the features replaced.")
+    parser = argparse.ArgumentParser(
+        description="A pycolmap script with the features replaced."
+    )
     parser.add_argument("image_path", type=Path)
     parser.add_argument("output_path", type=Path)
-    parser.add_argument("--sift", action="store_true", help="COLMAP's SIFT, for comparison")
+    parser.add_argument(
+        "--sift", action="store_true", help="COLMAP's SIFT, for comparison"
+    )
     options = parser.parse_args()
     options.output_path.mkdir(parents=True, exist_ok=True)
     database_path = options.output_path / "database.db"
@@ -35,7 +39,9 @@ def main() -> None:
         database_path, options.image_path, options.output_path, mapping
     )
     for index, model in models.items():
-        print(f"model {index}: {model.num_reg_images()} images, {model.num_points3D()} points")
+        print(
+            f"model {index}: {model.num_reg_images()} images, {model.num_points3D()} points"
+        )
 
 
 if __name__ == "__main__":

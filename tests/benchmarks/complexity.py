@@ -73,7 +73,9 @@ def main() -> None:
         "--methods", nargs="+", default=["rectified", "second-moment-shapes"],
         help="[LABEL=]RECIPE[:KEY=VALUE[,...]]",
     )  # fmt: skip
-    parser.add_argument("--image-path", type=Path, required=True, help="folder of images")
+    parser.add_argument(
+        "--image-path", type=Path, required=True, help="folder of images"
+    )
     parser.add_argument("--depth-path", type=Path, help="folder of their depth maps")
     parser.add_argument("--num-images", type=int, default=2, help="evenly spaced")
     parser.add_argument("--num-rounds", type=int, default=3)
@@ -87,7 +89,8 @@ def main() -> None:
         extraction = parse_method(text, depth).recipe.extraction
         both = extraction, without_warps(extraction)
         extractors[text] = [
-            prepare(options, Resources(weights_path=arguments.weights)) for options in both
+            prepare(options, Resources(weights_path=arguments.weights))
+            for options in both
         ]
     rounds = [
         [

@@ -109,7 +109,9 @@ def curve(
         rows.append(row)
         print(work_path.name, json.dumps(row), flush=True)
 
-    def map_images(context: Context, mapper: Mapper, **how: Any) -> tuple[StageReport, Any]:
+    def map_images(
+        context: Context, mapper: Mapper, **how: Any
+    ) -> tuple[StageReport, Any]:
         report, models = map_once(context, mapper, **how)
         if report.num_done or not rows:
             add_row(context)
@@ -150,7 +152,10 @@ def spent(context: Context) -> Row:
             if number
         },
         "hope": round(
-            max(situation.best_at(k, math.inf).all_photographs for k in situation.usable), 3
+            max(
+                situation.best_at(k, math.inf).all_photographs for k in situation.usable
+            ),
+            3,
         ),
         "scores": vars(looked_at) if looked_at else None,
     }
@@ -176,16 +181,26 @@ def draw(found: dict[str, list[Row]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     known = [rows for rows in found.values() if "right" in rows[0]]
-    seconds = sorted({row["cpu_s"] - rows[0]["cpu_s"] for rows in known for row in rows})
+    seconds = sorted(
+        {row["cpu_s"] - rows[0]["cpu_s"] for rows in known for row in rows}
+    )
     right = [sum(right_at(rows, limit) for rows in known) for limit in seconds]
     figure, axes = plt.subplots(figsize=(7, 3.5))
     axes.step([max(1.0, limit) for limit in seconds], right, where="post")
     for name in EFFORTS:
         last = [last_row_of(rows, name) for rows in known]
-        spent = [row["cpu_s"] - rows[0]["cpu_s"] for row, rows in zip(last, known, strict=True)]
+        spent = [
+            row["cpu_s"] - rows[0]["cpu_s"]
+            for row, rows in zip(last, known, strict=True)
+        ]
         mean_s = sum(spent) / len(spent)
         num_right = sum(row["right"] for row in last)
-        axes.plot(mean_s, num_right, "o", label=f"--effort {name}: {num_right} in {mean_s:.0f} s")
+        axes.plot(
+            mean_s,
+            num_right,
+            "o",
+            label=f"--effort {name}: {num_right} in {mean_s:.0f} s",
+        )
     axes.legend(loc="lower right")
     axes.set_xscale("log")
     axes.set_xlabel("seconds of one core spent on each set after its first model")
@@ -199,15 +214,25 @@ def main() -> None:
     root = Path(__file__).resolve().parents[2]
     aged = [f"aged {name}" for name in SUBSETS if "all" not in name and "(" not in name]
     parser = parser_of(__doc__)
-    parser.add_argument("--subsets", nargs="+", default=[*SUBSETS, *aged], metavar="NAME")
-    parser.add_argument("--scenes-path", type=Path, default=root.parent / "shared" / "scenes")
+    parser.add_argument(
+        "--subsets", nargs="+", default=[*SUBSETS, *aged], metavar="NAME"
+    )
+    parser.add_argument(
+        "--scenes-path", type=Path, default=root.parent / "shared" / "scenes"
+    )
     parser.add_argument("--aged-path", type=Path, help="the same scenes, aged")
     parser.add_argument("--effort", choices=EFFORT_NAMES, default="high")
-    parser.add_argument("--max-time", type=float, default=math.inf, help="minutes of a run")
+    parser.add_argument(
+        "--max-time", type=float, default=math.inf, help="minutes of a run"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--plot-path", type=Path, help="PNG file of the curve")
-    parser.add_argument("--work-path", type=Path, required=True, help="folder of the runs")
-    parser.add_argument("--output-path", type=Path, required=True, help="JSON file of the rows")
+    parser.add_argument(
+        "--work-path", type=Path, required=True, help="folder of the runs"
+    )
+    parser.add_argument(
+        "--output-path", type=Path, required=True, help="JSON file of the rows"
+    )
     arguments = parser.parse_args()
     output_path = arguments.output_path
     found = json.loads(output_path.read_text()) if output_path.exists() else {}
@@ -222,12 +247,25 @@ def main() -> None:
         work_path = arguments.work_path / re.sub(r"\W+", "_", name)
         scene_path = scenes_path / subset.scene
         found[name] = curve(
-            scene_path, subset, work_path, arguments.effort, arguments.seed, arguments.max_time
+            scene_path,
+            subset,
+            work_path,
+            arguments.effort,
+            arguments.seed,
+            arguments.max_time,
         )
         output_path.write_text(json.dumps(found, indent=1) + "\n")
     if arguments.plot_path:
         draw(found, arguments.plot_path)
-    keys = ("right", "registered", "sure", "sure_and_wrong", "expected", "spent_s", "cpu_s")
+    keys = (
+        "right",
+        "registered",
+        "sure",
+        "sure_and_wrong",
+        "expected",
+        "spent_s",
+        "cpu_s",
+    )
     lines = [
         [name, *(str(row.get(key, "")) for key in keys)]
         for name, rows in found.items()

@@ -48,8 +48,20 @@ NUM_ROWS = 6
 STRONG = 100
 ENOUGH = 50
 MAX_ERROR_DEG = 10.0
-PRIOR = {"constant": -1.5, "consistent": 0.5, "inliers": 0.3, "tried": -0.5, "success_ratio": 0.3}
-RIDGE = {"constant": 0.9, "consistent": 6.0, "inliers": 6.0, "tried": 6.0, "success_ratio": 6.0}
+PRIOR = {
+    "constant": -1.5,
+    "consistent": 0.5,
+    "inliers": 0.3,
+    "tried": -0.5,
+    "success_ratio": 0.3,
+}
+RIDGE = {
+    "constant": 0.9,
+    "consistent": 6.0,
+    "inliers": 6.0,
+    "tried": 6.0,
+    "success_ratio": 6.0,
+}
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -74,7 +86,10 @@ def truth_of(scene_path: Path) -> Truth:
 
 
 def rotation_error_deg(
-    truth: Truth, names: Sequence[str], points: Sequence[Array], sizes: Sequence[tuple[int, int]]
+    truth: Truth,
+    names: Sequence[str],
+    points: Sequence[Array],
+    sizes: Sequence[tuple[int, int]],
 ) -> float | None:
     """Return how far the rotation of matched points is from the true one, None if unknown.
 
@@ -140,12 +155,17 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
                 context.verification,
                 level.max_image_size_px,
             )
-            with closing(matched_at_level(context, pairs, context.matching, number)) as found_pairs:
+            with closing(
+                matched_at_level(context, pairs, context.matching, number)
+            ) as found_pairs:
                 for found in found_pairs:
                     frames = [features.read_frames(name) for name in found.names]
-                    inliers = verifier.inliers(found.names, (frames[0], frames[1]), found.indices)
+                    inliers = verifier.inliers(
+                        found.names, (frames[0], frames[1]), found.indices
+                    )
                     points = [
-                        f[i, :, 2].astype(float) for f, i in zip(frames, inliers.T, strict=True)
+                        f[i, :, 2].astype(float)
+                        for f, i in zip(frames, inliers.T, strict=True)
                     ]
                     sizes = [features.image_size(name) for name in found.names]
                     error = rotation_error_deg(truth, found.names, points, sizes)
@@ -160,7 +180,9 @@ def is_right(row: Row, number: int) -> bool:
     return bool(count >= (STRONG if row["inliers"] else 1) and right)
 
 
-def examples(rows: Sequence[Row], number: int) -> Iterator[tuple[dict[str, float], bool]]:
+def examples(
+    rows: Sequence[Row], number: int
+) -> Iterator[tuple[dict[str, float], bool]]:
     """Yield terms and outcome of pairs of one set at a level, each several times."""
     drawn = random.Random(0)
     there = [row for row in rows if number in row["levels"]]
@@ -168,7 +190,11 @@ def examples(rows: Sequence[Row], number: int) -> Iterator[tuple[dict[str, float
         others = [other for other in there if other is not row]
         for _ in range(NUM_ROWS):
             tried = [k for k in row["levels"] if k != number and drawn.random() < 0.5]
-            in_vain = [k for k in tried if row["levels"][k][0] < (STRONG if row["inliers"] else 1)]
+            in_vain = [
+                k
+                for k in tried
+                if row["levels"][k][0] < (STRONG if row["inliers"] else 1)
+            ]
             known = drawn.sample(others, drawn.randint(0, len(others)))
             wins = sum(other["levels"][number][0] > 0 for other in known)
             bits = 1 | sum(1 << k for k in in_vain)
@@ -197,15 +223,23 @@ def main() -> None:
     plain = [name for name in SUBSETS if "(" not in name]
     parser = parser_of(__doc__)
     parser.add_argument("--subsets", nargs="+", default=[*plain, *aged], metavar="NAME")
-    parser.add_argument("--scenes-path", type=Path, default=root.parent / "shared" / "scenes")
+    parser.add_argument(
+        "--scenes-path", type=Path, default=root.parent / "shared" / "scenes"
+    )
     parser.add_argument("--aged-path", type=Path, help="the same scenes, aged")
-    parser.add_argument("--work-path", type=Path, required=True, help="folder of what is observed")
-    parser.add_argument("--output-path", type=Path, required=True, help="JSON file of the weights")
+    parser.add_argument(
+        "--work-path", type=Path, required=True, help="folder of what is observed"
+    )
+    parser.add_argument(
+        "--output-path", type=Path, required=True, help="JSON file of the weights"
+    )
     arguments = parser.parse_args()
     observed: dict[str, list[Row]] = {}
     for name in arguments.subsets:
         subset = SUBSETS[name.removeprefix("aged ")]
-        scenes = arguments.aged_path if name.startswith("aged ") else arguments.scenes_path
+        scenes = (
+            arguments.aged_path if name.startswith("aged ") else arguments.scenes_path
+        )
         if scenes is None:
             continue
         folder = arguments.work_path / name.replace("/", "_")
@@ -217,11 +251,15 @@ def main() -> None:
             path.write_text(json.dumps(rows))
         observed[name] = json.loads(path.read_text())
         for row in observed[name]:
-            row["levels"] = {int(number): found for number, found in row["levels"].items()}
+            row["levels"] = {
+                int(number): found for number, found in row["levels"].items()
+            }
     content = json.loads(arguments.output_path.read_text())
     levels = load_recipe("default").levels
     for number in range(1, len(levels)):
-        by_set: defaultdict[str, list[tuple[dict[str, float], bool]]] = defaultdict(list)
+        by_set: defaultdict[str, list[tuple[dict[str, float], bool]]] = defaultdict(
+            list
+        )
         for name, rows in observed.items():
             by_set[name] += examples(rows, number)
         sets = [name for name, found in by_set.items() for _ in found]
@@ -239,7 +277,9 @@ def main() -> None:
         content[kind]["coefficients"] = dict(zip(PRIOR, weights, strict=True))
         brier = np.mean((chance - outcome) ** 2)
         mean = np.var(outcome)
-        print(f"{kind}: {len(found) // NUM_ROWS} pairs, Brier {brier:.3f} (mean alone {mean:.3f})")
+        print(
+            f"{kind}: {len(found) // NUM_ROWS} pairs, Brier {brier:.3f} (mean alone {mean:.3f})"
+        )
     arguments.output_path.write_text(json.dumps(content, indent=1) + "\n")
 
 

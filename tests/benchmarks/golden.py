@@ -128,17 +128,30 @@ def python(*arguments: object) -> None:
     """Run Python, mostly the command line."""
     environment = {**os.environ, "COLMAP_AFFRECT_WEIGHTS": str(SHARED / "weights")}
     line = [sys.executable, *map(str, arguments)]
-    done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        line, env=environment, capture_output=True, text=True, check=False
+    )
     if done.returncode:
-        raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr[-2000:]}")
+        raise SystemExit(
+            f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr[-2000:]}"
+        )
 
 
-def run_digests(work: Path, images: Path, names: list[str], options: list[str]) -> dict[str, str]:
+def run_digests(
+    work: Path, images: Path, names: list[str], options: list[str]
+) -> dict[str, str]:
     """Run on some images of a folder and digest the results."""
     work.mkdir(parents=True)
     listed = work / "names.txt"
     listed.write_text("\n".join(names), encoding="utf-8")
-    given = ["--image-path", images, "--image-list-path", listed, "--output-path", work / "out"]
+    given = [
+        "--image-path",
+        images,
+        "--image-list-path",
+        listed,
+        "--output-path",
+        work / "out",
+    ]
     python("-m", "colmap_affrect", "run", "--quiet", *given, *options)
     return folder_digests(work / "out")
 
@@ -156,14 +169,28 @@ def interop_digests(work: Path, run: Path) -> dict[str, str]:
     """Export the database of an output folder to hloc's files, and import the folder's own."""
     work.mkdir(parents=True)
     made, own = (
-        ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+        [
+            "--features-path",
+            folder / "features.h5",
+            "--matches-path",
+            folder / "matches.h5",
+        ]
         for folder in (work, run)
     )
     command = ("-m", "colmap_affrect")
     python(*command, "export-h5", "-q", "--database-path", run / "database.db", *made)
-    given = ["--image-path", COURTYARD / "images", *own, "--database-path", work / "imported.db"]
+    given = [
+        "--image-path",
+        COURTYARD / "images",
+        *own,
+        "--database-path",
+        work / "imported.db",
+    ]
     python(*command, "import-h5", "-q", *given)
-    exported = {f"{kind}-hloc": h5_digest(work / f"{kind}.h5") for kind in ("features", "matches")}
+    exported = {
+        f"{kind}-hloc": h5_digest(work / f"{kind}.h5")
+        for kind in ("features", "matches")
+    }
     return exported | database_digests(work / "imported.db")
 
 
@@ -193,7 +220,10 @@ def jobs() -> dict[str, Job]:
         fountain = ["0000.jpg", "0005.jpg", "0010.jpg"]
         kermit = sorted(path.name for path in KERMIT.iterdir())
         found["courtyard affnet-shapes"] = (images, court[:3], AFFNET)
-        for name, of in (("fountain", (FOUNTAIN, fountain)), ("kermit", (KERMIT, kermit))):
+        for name, of in (
+            ("fountain", (FOUNTAIN, fountain)),
+            ("kermit", (KERMIT, kermit)),
+        ):
             found[f"{name} rectified"] = (*of, rectified)
             found[f"{name} on-demand"] = (*of, demand)
             found[f"{name} affnet-shapes"] = (of[0], of[1][:5], [*AFFNET, *FEWER])
@@ -216,7 +246,9 @@ def main() -> int:
     """Write the digests, and tell which of them differ from others."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("output", type=Path, help="file to write")
-    parser.add_argument("--against", type=Path, help="file of another version to compare with")
+    parser.add_argument(
+        "--against", type=Path, help="file of another version to compare with"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as work:
         found = scenarios(Path(work))
@@ -230,7 +262,10 @@ def main() -> int:
         for kind, value in digests.items()
         if found.get(name, {}).get(kind) != value
     ]
-    print("\n".join(f"differs: {line}" for line in different) or f"{len(expected)} runs: the same")
+    print(
+        "\n".join(f"differs: {line}" for line in different)
+        or f"{len(expected)} runs: the same"
+    )
     return bool(different)
 
 

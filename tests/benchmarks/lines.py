@@ -49,7 +49,9 @@ class Measured:
     scene: str
     name: str
     true_focal: float  # longer sides
-    scores: Numbers | None  # (F, S) log-likelihoods of focal lengths and shifts, not tempered
+    scores: (
+        Numbers | None
+    )  # (F, S) log-likelihoods of focal lengths and shifts, not tempered
     seconds: float  # of one core, without reading
 
 
@@ -103,7 +105,9 @@ def measure(scene: Path) -> list[Measured]:
         start = time.process_time()
         likelihood = lines_of(image).likelihood
         seconds = time.process_time() - start
-        scores = None if likelihood is None else likelihood.log_likelihoods * lines.TEMPER
+        scores = (
+            None if likelihood is None else likelihood.log_likelihoods * lines.TEMPER
+        )
         found.append(Measured(scene.name, name, focal, scores, seconds))
     return found
 
@@ -123,7 +127,9 @@ def log_densities(one: Measured) -> Numbers:
         chances = posterior(one.scores, temper)
         for model_sigma in MODEL_SIGMAS:
             distances = np.log(lines.FOCALS / one.true_focal) / model_sigma
-            densities = np.exp(-0.5 * distances**2) / model_sigma / math.sqrt(2.0 * math.pi)
+            densities = (
+                np.exp(-0.5 * distances**2) / model_sigma / math.sqrt(2.0 * math.pi)
+            )
             found.append(math.log((1.0 - LIES) * float(chances @ densities) + LIES))
     return np.array(found)
 
@@ -153,7 +159,9 @@ def judged(one: Measured, temper: float, model_sigma: float) -> Judged | None:
     return Judged(one.scene, one.name, one.true_focal, math.exp(mean), sigma)
 
 
-def row_of(scene: str, photographs: Sequence[Measured], found: Sequence[Judged]) -> list[str]:
+def row_of(
+    scene: str, photographs: Sequence[Measured], found: Sequence[Judged]
+) -> list[str]:
     """Return a row of the table: truth, found, and how far what is stated holds."""
     truths = [one.true_focal for one in photographs]
     known = [one for one in found if one.sigma < lines.KNOWN_SIGMA]
@@ -186,18 +194,28 @@ def draw(found: Sequence[Judged], path: Path) -> None:
     expected = [math.erf(limit / math.sqrt(2.0)) for limit in limits]
     known = [one for one in found if one.sigma < lines.KNOWN_SIGMA]
     left.plot([0, 1], [0, 1], color="0.7", linewidth=1)
-    for chosen, label, color in ((found, "all", "#1b6ca8"), (known, "lines know it", "#D55E00")):
+    for chosen, label, color in (
+        (found, "all", "#1b6ca8"),
+        (known, "lines know it", "#D55E00"),
+    ):
         zs = np.abs([one.z for one in chosen])
         shares = [float((zs < limit).mean()) for limit in limits]
         left.plot(expected, shares, "o-", color=color, label=f"{label} ({len(chosen)})")
-    left.set(xlabel="probability of the interval stated", ylabel="share with the truth in it")
+    left.set(
+        xlabel="probability of the interval stated", ylabel="share with the truth in it"
+    )
     left.legend(frameon=False)
     right.plot([0.4, 6.0], [0.4, 6.0], color="0.7", linewidth=1)
     for one in found:
         is_known = one.sigma < lines.KNOWN_SIGMA
-        bar = [[one.focal * (1.0 - math.exp(-one.sigma))], [one.focal * math.expm1(one.sigma)]]
+        bar = [
+            [one.focal * (1.0 - math.exp(-one.sigma))],
+            [one.focal * math.expm1(one.sigma)],
+        ]
         color = "#D55E00" if is_known else "#9ab8cc"
-        right.errorbar([one.true_focal], [one.focal], bar, fmt=".", color=color, linewidth=0.7)
+        right.errorbar(
+            [one.true_focal], [one.focal], bar, fmt=".", color=color, linewidth=0.7
+        )
     right.set(xscale="log", yscale="log", xlabel="true focal length, longer sides")
     right.set(ylabel="by the lines")
     ticks = [0.5, 0.7, 1.0, 1.5, 2.0, 3.0]
@@ -212,7 +230,9 @@ def measured(options: argparse.Namespace) -> list[Measured]:
     """Return what lines say of all photographs, on one core; what is kept is used again."""
     if options.work_path and options.work_path.exists():
         return list(pickle.loads(options.work_path.read_bytes()))
-    names = options.scenes or sorted(path.name for path in options.scenes_path.iterdir())
+    names = options.scenes or sorted(
+        path.name for path in options.scenes_path.iterdir()
+    )
     photographs = list[Measured]()
     cv2.setNumThreads(1)
     with threadpool_limits(1):
@@ -228,7 +248,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--scenes-path", type=Path, required=True)
     parser.add_argument("--diagram-path", type=Path, required=True)
-    parser.add_argument("--work-path", type=Path, help="file that keeps what was measured")
+    parser.add_argument(
+        "--work-path", type=Path, help="file that keeps what was measured"
+    )
     parser.add_argument("--scenes", nargs="*", help="by default all with known cameras")
     options = parser.parse_args()
     photographs = measured(options)
@@ -239,21 +261,35 @@ def main() -> None:
     for name in np.unique(scenes):
         others = [one for one in photographs if one.scene != name]
         constants = fitted(others, densities[scenes != name])
-        print(f"without {name}: temper {constants[0]:g}, deviation of the model {constants[1]:g}")
+        print(
+            f"without {name}: temper {constants[0]:g}, deviation of the model {constants[1]:g}"
+        )
         inside = [one for one in photographs if one.scene == name]
         stated = [judged(one, *constants) for one in inside]
         found = [one for one in stated if one is not None]
         rows.append(row_of(name, inside, found))
         everything += found
     rows.append(row_of("all", photographs, everything))
-    titles = ["scene", "images", "truth", "known ones", "within 10, 20 %", "z > 2", "largest z"]
+    titles = [
+        "scene",
+        "images",
+        "truth",
+        "known ones",
+        "within 10, 20 %",
+        "z > 2",
+        "largest z",
+    ]
     print(table(titles, rows))
     zs = np.abs([one.z for one in everything])
-    print(f"z below 1: {(zs < 1).mean():.1%}, below 2: {(zs < 2).mean():.1%} of {len(zs)}")
+    print(
+        f"z below 1: {(zs < 1).mean():.1%}, below 2: {(zs < 2).mean():.1%} of {len(zs)}"
+    )
     temper, model_sigma = fitted(photographs, densities)
     print(f"by all: TEMPER = {temper:g}, MODEL_SIGMA = {model_sigma:g}")
     seconds = [one.seconds for one in photographs]
-    print(f"seconds for a photograph: median {np.median(seconds):.2f}, most {max(seconds):.2f}")
+    print(
+        f"seconds for a photograph: median {np.median(seconds):.2f}, most {max(seconds):.2f}"
+    )
     draw(everything, options.diagram_path)
 
 

@@ -22,9 +22,15 @@ def describe_machine() -> str:
     """Return processor, cores, memory, load and versions."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    names = [
+        line.partition(":")[2].strip()
+        for line in lines
+        if line.startswith("model name")
+    ]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    versions = ", ".join(f"{name} {version}" for name, version in installed_versions().items())
+    versions = ", ".join(
+        f"{name} {version}" for name, version in installed_versions().items()
+    )
     return (
         f"{names[0] if names else platform.machine()}, {available_cores()} cores, "
         f"{memory:.0f} GiB, load {os.getloadavg()[0]:.1f} at the start\n{versions}"

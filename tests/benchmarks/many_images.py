@@ -49,13 +49,17 @@ def front(random: np.random.Generator) -> materials.Surface:
     palette = (render.BRICK, render.ASHLAR)[random.integers(2)]
     stones = materials.masonry(random, shape, TEXELS_PER_METRE, palette)
     color = random.uniform(0.4, 0.85, 3)
-    wall = materials.plaster(random, stones, tuple(color), fallen=random.uniform(0.0, 1.0))
+    wall = materials.plaster(
+        random, stones, tuple(color), fallen=random.uniform(0.0, 1.0)
+    )
     painter = materials.Painter(random, wall)
     for top in (0.85, 3.15):
         for left in np.arange(1.0, width - 1, random.uniform(2.0, 3.0)):
             size = random.uniform(0.7, 1.1), random.uniform(1.0, 1.3)
             place = left + random.uniform(0, 0.4), top + random.uniform(0, 0.2)
-            materials.window(painter, *place, *size, render.CARVED, arched=random.random() < 0.5)
+            materials.window(
+                painter, *place, *size, render.CARVED, arched=random.random() < 0.5
+            )
     materials.leaves(painter, [(random.uniform(0, width), height)], 3.6, 900)
     painter.finish()
     materials.weather(random, wall)
@@ -71,8 +75,12 @@ def house(number: int) -> Sequence[Any]:
     left = (number - 0.5) * width
     set_back = y_axis * random.uniform(0, 1.5)
     shape = materials.texture_shape(width, PAVEMENT_M, TEXELS_PER_METRE)
-    slabs = materials.masonry(random, shape, TEXELS_PER_METRE, render.PAVING, flagstones=0.55)
-    pavement = render.Plane(x_axis * left + 2 * y_axis, x_axis, -y_axis, width, PAVEMENT_M, slabs)
+    slabs = materials.masonry(
+        random, shape, TEXELS_PER_METRE, render.PAVING, flagstones=0.55
+    )
+    pavement = render.Plane(
+        x_axis * left + 2 * y_axis, x_axis, -y_axis, width, PAVEMENT_M, slabs
+    )
     wall_origin = x_axis * left + set_back + up * height
     wall = render.Plane(wall_origin, x_axis, -up, width, height, front(random))
     planes = [pavement, wall]
@@ -83,8 +91,12 @@ def house(number: int) -> Sequence[Any]:
 def street(position_m: float) -> Sequence[Any]:
     """Build the houses that can be seen from a position along the street."""
     render.SUPERSAMPLING = SAMPLES_PER_PIXEL
-    first, last = (round((position_m + way * SIGHT_M) / HOUSE_SIZE_M[0]) for way in (-1, 1))
-    return [plane for number in range(max(0, first), last + 1) for plane in house(number)]
+    first, last = (
+        round((position_m + way * SIGHT_M) / HOUSE_SIZE_M[0]) for way in (-1, 1)
+    )
+    return [
+        plane for number in range(max(0, first), last + 1) for plane in house(number)
+    ]
 
 
 def file_name(number: int) -> str:
@@ -102,7 +114,9 @@ def view_of(number: int) -> Any:
         STEP_M * number + random.uniform(-5.0, 5.0),
     )
     roll = random.uniform(-3, 3)
-    return render._walk_view(file_name(number), place, roll, FOCAL_LENGTH_PX, IMAGE_SIZE)
+    return render._walk_view(
+        file_name(number), place, roll, FOCAL_LENGTH_PX, IMAGE_SIZE
+    )
 
 
 def take_photograph(path: Path, number: int) -> None:
@@ -136,17 +150,28 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--output-path", type=Path, required=True)
     parser.add_argument("--num-images", type=int, default=1000)
-    parser.add_argument("options", nargs="*", help="of run, after --; default: --pairs retrieval")
+    parser.add_argument(
+        "options", nargs="*", help="of run, after --; default: --pairs retrieval"
+    )
     arguments = parser.parse_args()
     photographs = arguments.output_path / "images"
     out = arguments.output_path / "run"
     photographs.mkdir(parents=True, exist_ok=True)
     take_photographs(photographs, arguments.num_images)
-    parameters = f"{FOCAL_LENGTH_PX},{FOCAL_LENGTH_PX},{IMAGE_SIZE[0] / 2},{IMAGE_SIZE[1] / 2}"
+    parameters = (
+        f"{FOCAL_LENGTH_PX},{FOCAL_LENGTH_PX},{IMAGE_SIZE[0] / 2},{IMAGE_SIZE[1] / 2}"
+    )
     command = [
         *(sys.executable, "-m", "colmap_affrect", "run", "--overwrite"),
         *("--image-path", str(photographs), "--output-path", str(out)),
-        *("--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", parameters),
+        *(
+            "--camera-mode",
+            "single",
+            "--camera-model",
+            "PINHOLE",
+            "--camera-params",
+            parameters,
+        ),
         *(arguments.options or ("--pairs", "retrieval")),
     ]
     print(describe_machine())
@@ -154,7 +179,12 @@ def main() -> None:
     if status:
         raise SystemExit(f"the run ended with {os.waitstatus_to_exitcode(status)}")
     stages = json.loads((out / "report.json").read_text(encoding="utf-8"))["stages"]
-    print(table(("stage", "seconds"), [(each["name"], f"{each['wall_s']:.0f}") for each in stages]))
+    print(
+        table(
+            ("stage", "seconds"),
+            [(each["name"], f"{each['wall_s']:.0f}") for each in stages],
+        )
+    )
     print(f"memory at most: {usage.ru_maxrss / 2**20:.2f} GiB")  # of a process, KiB
     print(scores(out / "sparse" / "0", arguments.num_images))
 

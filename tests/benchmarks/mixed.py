@@ -28,7 +28,9 @@ def print_of(picture: Picture, drawn: np.random.Generator) -> Picture:
     """A soft gray print with grain, and little contrast."""
     gray = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.float64) / 255
     gray = cv2.GaussianBlur(gray, (0, 0), max(gray.shape) / 1600)
-    gray = 0.2 + 0.6 * gray ** drawn.uniform(0.7, 1.4) + drawn.normal(0, 0.03, gray.shape)
+    gray = (
+        0.2 + 0.6 * gray ** drawn.uniform(0.7, 1.4) + drawn.normal(0, 0.03, gray.shape)
+    )
     return cv2.merge([np.clip(255 * gray, 0, 255).astype(np.uint8)] * 3)
 
 
@@ -64,10 +66,14 @@ def main() -> None:
     target.mkdir(parents=True, exist_ok=True)
     for number, path in enumerate(sorted(source.iterdir())):
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        turn = number + number // len(LOOKS)  # every second photograph has all looks, too
+        turn = number + number // len(
+            LOOKS
+        )  # every second photograph has all looks, too
         look = LOOKS[turn % len(LOOKS)]
         changed = look(picture, np.random.default_rng(number))
-        cv2.imwrite(str(target / f"{path.stem}.jpg"), changed, [cv2.IMWRITE_JPEG_QUALITY, 90])
+        cv2.imwrite(
+            str(target / f"{path.stem}.jpg"), changed, [cv2.IMWRITE_JPEG_QUALITY, 90]
+        )
 
 
 if __name__ == "__main__":

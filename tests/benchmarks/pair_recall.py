@@ -30,7 +30,9 @@ from colmap_affrect.session.context import Context
 HEADER = ("chosen by", "chosen", "recall", "possible", "inliers", "s")
 
 
-def ways_to_choose(features: FeatureStore) -> dict[str, Callable[[int], Sequence[Pair]]]:
+def ways_to_choose(
+    features: FeatureStore,
+) -> dict[str, Callable[[int], Sequence[Pair]]]:
     """Return the ways to choose pairs such that images have so many neighbours on average."""
     names = sorted(features.names())
     return {

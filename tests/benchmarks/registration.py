@@ -62,7 +62,9 @@ SUBSETS = {
     "herz all": Subset(HERZ, 1, True),
 }
 calibrated = {name: subset for name, subset in SUBSETS.items() if subset.calibrated}
-SUBSETS |= {f"{name} (unknown)": s._replace(calibrated=False) for name, s in calibrated.items()}
+SUBSETS |= {
+    f"{name} (unknown)": s._replace(calibrated=False) for name, s in calibrated.items()
+}
 
 
 def compare(
@@ -83,7 +85,9 @@ def compare(
         *("--output-path", work_path / "compare", "--methods", *methods),
         *("--seeds", ",".join(map(str, range(num_seeds))), *options),
     ]
-    ended = subprocess.run(list(map(str, command)), check=True, stdout=subprocess.PIPE, text=True)
+    ended = subprocess.run(
+        list(map(str, command)), check=True, stdout=subprocess.PIPE, text=True
+    )
     comparison: dict[str, Any] = json.loads(ended.stdout)
     return comparison
 
@@ -107,7 +111,9 @@ def compare_subset(
         given += ["--ground-truth-path", truth]
     if subset.calibrated:
         lines = (scene_path / "ground_truth" / "cameras.txt").read_text().splitlines()
-        _, model, _, _, *parameters = next(line for line in lines if line[0] != "#").split()
+        _, model, _, _, *parameters = next(
+            line for line in lines if line[0] != "#"
+        ).split()
         given += ["--camera-mode", "single", "--camera-model", model]
         given += ["--camera-params", ",".join(parameters)]
     folder = work_path / re.sub(r"\W+", "_", name)
@@ -166,11 +172,19 @@ def main() -> None:
     root = Path(__file__).resolve().parents[2]
     parser = parser_of(__doc__)
     parser.add_argument("--methods", nargs="+", default=["sift", "rectified"])
-    parser.add_argument("--subsets", nargs="+", choices=SUBSETS, default=SUBSETS, metavar="NAME")
-    parser.add_argument("--seeds", type=int, default=5, help="run the seeds 0 to SEEDS - 1")
-    parser.add_argument("--scenes-path", type=Path, default=root.parent / "shared" / "scenes")
+    parser.add_argument(
+        "--subsets", nargs="+", choices=SUBSETS, default=SUBSETS, metavar="NAME"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=5, help="run the seeds 0 to SEEDS - 1"
+    )
+    parser.add_argument(
+        "--scenes-path", type=Path, default=root.parent / "shared" / "scenes"
+    )
     parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
-    parser.add_argument("--work-path", type=Path, required=True, help="folder of the comparisons")
+    parser.add_argument(
+        "--work-path", type=Path, required=True, help="folder of the comparisons"
+    )
     parser.add_argument("--output-path", type=Path, required=True, help="JSON file")
     arguments = parser.parse_args()
     output_path = arguments.output_path
@@ -181,7 +195,9 @@ def main() -> None:
         given = arguments.methods, arguments.seeds, *weights
         new = rows_of(name, compare_subset(name, *folders, *given))
         redone = {(row["subset"], row["method"]) for row in new}
-        rows = [row for row in rows if (row["subset"], row["method"]) not in redone] + new
+        rows = [
+            row for row in rows if (row["subset"], row["method"]) not in redone
+        ] + new
         output_path.write_text(json.dumps(rows, indent=1) + "\n")
     print(table_of(rows))
 

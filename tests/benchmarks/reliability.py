@@ -40,7 +40,12 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
+from colmap_affrect.colmap.model_files import (
+    model_poses,
+    pose_errors,
+    read_poses,
+    relative_pose,
+)
 from colmap_affrect.comparison import results
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MappingTask
 from colmap_affrect.mappers.reliability import COEFFICIENTS, TERMS
@@ -56,7 +61,9 @@ def mirrored(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:
     for number, path in enumerate(paths):
         shutil.copy(path, out)
         if number % 3 == 0:
-            cv2.imwrite(str(out / f"mirrored-{path.name}"), cv2.imread(str(path))[:, ::-1])
+            cv2.imwrite(
+                str(out / f"mirrored-{path.name}"), cv2.imread(str(path))[:, ::-1]
+            )
 
 
 def cropped(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:
@@ -77,7 +84,9 @@ def turned(paths: Sequence[Path], out: Path, _: Sequence[Path]) -> None:
     focal = 1.2 * width
     inner = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     for number, path in enumerate(paths):
-        yaw, pitch = np.deg2rad([4.0 * number - 2.0 * len(paths), 5.0 * (number % 3 - 1)])
+        yaw, pitch = np.deg2rad(
+            [4.0 * number - 2.0 * len(paths), 5.0 * (number % 3 - 1)]
+        )
         rotation, _ = cv2.Rodrigues(np.array([pitch, yaw, 0.02 * number]))
         warp = inner @ rotation @ np.linalg.inv(inner)
         view = cv2.warpPerspective(image, warp, (width, height))
@@ -153,12 +162,18 @@ def make(name: str, scenes_path: Path, work_path: Path) -> Path:
     out = work_path / name
     if (out / "report.json").exists():
         return out
-    paths = sorted((scenes_path / some.scene / "images").iterdir())[some.first :: some.step]
+    paths = sorted((scenes_path / some.scene / "images").iterdir())[
+        some.first :: some.step
+    ]
     with tempfile.TemporaryDirectory() as folder:
         images = Path(folder) / "images"
         images.mkdir()
         if some.spoil in SPOILS:
-            others = sorted((scenes_path / some.other / "images").iterdir()) if some.other else []
+            others = (
+                sorted((scenes_path / some.other / "images").iterdir())
+                if some.other
+                else []
+            )
             SPOILS[some.spoil](paths, images, others[::2])
         else:
             for path in paths:
@@ -177,7 +192,11 @@ def make(name: str, scenes_path: Path, work_path: Path) -> Path:
     return out
 
 
-CAMERAS = ("unknown", "known", "wrong")  # focal lengths: nothing is said, true ones, a wrong one
+CAMERAS = (
+    "unknown",
+    "known",
+    "wrong",
+)  # focal lengths: nothing is said, true ones, a wrong one
 WRONG_FACTORS = (0.7, 0.8, 1.25, 1.45)
 SIZES = (3, 4, 5, 6, 8, 10)  # photographs of a part
 MAX_ITERATIONS = 50
@@ -196,13 +215,17 @@ def truth_of(
         for folder in ("ground_truth", "pseudo_ground_truth"):
             if scene and (scenes_path / scene / folder).exists():
                 poses = read_poses(scenes_path / scene / folder)
-                found |= {prefix + Path(i).stem: (scene, pose) for i, pose in poses.items()}
+                found |= {
+                    prefix + Path(i).stem: (scene, pose) for i, pose in poses.items()
+                }
     copies = ("mirrored-", "turned-")
     known = {i: found.get(Path(i).stem) for i in images}
     return {i: place for i, place in known.items() if place or i.startswith(copies)}
 
 
-def correct_images(poses: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, bool]:
+def correct_images(
+    poses: Mapping[str, Any], truth: Mapping[str, Any]
+) -> dict[str, bool]:
     """Tell of each image whether it is registered correctly; those without a place are not."""
     names = sorted(poses.keys() & truth.keys())
     errors = {}
@@ -223,7 +246,9 @@ def parts_of(
     """Draw parts of a set, all of it first; small ones only where no model will be certain."""
     parts = [] if kind == "wrong" else [list(images)]
     while len(parts) < number:
-        size = min(int(rng.choice(SIZES[:4] if kind == "wrong" else SIZES)), len(images))
+        size = min(
+            int(rng.choice(SIZES[:4] if kind == "wrong" else SIZES)), len(images)
+        )
         parts.append(sorted(rng.choice(images, size, replace=False).tolist()))
     return parts
 
@@ -256,7 +281,9 @@ def cameras_of(
     return changed, cameras
 
 
-def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> list[dict[str, Any]]:
+def observe(
+    name: str, scenes_path: Path, work_path: Path, num_parts: int
+) -> list[dict[str, Any]]:
     """Map parts of a set; return a row for each photograph whose place is known or is none."""
     pycolmap.logging.minloglevel = 3
     out = make(name, scenes_path, work_path)
@@ -272,12 +299,16 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
         small = Path(folder) / "small.db"
         shutil.copy(out / "database.db", small)
         connection = sqlite3.connect(small)
-        connection.executescript("DELETE FROM descriptors; DELETE FROM matches; VACUUM;")
+        connection.executescript(
+            "DELETE FROM descriptors; DELETE FROM matches; VACUUM;"
+        )
         connection.close()
         for kind in CAMERAS:  # and "misplaced": one photograph of a model is moved
             if kind != "unknown" and not true_cameras:
                 continue
-            num = num_parts // 2 if kind == "wrong" else num_parts  # most given ones fit
+            num = (
+                num_parts // 2 if kind == "wrong" else num_parts
+            )  # most given ones fit
             for number, part in enumerate(parts_of(sorted(images), kind, num, rng)):
                 told = cameras_of(kind, records, true_cameras, rng)
                 if told is None:
@@ -287,7 +318,9 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
                 task = MappingTask(
                     path,
                     None,
-                    unmeasured_pairs=frozenset(pair for pair in unmeasured if {*part} >= {*pair}),
+                    unmeasured_pairs=frozenset(
+                        pair for pair in unmeasured if {*part} >= {*pair}
+                    ),
                     cameras=told[0],
                     may_share=kind == "unknown",
                 )
@@ -296,13 +329,20 @@ def observe(name: str, scenes_path: Path, work_path: Path, num_parts: int) -> li
                 if not models:
                     continue
                 best = max(models, key=lambda m: m.reconstruction.num_reg_images())
-                about = {"set": name, "scene": SETS[name].scene, "cameras": kind, "part": number}
+                about = {
+                    "set": name,
+                    "scene": SETS[name].scene,
+                    "cameras": kind,
+                    "part": number,
+                }
                 rows += [{**about, **row} for row in rows_of(best, task, truth)]
                 if kind == "unknown" and number % 2 == 0:
                     misplaced = misplace(best.reconstruction, rng)
                     about["cameras"] = "misplaced"
                     found = rows_of(best, task, truth)
-                    rows += [{**about, **row} for row in found if row["image"] == misplaced]
+                    rows += [
+                        {**about, **row} for row in found if row["image"] == misplaced
+                    ]
     return rows
 
 
@@ -330,13 +370,17 @@ def misplace(model: pycolmap.Reconstruction, rng: np.random.Generator) -> str:
     seen = [model.point3D(p.point3D_id).xyz for p in image.get_observation_points2D()]
     middle = np.median(seen, axis=0)
     axis = rng.normal(size=3)
-    turn = pycolmap.Rotation3d(np.deg2rad(rng.uniform(20, 90)) * axis / np.linalg.norm(axis))
+    turn = pycolmap.Rotation3d(
+        np.deg2rad(rng.uniform(20, 90)) * axis / np.linalg.norm(axis)
+    )
     around = pycolmap.Rigid3d(turn, middle - turn.matrix() @ middle)
     image.frame.set_cam_from_world(image.camera_id, image.cam_from_world() * around)
     return str(image.name)
 
 
-def write_part(source: Path, path: Path, images: set[int], cameras: Mapping[int, Any]) -> None:
+def write_part(
+    source: Path, path: Path, images: set[int], cameras: Mapping[int, Any]
+) -> None:
     """Copy a database with the verified pairs of some images only, and other cameras."""
     shutil.copy(source, path)
     with open_database(path) as database:
@@ -354,7 +398,9 @@ def calibration(some: Set, scenes_path: Path) -> dict[str, Any]:
     if not path.exists() or some.spoil not in ("", "aged"):
         return {}
     model = pycolmap.Reconstruction(path)
-    return {Path(i.name).stem: model.cameras[i.camera_id] for i in model.images.values()}
+    return {
+        Path(i.name).stem: model.cameras[i.camera_id] for i in model.images.values()
+    }
 
 
 def fitted(
@@ -376,7 +422,9 @@ def fitted(
         for _ in range(MAX_ITERATIONS):
             probabilities = 1.0 / (1.0 + np.exp(-part @ weights))
             gradient = part.T @ (probabilities - right) + prior @ weights
-            curvature = (part.T * (probabilities * (1.0 - probabilities))) @ part + prior
+            curvature = (
+                part.T * (probabilities * (1.0 - probabilities))
+            ) @ part + prior
             step = np.linalg.solve(curvature, gradient)
             weights -= step * min(1.0, 3.0 / np.abs(step).max())
         if (weights[:-1] >= 0.0).all():
@@ -401,7 +449,9 @@ def left_out(rows: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
     return found
 
 
-def scores(probabilities: NDArray[np.float64], right: NDArray[np.float64]) -> dict[str, float]:
+def scores(
+    probabilities: NDArray[np.float64], right: NDArray[np.float64]
+) -> dict[str, float]:
     """Return how good probabilities are."""
     sure = probabilities >= SURE
     doubtful = probabilities < DOUBTFUL
@@ -431,7 +481,9 @@ def draw(
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
     axes.plot([b[2] for b in bins], [b[3] for b in bins], "o-", color="#1b6ca8")
     for _, number, mean, share in bins:
-        axes.annotate(str(number), (mean, share), (6, -10), textcoords="offset points", fontsize=8)
+        axes.annotate(
+            str(number), (mean, share), (6, -10), textcoords="offset points", fontsize=8
+        )
     axes.set(xlabel="probability that the model states", ylabel="share that is right")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
@@ -444,15 +496,21 @@ def main() -> None:
     parser.add_argument("--scenes-path", type=Path, required=True)
     parser.add_argument("--work-path", type=Path, required=True)
     parser.add_argument("--diagram-path", type=Path, required=True)
-    parser.add_argument("--parts", type=int, default=8, help="of each set and kind of cameras")
+    parser.add_argument(
+        "--parts", type=int, default=8, help="of each set and kind of cameras"
+    )
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for name in SETS:
         path = options.work_path / f"{name}.jsonl"
         if not path.exists():
             found = observe(name, options.scenes_path, options.work_path, options.parts)
-            path.write_text("".join(json.dumps(row) + "\n" for row in found), encoding="utf-8")
-        rows += [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+            path.write_text(
+                "".join(json.dumps(row) + "\n" for row in found), encoding="utf-8"
+            )
+        rows += [
+            json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()
+        ]
     right = np.array([float(row["right"]) for row in rows])
     values = np.array([list(row["terms"].values()) for row in rows])
     slopes, constant = fitted(values, right)

@@ -22,7 +22,11 @@ from machine import describe_machine, parser_of, span, table
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.initial_cameras import import_images
-from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.colmap.verification import (
+    VerificationOptions,
+    verified_pairs,
+    verify,
+)
 from colmap_affrect.comparison.method_run import extract_sift, match_sift
 from colmap_affrect.comparison.methods import SIFT, Method, parse_method
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
@@ -60,7 +64,12 @@ def run_commands(method: Method, paths: Sequence[Path], resources: Resources) ->
         with open_database(folder / "database.db") as database:
             row["features"] = database.num_keypoints()
     pairs = len(names) * (len(names) - 1) // 2
-    return {**row, "images": len(names), "pairs": pairs, "inliers": sum(inliers.values())}
+    return {
+        **row,
+        "images": len(names),
+        "pairs": pairs,
+        "inliers": sum(inliers.values()),
+    }
 
 
 def run_sift(folder: Path, image_path: Path, names: Sequence[str]) -> Row:
@@ -74,17 +83,26 @@ def run_sift(folder: Path, image_path: Path, names: Sequence[str]) -> Row:
     times.append(time.perf_counter())
     verify(database_path, VERIFICATION)
     times.append(time.perf_counter())
-    return dict(zip(("extract_s", "match_s", "verify_s"), np.diff(times).tolist(), strict=True))
+    return dict(
+        zip(("extract_s", "match_s", "verify_s"), np.diff(times).tolist(), strict=True)
+    )
 
 
 def run_recipe(
-    folder: Path, image_path: Path, names: Sequence[str], recipe: Recipe, resources: Resources
+    folder: Path,
+    image_path: Path,
+    names: Sequence[str],
+    recipe: Recipe,
+    resources: Resources,
 ) -> Row:
     """Run a recipe; return seconds."""
     listed = folder.with_name("names.txt")
     listed.write_text("\n".join(names) + "\n", encoding="utf-8")
     options = RunOptions(
-        recipe=recipe, image_list_path=listed, resources=resources, verification=VERIFICATION
+        recipe=recipe,
+        image_list_path=listed,
+        resources=resources,
+        verification=VERIFICATION,
     )
     report = run(image_path, folder, options)
     row: Row = {f"{stage.name}_s": stage.wall_s for stage in report.stages}
@@ -104,7 +122,10 @@ def table_of(results: dict[str, list[Row]]) -> str:
         cells = [name]
         for key, unit in (("extract_s", "images"), ("match_s", "pairs")):
             seconds = each(rounds, key, unit)
-            cells += [f"{median(seconds):.3g} s", span(seconds / each(reference, key, unit), 2)]
+            cells += [
+                f"{median(seconds):.3g} s",
+                span(seconds / each(reference, key, unit), 2),
+            ]
         for key, unit in (("features", "images"), ("inliers", "pairs")):
             cells.append(f"{median(each(rounds, key, unit)):.0f}")
         rows.append(cells)
@@ -118,7 +139,9 @@ def table_of(results: dict[str, list[Row]]) -> str:
 def main() -> None:
     """Run the methods in turn and print the table."""
     parser = parser_of(__doc__)
-    parser.add_argument("--image-path", type=Path, required=True, help="folder of images")
+    parser.add_argument(
+        "--image-path", type=Path, required=True, help="folder of images"
+    )
     parser.add_argument("--num-images", type=int, default=4, help="the first so many")
     parser.add_argument("--num-rounds", type=int, default=3)
     parser.add_argument(

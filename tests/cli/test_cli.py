@@ -37,7 +37,10 @@ TIMEOUT_S = 60
 def test_help_has_options_and_examples(command: list[str], call: Call) -> None:
     done = call(*command, "--help")
     assert (done.code, done.stderr) == (0, [])
-    assert f"colmap-affrect {(command or ['run'])[0]}" in done.stdout.partition("examples:")[2]
+    assert (
+        f"colmap-affrect {(command or ['run'])[0]}"
+        in done.stdout.partition("examples:")[2]
+    )
     assert "Exit codes: 0 done" in done.stdout
     if not command:
         assert all(f"    {name} " in done.stdout for name in COMMANDS)
@@ -60,12 +63,17 @@ def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
 
 def test_help_of_many_flags_is_in_groups_that_lack_none() -> None:
     parser = build_parser()
-    (choices,) = (action.choices for action in parser._actions if action.dest == "command")
+    (choices,) = (
+        action.choices for action in parser._actions if action.dest == "command"
+    )
     for name, (_, flags) in ALL_COMMANDS.items():
         words = re.split(r"[ |\n,]+", f"{flags} {VOLUME}")
         given = {word.removesuffix("!").partition("@")[0] for word in words}
         known = choices[name]._option_string_actions.keys()
-        assert {flag for flag in given if flag.startswith("-")} == known - {"-h", "--help"}, name
+        assert {flag for flag in given if flag.startswith("-")} == known - {
+            "-h",
+            "--help",
+        }, name
     shown = choices["run"].format_help()
     first = "usage: colmap-affrect run --image-path PATH --output-path PATH [options]\n"
     assert shown.startswith(first)
@@ -99,9 +107,15 @@ def test_recipes_are_listed_with_what_they_need(call: Call) -> None:
     lines = call("recipes").stdout.splitlines()
     first, *others = [line.split()[0] for line in lines[::2]]
     assert (first, sorted([first, *others])) == ("default", recipe_names())
-    needs = {name.split()[0]: line.strip() for name, line in zip(*[iter(lines)] * 2, strict=True)}
+    needs = {
+        name.split()[0]: line.strip()
+        for name, line in zip(*[iter(lines)] * 2, strict=True)
+    }
     assert needs["rectified"] == needs["on-demand"] == "needs nothing"
-    assert needs["default"] == "needs nothing, and uses aliked-n16, lightglue-aliked if it can"
+    assert (
+        needs["default"]
+        == "needs nothing, and uses aliked-n16, lightglue-aliked if it can"
+    )
     assert needs["dense-affnet"] == "needs affnet, hardnet, orinet"
     assert needs["depth-planes-recommended"] == "needs depth"
 
@@ -116,7 +130,10 @@ def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
     copy = load_recipe(str(path))
     original = load_recipe("on-demand")
     assert (copy.extraction, copy.matching) == (original.extraction, original.matching)
-    assert "# Radius r of a covering ball as a tilt ratio. Paper: 1.7.\ntilt_radius" in done.stdout
+    assert (
+        "# Radius r of a covering ball as a tilt ratio. Paper: 1.7.\ntilt_radius"
+        in done.stdout
+    )
 
 
 def test_the_name_alone_shows_the_help(call: Call) -> None:
@@ -128,7 +145,10 @@ def test_the_name_alone_shows_the_help(call: Call) -> None:
     [
         ("rum", "invalid choice: 'rum'"),
         ("run --image-path x", "required: --output-path"),
-        ("pairs --output-path {out} --camera-mode single", "unknown argument --camera-mode"),
+        (
+            "pairs --output-path {out} --camera-mode single",
+            "unknown argument --camera-mode",
+        ),
         ("match --output_path {out} -q -v", "not allowed with argument"),
         (
             "run --image-path x --output-path {out} --recipie x",
@@ -152,7 +172,13 @@ def test_wrong_usage_ends_with_2_and_does_nothing(
 def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(
     tmp_path: Path, call: Call
 ) -> None:
-    arguments = ["run", "--image-path", tmp_path / "none", "--output-path", tmp_path / "out"]
+    arguments = [
+        "run",
+        "--image-path",
+        tmp_path / "none",
+        "--output-path",
+        tmp_path / "out",
+    ]
     done = call(*arguments)
     assert (done.code, done.stdout) == (2, "")
     assert done.stderr == [
@@ -198,7 +224,9 @@ def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(
     assert "init_min_num_inliers=40, and it is None now" in done.errors[0]
 
 
-SELECTED = "--image-list-path --mask-path --camera-mask-path --from-database --cameras-path"
+SELECTED = (
+    "--image-list-path --mask-path --camera-mask-path --from-database --cameras-path"
+)
 RUN = "--image-path PHOTOS --output-path NEW"
 H5 = "--features-path OUT/features.h5 --matches-path OUT/matches.h5 --database-path NEW"
 MODEL = "--model-path OUT/sparse/0 --output-path NEW"
@@ -255,7 +283,13 @@ def test_file_or_folder_that_is_not_there_is_wrong_usage_before_anything_is_made
     assert times() == before
 
 
-FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images" / "view_5_tilt70.jpg"
+FACADE = (
+    Path(__file__).parents[2]
+    / "sample_scenes"
+    / "facade"
+    / "images"
+    / "view_5_tilt70.jpg"
+)
 
 
 SMALL = "max_image_size_px=240"
@@ -263,7 +297,9 @@ SMALL = "max_image_size_px=240"
 
 def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
     out = tmp_path / "out č"
-    done = call("inspect", FACADE, "--output-path", out, "--recipe", "rectified", "--set", SMALL)
+    done = call(
+        "inspect", FACADE, "--output-path", out, "--recipe", "rectified", "--set", SMALL
+    )
     assert (done.code, done.stderr) == (0, [])
     sheet = out / "view_5_tilt70-inspection.png"
     assert sheet.stat().st_size > 50_000
@@ -282,7 +318,9 @@ def test_lines_go_on_past_what_cannot_be_read(tmp_path: Path, call: Call) -> Non
     assert (out / f"{FACADE.name}-lines.png").stat().st_size > 50_000
     again = call("lines", FACADE, "--output-path", out)
     assert (again.code, again.stdout) == (2, "")  # a picture is there already
-    numbers = json.loads(call("lines", FACADE, bad, "--json", "--max-failures", 1).stdout)
+    numbers = json.loads(
+        call("lines", FACADE, bad, "--json", "--max-failures", 1).stdout
+    )
     assert numbers["photographs"][str(FACADE)]["is_known"]
     assert list(numbers["failures"]) == [str(bad)]
 
@@ -311,11 +349,15 @@ def test_show_pair_draws_matches_of_a_run_and_of_any_database(
     done = call(*given, tmp_path / "pair.png")
     assert (done.code, done.stderr) == (0, [])
     assert (
-        done.stdout.splitlines()[0] == said.partition(" of level")[0] + ", " + said.split(", ")[1]
+        done.stdout.splitlines()[0]
+        == said.partition(" of level")[0] + ", " + said.split(", ")[1]
     )
     before = (tmp_path / "pair.png").read_bytes()
     done = call(*given, tmp_path / "pair.png")
-    assert (done.code, done.stderr[0].endswith("give another name or folder")) == (2, True)
+    assert (done.code, done.stderr[0].endswith("give another name or folder")) == (
+        2,
+        True,
+    )
     assert (tmp_path / "pair.png").read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["any.db", "pair.png"]
     assert rows_digest(verified / "database.db") == digest
@@ -326,17 +368,41 @@ def test_show_pair_draws_matches_of_a_run_and_of_any_database(
     [
         ("OUT a.pgn side/č.png", "a.pgn: no such photograph (did you mean 'a.png'?)"),
         ("OUT a.png a.png", "a.png, a.png: never matched"),
-        ("OUT/database.db a.png side/č.png", "--image-path: give the folder of the photographs"),
-        ("OUT/database.db a.png side/č.png --image-path PHOTOS", "--output-path: give the name"),
-        ("OUT a.png side/č.png --output-path NEW/pair.jpg", "new file that ends in .png"),
-        ("OUT a.png side/č.png --output-path PHOTOS/pair.png", "in the folder of the photographs"),
-        ("PHOTOS a.png side/č.png", "database.db: no such file; give a COLMAP database"),
+        (
+            "OUT/database.db a.png side/č.png",
+            "--image-path: give the folder of the photographs",
+        ),
+        (
+            "OUT/database.db a.png side/č.png --image-path PHOTOS",
+            "--output-path: give the name",
+        ),
+        (
+            "OUT a.png side/č.png --output-path NEW/pair.jpg",
+            "new file that ends in .png",
+        ),
+        (
+            "OUT a.png side/č.png --output-path PHOTOS/pair.png",
+            "in the folder of the photographs",
+        ),
+        (
+            "PHOTOS a.png side/č.png",
+            "database.db: no such file; give a COLMAP database",
+        ),
     ],
 )
 def test_show_pair_says_what_it_lacks_and_makes_nothing(
-    verified: Path, photos: Path, tmp_path: Path, arguments: str, message: str, call: Call
+    verified: Path,
+    photos: Path,
+    tmp_path: Path,
+    arguments: str,
+    message: str,
+    call: Call,
 ) -> None:
-    for name, path in {"OUT": verified, "PHOTOS": photos, "NEW": tmp_path / "new"}.items():
+    for name, path in {
+        "OUT": verified,
+        "PHOTOS": photos,
+        "NEW": tmp_path / "new",
+    }.items():
         arguments = arguments.replace(name, str(path))
     before = sorted(photos.rglob("*"))
     done = call("show-pair", *arguments.split())
@@ -352,7 +418,9 @@ def test_page_of_a_run_has_pictures_of_pairs(verified: Path, call: Call) -> None
     section = page.partition('<section id="looks">')[2].partition("</section>")[0]
     assert "the strongest pair of a.png" in section
     assert "--reject-pair &#39;a.png,b c.png&#39;" in section
-    widths = re.findall(r'src="data:image/jpeg;base64,[^"]{9999,}" width="(\d+)"', section)
+    widths = re.findall(
+        r'src="data:image/jpeg;base64,[^"]{9999,}" width="(\d+)"', section
+    )
     assert 1 <= len(widths) <= 3
     assert set(widths) == {"900"}
 
@@ -376,7 +444,13 @@ def test_wrong_options_are_refused_before_any_image_is_read(
 ) -> None:
     write_photographs(tmp_path / "photos", 2)
     out = tmp_path / "out"
-    given = ["--image-path", tmp_path / "photos", "--output-path", out, *arguments.split()]
+    given = [
+        "--image-path",
+        tmp_path / "photos",
+        "--output-path",
+        out,
+        *arguments.split(),
+    ]
     done = call("run", *given)
     assert (done.code, done.stdout) == (2, "")
     (line,) = done.stderr
@@ -398,7 +472,9 @@ def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:
 
 def test_what_is_printed_may_end_early() -> None:
     command = f"{sys.executable} -m colmap_affrect recipes on-demand | head -n 1"
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command, shell=True, capture_output=True, text=True, check=True
+    )
     assert (len(done.stdout.splitlines()), done.stderr) == (1, "")
 
 
@@ -411,7 +487,9 @@ def test_finished_model_is_extended_and_another_database_mapped(
     listed = tmp_path / "names.txt"
     names = sorted(str(p.relative_to(photos)) for p in photos.rglob("*.png"))
     listed.write_text("\n".join(names[:2]))
-    small = call("run", *on_photographs(photos, first), "--image-list-path", listed, "-q")
+    small = call(
+        "run", *on_photographs(photos, first), "--image-list-path", listed, "-q"
+    )
     assert small.code == 0
     model = first / "sparse" / "0"
     done = call("run", *on_photographs(photos, out), "--extend", model, "--json", "-q")
@@ -420,12 +498,23 @@ def test_finished_model_is_extended_and_another_database_mapped(
     assert (report["extended"], report["added"]) == (names[:2], names[2:])
     refused = call("map", "--output-path", out, "-q")
     assert refused.code == 2
-    assert "its model extends another one; give --extend again, or --over" in refused.errors[-1]
-    copied = ["map", "--output-path", tmp_path / "copied", "--from-database", out / "database.db"]
+    assert (
+        "its model extends another one; give --extend again, or --over"
+        in refused.errors[-1]
+    )
+    copied = [
+        "map",
+        "--output-path",
+        tmp_path / "copied",
+        "--from-database",
+        out / "database.db",
+    ]
     mapped = call(*copied, "--extend", model, "-q")
     assert (mapped.code, mapped.errors) == (0, [])
     assert "extended    2 were there, 1 came in" in mapped.stdout
-    wrong = call("run", *on_photographs(photos, tmp_path / "no"), "--extend", photos, "-q")
+    wrong = call(
+        "run", *on_photographs(photos, tmp_path / "no"), "--extend", photos, "-q"
+    )
     assert "not a COLMAP model" in wrong.errors[-1]
     assert not (tmp_path / "no" / "features.h5").exists()
 
@@ -445,5 +534,7 @@ def test_model_that_nobody_can_trust_ends_with_3(
     assert not {"colmap gui", "colmap-affrect export"} & set(printed.out.splitlines())
     assert "\nnext" not in printed.out
     assert ": few matches support its position\n" in printed.out
-    assert printed.err.splitlines()[-1].startswith("error: nothing in the model can be trusted;")
+    assert printed.err.splitlines()[-1].startswith(
+        "error: nothing in the model can be trusted;"
+    )
     assert json.loads((verified / "report.json").read_text())["status"] == "doubtful"

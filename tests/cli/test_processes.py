@@ -22,12 +22,18 @@ TIMEOUT_S = 60
 
 
 @pytest.mark.long
-def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path: Path) -> None:
-    done = run_in_process_of_its_own("run", *on_photographs(photos, tmp_path / "out"), "--json")
+def test_json_goes_to_stdout_alone_and_progress_to_stderr(
+    photos: Path, tmp_path: Path
+) -> None:
+    done = run_in_process_of_its_own(
+        "run", *on_photographs(photos, tmp_path / "out"), "--json"
+    )
     assert done.code == 0, done.stderr
     report = done.report
     assert report["images_registered"] == 3
-    assert report == json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
+    assert report == json.loads(
+        (tmp_path / "out" / "report.json").read_text(encoding="utf-8")
+    )
     lines = done.stderr
     assert "extract: 3/3 images" in lines
     assert "match: 3/3 pairs" in lines
@@ -106,7 +112,9 @@ def tidy_up_for_ever():
 cli.main = lambda begin: (begin(), print("begun", flush=True), WORK)
 __main__.main()
 """
-STUCK = "collections.deque(itertools.repeat(0), maxlen=0)"  # holds Python's lock for ever
+STUCK = (
+    "collections.deque(itertools.repeat(0), maxlen=0)"  # holds Python's lock for ever
+)
 
 
 def start_stuck(work: str) -> subprocess.Popen[str]:
@@ -155,19 +163,27 @@ def test_crash_in_native_code_is_one_line() -> None:
     with start_stuck("ctypes.string_at(1)") as process:
         _, stderr = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 1
-    assert [line.startswith("error: ended by SIGSEGV; ") for line in stderr.splitlines()] == [True]
+    assert [
+        line.startswith("error: ended by SIGSEGV; ") for line in stderr.splitlines()
+    ] == [True]
 
 
 @pytest.mark.long
 def test_worker_ends_with_the_process_that_was_started() -> None:
     with start_stuck(STUCK) as process:
         process.kill()
-        process.communicate(timeout=5.0)  # which the worker's end of the pipe would keep open
+        process.communicate(
+            timeout=5.0
+        )  # which the worker's end of the pipe would keep open
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "closed", [(0, 1, 2), *(pytest.param((number,), marks=pytest.mark.long) for number in (1, 2))]
+    "closed",
+    [
+        (0, 1, 2),
+        *(pytest.param((number,), marks=pytest.mark.long) for number in (1, 2)),
+    ],
 )
 def test_streams_that_are_closed_stop_nothing(
     photos: Path, tmp_path: Path, closed: tuple[int, ...]
@@ -197,7 +213,9 @@ def test_native_code_that_ends_the_command_is_named() -> None:
     )  # fmt: skip
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith("error: native code ended the command with exit code 1 (perhaps for")
+    assert line.startswith(
+        "error: native code ended the command with exit code 1 (perhaps for"
+    )
 
 
 def test_want_of_memory_while_packages_are_loaded_is_one_line() -> None:
@@ -230,7 +248,14 @@ def test_output_has_any_encoding(
     """What an encoding lacks is escaped as JSON has it; the exit codes are the usual ones."""
     write_model(tmp_path / "model")
     monkeypatch.setenv("PYTHONIOENCODING", encoding)
-    command = [sys.executable, "-m", "colmap_affrect", "export", "--model-path", tmp_path / "model"]
+    command = [
+        sys.executable,
+        "-m",
+        "colmap_affrect",
+        "export",
+        "--model-path",
+        tmp_path / "model",
+    ]
     for code in (0, 2):  # the second time the files are there
         given = ["--output-path", tmp_path / "out čé😀", "--format", "cameras"]
         ended = subprocess.run([*command, *given], check=False, capture_output=True)

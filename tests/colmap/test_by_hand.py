@@ -32,7 +32,9 @@ def marked(path: Path, text: str) -> dict[str, dict[str, list[float]]]:
     "y,image,x,point\n20,a,10.5,p\n40.25,b.jpg,30,p\n2,c,1,q\n",
     "point,image,px,py,x,y,z\np,a.jpg,10.5,20,7,8,9\np,b.jpg,30,40.25,,,\nq,c.png,1,2,,,\n",
 ])  # fmt: skip
-def test_tables_may_have_any_order_of_columns_and_short_names(tmp_path: Path, text: str) -> None:
+def test_tables_may_have_any_order_of_columns_and_short_names(
+    tmp_path: Path, text: str
+) -> None:
     expected = {
         "p": {"old/a.jpg": [10.5, 20.0], "b.jpg": [30.0, 40.25]},
         "q": {"c.png": [1.0, 2.0]},
@@ -47,14 +49,18 @@ def test_tables_may_have_any_order_of_columns_and_short_names(tmp_path: Path, te
     ("p,a.jpg,1,2\n", "no point is marked in two photographs"),
     ("point,photograph,x,y,colour\np,a,1,2,red\n", "unknown column 'colour'"),
 ])  # fmt: skip
-def test_what_cannot_be_used_is_refused_in_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_what_cannot_be_used_is_refused_in_one_line(
+    tmp_path: Path, text: str, words: str
+) -> None:
     with pytest.raises(OptionError, match=words):
         marked(tmp_path / "marks.csv", text)
 
 
 @pytest.mark.parametrize("cells", ["nan,2", "1,inf", "-inf,2", "NaN,NaN"])
 def test_marks_are_finite(tmp_path: Path, cells: str) -> None:
-    with pytest.raises(OptionError, match="line 2: x and y must be finite numbers of px"):
+    with pytest.raises(
+        OptionError, match="line 2: x and y must be finite numbers of px"
+    ):
         marked(tmp_path / "marks.csv", f"p,a,1,2\np,b,{cells}\n")
 
 
@@ -111,17 +117,23 @@ def database(tmp_path: Path) -> Path:
     """Three images with four keypoints each, in another number of columns, and all pairs."""
     path = tmp_path / "database.db"
     with open_database(path) as made:
-        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
+        camera = pycolmap.Camera.create_from_model_name(
+            1, "SIMPLE_PINHOLE", 500.0, 640, 480
+        )
         write_images(made, camera, NAMES)
         for image_id, columns in ((1, 6), (2, 4)):
             made.write_keypoints(image_id, np.full((4, columns), 7.0, np.float32))
         for pair in [(1, 2), (1, 3), (2, 3)]:
-            geometry = pycolmap.TwoViewGeometry(inlier_matches=np.zeros((1, 2), np.uint32))
+            geometry = pycolmap.TwoViewGeometry(
+                inlier_matches=np.zeros((1, 2), np.uint32)
+            )
             made.write_two_view_geometry(*pair, geometry)
     return path
 
 
-def test_the_copy_has_tie_points_behind_the_keypoints(tmp_path: Path, database: Path) -> None:
+def test_the_copy_has_tie_points_behind_the_keypoints(
+    tmp_path: Path, database: Path
+) -> None:
     (tmp_path / "marks.csv").write_text(ROWS + "q,b.jpg,5,6\n")
     by_hand = ByHand(tie_points_path=tmp_path / "marks.csv")
     indices = by_hand.copy_database(database, tmp_path / "mapped.db")

@@ -73,7 +73,9 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
         "line 4: says something else of camera 'X' than line 2; give them two labels",
     ),
 ])  # fmt: skip
-def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], message: str) -> None:
+def test_wrong_tables_are_one_clear_line(
+    tmp_path: Path, lines: list[str], message: str
+) -> None:
     with pytest.raises(OptionError, match=message) as error:
         given(table(tmp_path, *lines))
     assert "plates.csv" in str(error.value)
@@ -92,7 +94,9 @@ def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], messa
     ({"principal_point": "1"}, "--principal-point: cy='': should be a valid number"),
     ({"cameras_path": "nowhere.csv"}, "--cameras-path nowhere.csv: cannot be read .No such"),
 ])  # fmt: skip
-def test_wrong_options_are_one_clear_line(options: dict[str, object], message: str) -> None:
+def test_wrong_options_are_one_clear_line(
+    options: dict[str, object], message: str
+) -> None:
     with pytest.raises(OptionError, match=message) as error:
         read_given_cameras(CameraOptions(**options))
     assert "\n" not in str(error.value)
@@ -101,7 +105,9 @@ def test_wrong_options_are_one_clear_line(options: dict[str, object], message: s
 @pytest.mark.parametrize("write", ["write_binary", "write_text"])
 def test_cameras_of_a_model_are_read(tmp_path: Path, write: str) -> None:
     model = pycolmap.synthesize_dataset(
-        pycolmap.SyntheticDatasetOptions(num_points3D=5, num_rigs=2, num_frames_per_rig=2)
+        pycolmap.SyntheticDatasetOptions(
+            num_points3D=5, num_rigs=2, num_frames_per_rig=2
+        )
     )
     getattr(model, write)(tmp_path)
     for path in (tmp_path, tmp_path / f"cameras.{write[6:9].replace('tex', 'txt')}"):
@@ -113,7 +119,9 @@ def test_cameras_of_a_model_are_read(tmp_path: Path, write: str) -> None:
             assert found[image.name].size == (camera.width, camera.height)
     for file in tmp_path.glob("points3D.*"):
         file.unlink()
-    with pytest.raises(OptionError, match=r"^--cameras-path .*give the folder that holds cameras"):
+    with pytest.raises(
+        OptionError, match=r"^--cameras-path .*give the folder that holds cameras"
+    ):
         given(tmp_path)
 
 
@@ -133,7 +141,9 @@ def test_records_come_back(tmp_path: Path) -> None:
 def test_damaged_records_are_one_clear_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "cameras.json"
     path.write_text(text)
-    with pytest.raises(WorkspaceError, match=r"cameras\.json: damaged .*; run .*verify"):
+    with pytest.raises(
+        WorkspaceError, match=r"cameras\.json: damaged .*; run .*verify"
+    ):
         read_camera_records(path)
 
 
@@ -141,7 +151,11 @@ def test_report_has_the_focal_length_in_longer_sides_and_the_refined_one() -> No
     model = ModelSummary((), 0, 0.0, 0.0, focals_px={"c.jpg": 470.0, "z": 9.0})
     entry = RESCALED.to_report(12, model)
     assert entry["refined_px"] == 470.0
-    assert (entry["id"], entry["num_images"], entry["source"]) == (12, 1, "exif-rescaled")
+    assert (entry["id"], entry["num_images"], entry["source"]) == (
+        12,
+        1,
+        "exif-rescaled",
+    )
     assert entry["focal_longer_sides"] == pytest.approx(1.25)
     known = FROM_EXIF.to_report(3, None)
     assert known["refined_px"] is None

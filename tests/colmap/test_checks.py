@@ -34,7 +34,13 @@ def write_database(path: Path) -> Path:
         camera.has_prior_focal_length = True
         write_images(database, camera, NAMES)
         for image_id, count in enumerate(NUM_KEYPOINTS, 1):
-            keypoints = rng.uniform(0, 1, (count, 6)).astype(np.float32) * [*SIZE, 1, 1, 1, 1]
+            keypoints = rng.uniform(0, 1, (count, 6)).astype(np.float32) * [
+                *SIZE,
+                1,
+                1,
+                1,
+                1,
+            ]
             database.write_keypoints(image_id, keypoints.astype(np.float32))
         for first, second in [(1, 2), (1, 3), (2, 3)]:
             indices = np.array([[0, 1], [4, 6]], np.uint32)
@@ -123,13 +129,18 @@ def new_matches(first: int, second: int, table: str = "matches") -> Statement:
     columns = "pair_id, rows, cols, data" + (", config" * (table != "matches"))
     values = [first * (2**31 - 1) + second, *indices.shape, indices.tobytes()]
     values += [3] * (table != "matches")
-    return (f"INSERT INTO {table} ({columns}) VALUES ({', '.join('?' * len(values))})", values)
+    return (
+        f"INSERT INTO {table} ({columns}) VALUES ({', '.join('?' * len(values))})",
+        values,
+    )
 
 
 def test_healthy_database_has_no_problem(database_path: Path) -> None:
     tables, problems = check_database(database_path)
     assert problems == {}
-    assert tables.summary() == ("3 images, 1 camera, 21 keypoints, 3 matched and 3 verified pairs")
+    assert tables.summary() == (
+        "3 images, 1 camera, 21 keypoints, 3 matched and 3 verified pairs"
+    )
 
 
 GEOMETRIES = "two_view_geometries"
@@ -248,7 +259,9 @@ def test_keypoints_of_smaller_pictures_are_found(
     execute(database_path, "DELETE FROM matches", "DELETE FROM two_view_geometries")
     for scale in (0.4, 1.0):  # those of one image alone may be so
         for image_id in (1, 2, 3):
-            rows = np.column_stack([places * np.float32(0.5), np.ones((100, 2), np.float32)])
+            rows = np.column_stack(
+                [places * np.float32(0.5), np.ones((100, 2), np.float32)]
+            )
             if image_id == 2:
                 rows[:, :2] *= np.float32(2.0 * scale)
             execute(database_path, (
@@ -258,7 +271,9 @@ def test_keypoints_of_smaller_pictures_are_found(
         caplog.clear()
         refuse_unusable(database_path, warns=True)
         found = check_database(database_path)[1]
-        assert found == ({"keypoints-in-a-corner": sorted(NAMES)} if scale < 1.0 else {})
+        assert found == (
+            {"keypoints-in-a-corner": sorted(NAMES)} if scale < 1.0 else {}
+        )
         assert ("all keypoints in the upper left part" in caplog.text) == (scale < 1.0)
     diagnosis = Diagnosis()
     assert examine_database(diagnosis, database_path)
@@ -281,7 +296,9 @@ def test_keypoints_of_smaller_pictures_are_found(
     f"WHERE pair_id = {pair_id(1, 2)}",  # tried without success
     f"DELETE FROM matches WHERE pair_id = {pair_id(1, 2)}",  # inliers alone were imported
 ])  # fmt: skip
-def test_what_is_allowed_is_no_problem(database_path: Path, statement: Statement) -> None:
+def test_what_is_allowed_is_no_problem(
+    database_path: Path, statement: Statement
+) -> None:
     path = database_path
     none_has_one = statement == "DELETE FROM frames"
     execute(path, "DELETE FROM frame_data" if none_has_one else "SELECT 1", statement)
@@ -293,7 +310,9 @@ def test_pair_ids_are_those_of_colmap(first: int, second: int) -> None:
     assert divmod(pair_id(first, second), MAX_NUM_IMAGES) == (first, second)
 
 
-def test_damaged_file_is_a_database_error_or_problems(tmp_path: Path, database_path: Path) -> None:
+def test_damaged_file_is_a_database_error_or_problems(
+    tmp_path: Path, database_path: Path
+) -> None:
     execute(database_path, "PRAGMA journal_mode = DELETE")
     data = database_path.read_bytes()
     rng = random.Random(7)

@@ -61,7 +61,9 @@ def some_frames(count: int) -> Array:
     """Frames that differ from each other."""
     rng = np.random.default_rng(count)
     points = rng.uniform(0, [90, 60], (count, 2))
-    return lafs_from_keypoints(points, rng.uniform(5, 80, count), rng.uniform(-3, 3, count))
+    return lafs_from_keypoints(
+        points, rng.uniform(5, 80, count), rng.uniform(-3, 3, count)
+    )
 
 
 def test_import_images_adds_what_is_new_and_names_what_colmap_cannot_read(
@@ -71,7 +73,9 @@ def test_import_images_adds_what_is_new_and_names_what_colmap_cannot_read(
     path = tmp_path / "database.db"
     import_images(path, image_folder, NAMES[1:3], CameraOptions())
     before = image_ids(path)
-    assert import_images(path, image_folder, ["text.png", *NAMES], CameraOptions()) == ["text.png"]
+    assert import_images(path, image_folder, ["text.png", *NAMES], CameraOptions()) == [
+        "text.png"
+    ]
     after = image_ids(path)
     assert {name: after[name] for name in before} == before
     assert sorted(after) == NAMES
@@ -91,7 +95,9 @@ def test_new_database_appears_with_all_images_or_not_at_all(
     (tmp_path / "database.db-wal").write_bytes(b"of a database that was removed")
     import_images(path, image_folder, NAMES[:2], CameraOptions(mode="per-folder"))
     assert sorted(image_ids(path)) == NAMES[:2]
-    assert sorted(file.name for file in tmp_path.glob("database.db*")) == ["database.db"]
+    assert sorted(file.name for file in tmp_path.glob("database.db*")) == [
+        "database.db"
+    ]
 
 
 def test_colmap_keypoints_move_by_half_a_pixel_and_divide_shapes_by_six() -> None:
@@ -109,12 +115,18 @@ def test_keypoints_that_are_there_stay_unless_escalation_has_extended_them(
         write_keypoints(database, 1, some_frames(5) + 1.0)
         with pytest.raises(DatabaseError, match=r"5 keypoints .* 9"):
             write_keypoints(database, 1, some_frames(9))
-        np.testing.assert_array_equal(database.read_keypoints(1), colmap_keypoints(some_frames(5)))
+        np.testing.assert_array_equal(
+            database.read_keypoints(1), colmap_keypoints(some_frames(5))
+        )
         write_keypoints(database, 1, some_frames(9), level_ends=[5, 9])
-        np.testing.assert_array_equal(database.read_keypoints(1), colmap_keypoints(some_frames(9)))
+        np.testing.assert_array_equal(
+            database.read_keypoints(1), colmap_keypoints(some_frames(9))
+        )
 
 
-def test_write_keypoints_refuses_values_that_are_not_finite(database_path: Path) -> None:
+def test_write_keypoints_refuses_values_that_are_not_finite(
+    database_path: Path,
+) -> None:
     lafs = some_frames(4)
     lafs[1, 0, 2] = np.nan
     with open_database(database_path) as database:
@@ -123,7 +135,9 @@ def test_write_keypoints_refuses_values_that_are_not_finite(database_path: Path)
         assert not database.exists_keypoints(3)
 
 
-def test_elliptic_blob_of_30_degrees_keeps_its_axis_in_the_database(database_path: Path) -> None:
+def test_elliptic_blob_of_30_degrees_keeps_its_axis_in_the_database(
+    database_path: Path,
+) -> None:
     # An ellipse of axis ratio 2 with its long axis 30 degrees from x towards y.
     ellipse = rotation(np.deg2rad(30.0)) @ np.diag([10.0, 5.0])
     image = blobs((220, 200), [[110.3, 99.6]], ellipse)
@@ -131,17 +145,23 @@ def test_elliptic_blob_of_30_degrees_keeps_its_axis_in_the_database(database_pat
     linear = rectifying_affine(2.0, np.deg2rad(60.0))
     corners = np.array([[0.0, 0.0], [219.0, 0.0], [0.0, 199.0], [219.0, 199.0]])
     matrix, canvas = fit_canvas(linear, corners, margin_px=0.0)
-    plan = Rectification(matrix, canvas, np.ones(image.shape, bool), 2.0, np.deg2rad(60.0))
+    plan = Rectification(
+        matrix, canvas, np.ones(image.shape, bool), 2.0, np.deg2rad(60.0)
+    )
     features = RootSift(SiftOptions()).detect((warp(image, plan), None))
     lafs = transform_lafs(plan.image_from_rectified, features.lafs)
     best = np.linalg.norm(lafs[:, :, 2] - [110.3, 99.6], axis=1).argmin()
     laf = lafs[best : best + 1].copy()
-    laf[0, :, :2] = laf[0, :, :2] @ rotation(np.deg2rad(77.0))  # which is not seen in the ellipse
+    laf[0, :, :2] = laf[0, :, :2] @ rotation(
+        np.deg2rad(77.0)
+    )  # which is not seen in the ellipse
     with open_database(database_path) as database:
         write_keypoints(database, 1, laf)
         x, y, *shape = database.read_keypoints(1)[0].astype(float)
     assert np.hypot(x - 110.8, y - 100.1) < 0.1
-    values, vectors = np.linalg.eigh(np.reshape(shape, (2, 2)) @ np.reshape(shape, (2, 2)).T)
+    values, vectors = np.linalg.eigh(
+        np.reshape(shape, (2, 2)) @ np.reshape(shape, (2, 2)).T
+    )
     angle_deg = np.rad2deg(np.arctan2(vectors[1, 1], vectors[0, 1])) % 180.0
     assert abs(angle_deg - 30.0) < ELLIPSE_ERROR_DEG
     assert_allclose(np.sqrt(values), [5.0, 10.0], rtol=0.2)
@@ -160,14 +180,21 @@ def matchable_path(database_path: Path) -> Path:
     return database_path
 
 
-def test_write_matches_round_trips_in_the_order_of_the_pair(matchable_path: Path) -> None:
+def test_write_matches_round_trips_in_the_order_of_the_pair(
+    matchable_path: Path,
+) -> None:
     # Also above the range of signed integers of 16 bits.
-    for pair, matches in (((2, 1), [[4, 1], [0, 3]]), ((4, 2), [[39_999, 6], [32_768, 0]])):
+    for pair, matches in (
+        ((2, 1), [[4, 1], [0, 3]]),
+        ((4, 2), [[39_999, 6], [32_768, 0]]),
+    ):
         indices = np.array(matches, np.uint16)
         with open_database(matchable_path) as database:
             write_matches(database, *pair, indices)
             np.testing.assert_array_equal(database.read_matches(*pair), indices)
-            np.testing.assert_array_equal(database.read_matches(*pair[::-1]), indices[:, ::-1])
+            np.testing.assert_array_equal(
+                database.read_matches(*pair[::-1]), indices[:, ::-1]
+            )
             database.write_two_view_geometry(*pair, pycolmap.TwoViewGeometry())
             write_matches(database, *pair, indices)  # nothing has changed
             assert database.exists_two_view_geometry(*pair)

@@ -51,7 +51,9 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def add_position(
-    database: pycolmap.Database, position: np.ndarray, system: pycolmap.PosePriorCoordinateSystem
+    database: pycolmap.Database,
+    position: np.ndarray,
+    system: pycolmap.PosePriorCoordinateSystem,
 ) -> None:
     prior = pycolmap.PosePrior(position=position, coordinate_system=system)
     prior.corr_data_id = database.read_image(2).data_id
@@ -86,10 +88,14 @@ def test_content_and_ids_are_those_of_the_source(source: Path, tmp_path: Path) -
     ]  # fmt: skip
 
 
-def test_command_takes_an_output_folder(source: Path, tmp_path: Path, call: Call) -> None:
+def test_command_takes_an_output_folder(
+    source: Path, tmp_path: Path, call: Call
+) -> None:
     (tmp_path / "out").mkdir()
     shutil.copy(source, tmp_path / "out" / "database.db")
-    done = call("export-database", tmp_path / "out", tmp_path / "old.db", "--colmap", "3.8")
+    done = call(
+        "export-database", tmp_path / "out", tmp_path / "old.db", "--colmap", "3.8"
+    )
     assert done.code == 0
     assert done.stdout.startswith(f"{tmp_path / 'old.db'}: for COLMAP 3.8 to 3.13; ")
     assert MAPPER_OPTIONS in done.stdout
@@ -115,10 +121,13 @@ def test_what_is_exported_comes_back(source: Path, tmp_path: Path) -> None:
 def test_what_the_old_colmap_has_no_place_for(source: Path, tmp_path: Path) -> None:
     changed = tmp_path / "changed.db"
     shutil.copy(source, changed)
-    of_rig = pycolmap.TwoViewGeometry(config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED_RIG)
+    of_rig = pycolmap.TwoViewGeometry(
+        config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED_RIG
+    )
     with open_database(changed) as database:
         learned = pycolmap.FeatureDescriptors(
-            type=pycolmap.FeatureExtractorType.ALIKED_N16ROT, data=np.zeros((3, 512), np.uint8)
+            type=pycolmap.FeatureExtractorType.ALIKED_N16ROT,
+            data=np.zeros((3, 512), np.uint8),
         )
         database.clear_descriptors()
         database.write_descriptors(1, learned)
@@ -126,7 +135,9 @@ def test_what_the_old_colmap_has_no_place_for(source: Path, tmp_path: Path) -> N
         database.write_two_view_geometry(1, 2, of_rig)
     export_database(changed, tmp_path / "old.db")
     assert rows(tmp_path / "old.db", "SELECT count(*) FROM descriptors") == [(0,)]
-    assert rows(tmp_path / "old.db", "SELECT max(config) FROM two_view_geometries") == [(2,)]
+    assert rows(tmp_path / "old.db", "SELECT max(config) FROM two_view_geometries") == [
+        (2,)
+    ]
     with open_database(changed) as database:
         camera = database.read_camera(1)
         database.update_camera(
@@ -150,7 +161,9 @@ def old_database(tmp_path: Path) -> Path:
     params = np.array([500.0, 320.0, 240.0]).tobytes()
     points = np.array([[10.5, 20.5], [30.5, 40.5]], np.float32).tobytes()
     with closing(sqlite3.connect(folder / "database.db")) as connection, connection:
-        connection.execute("INSERT INTO cameras VALUES (3, 0, 640, 480, ?, 1)", [params])
+        connection.execute(
+            "INSERT INTO cameras VALUES (3, 0, 640, 480, ?, 1)", [params]
+        )
         for image in ((7, "7.jpg"), (8, "8.jpg")):
             columns = "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, 3)"
             connection.execute(columns, image)
@@ -173,7 +186,9 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
-def test_old_database_is_migrated_in_the_copy_only(old_database: Path, tmp_path: Path) -> None:
+def test_old_database_is_migrated_in_the_copy_only(
+    old_database: Path, tmp_path: Path
+) -> None:
     before = files(old_database.parent)
     assert schema_version(old_database) == 3800
     copy_database(old_database, tmp_path / "copy.db")
@@ -212,7 +227,9 @@ def test_what_another_program_has_just_written_is_copied(database_path: Path) ->
             assert copy.read_camera(9).focal_length_x == 77.0
 
 
-def test_newer_database_is_refused_and_left_as_it_is(database_path: Path, tmp_path: Path) -> None:
+def test_newer_database_is_refused_and_left_as_it_is(
+    database_path: Path, tmp_path: Path
+) -> None:
     with closing(sqlite3.connect(database_path)) as connection:
         connection.execute(f"PRAGMA user_version = {newest_schema_version() + 1}")
     before = database_path.read_bytes()
@@ -238,12 +255,16 @@ def test_what_is_no_database_is_one_clear_line(
     if content is not None:
         path.write_bytes(content)
     for copy in (copy_database, copy_without_features):
-        with pytest.raises(OptionError if content is None else DatabaseError, match=message):
+        with pytest.raises(
+            OptionError if content is None else DatabaseError, match=message
+        ):
             copy(path, tmp_path / "copy.db")
     assert {item.name for item in tmp_path.iterdir()} <= {"x.db"}
 
 
-def test_existing_target_is_not_overwritten(database_path: Path, tmp_path: Path) -> None:
+def test_existing_target_is_not_overwritten(
+    database_path: Path, tmp_path: Path
+) -> None:
     (tmp_path / "there.db").write_text("precious")
     for copy in (copy_database, copy_without_features):
         with pytest.raises(DatabaseError, match="exists already"):
@@ -252,7 +273,9 @@ def test_existing_target_is_not_overwritten(database_path: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", ["new.db", "old.db", ".lock", "results"])
-def test_an_exported_database_may_have_any_name(source: Path, tmp_path: Path, name: str) -> None:
+def test_an_exported_database_may_have_any_name(
+    source: Path, tmp_path: Path, name: str
+) -> None:
     export_database(source, tmp_path / name)
     assert rows(tmp_path / name, "SELECT COUNT(*) FROM images") == [(6,)]
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -260,7 +283,9 @@ def test_an_exported_database_may_have_any_name(source: Path, tmp_path: Path, na
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
 @pytest.mark.parametrize("suffix", ["", "-wal", "-journal"])
-def test_pipes_in_the_place_of_a_database_are_refused(tmp_path: Path, suffix: str) -> None:
+def test_pipes_in_the_place_of_a_database_are_refused(
+    tmp_path: Path, suffix: str
+) -> None:
     os.mkfifo(tmp_path / f"x.db{suffix}")
     with pytest.raises(OptionError, match="is not a file, but a pipe"):
         schema_version(tmp_path / "x.db")
@@ -286,18 +311,26 @@ def whole(path: Path) -> list[tuple[object, ...]]:
     made = rows(path, "SELECT type, name, sql FROM sqlite_master ORDER BY name")
     return [
         *made,
-        *(row for name in tables_of(path) for row in rows(path, f"SELECT * FROM {name}")),
+        *(
+            row
+            for name in tables_of(path)
+            for row in rows(path, f"SELECT * FROM {name}")
+        ),
     ]
 
 
 def tables_of(path: Path) -> list[str]:
     """Return the names of the tables of a database."""
-    made = rows(path, "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name")
+    made = rows(
+        path, "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name"
+    )
     return [str(name) for (name,) in made]
 
 
 @pytest.mark.parametrize("case", FOREIGN)
-def test_copies_hold_the_tables_of_colmap_alone(source: Path, tmp_path: Path, case: str) -> None:
+def test_copies_hold_the_tables_of_colmap_alone(
+    source: Path, tmp_path: Path, case: str
+) -> None:
     path = Path(shutil.copy(source, tmp_path / "given.db"))
     with closing(sqlite3.connect(path)) as connection:
         connection.executescript(FOREIGN[case])
@@ -307,7 +340,9 @@ def test_copies_hold_the_tables_of_colmap_alone(source: Path, tmp_path: Path, ca
     assert len(tables_of(source)) == 12
     for name in tables_of(source):
         query = f"SELECT * FROM {name}"
-        assert sorted(rows(tmp_path / "copy.db", query)) == sorted(rows(source, query)), name
+        assert sorted(rows(tmp_path / "copy.db", query)) == sorted(
+            rows(source, query)
+        ), name
     with open_database(tmp_path / "copy.db") as database:
         database.clear_keypoints()
         database.write_keypoints(1, np.zeros((1, 2), np.float32))
@@ -319,7 +354,9 @@ def test_triggers_of_old_databases_stay_behind(source: Path, tmp_path: Path) -> 
     export_database(source, tmp_path / "old.db")
     execute(tmp_path / "old.db", FOREIGN["trigger"], FOREIGN["view"])
     copy_database(tmp_path / "old.db", tmp_path / "copy.db")
-    made = rows(tmp_path / "copy.db", "SELECT name FROM sqlite_master WHERE type != 'table'")
+    made = rows(
+        tmp_path / "copy.db", "SELECT name FROM sqlite_master WHERE type != 'table'"
+    )
     assert not {("t",), ("v",)} & {*made}
     query = "SELECT image_id, rows, data FROM keypoints"
     assert rows(tmp_path / "copy.db", query) == rows(source, query)
@@ -328,7 +365,9 @@ def test_triggers_of_old_databases_stay_behind(source: Path, tmp_path: Path) -> 
 
 def test_views_are_no_tables(source: Path, tmp_path: Path) -> None:
     path = Path(shutil.copy(source, tmp_path / "given.db"))
-    execute(path, "ALTER TABLE frames RENAME TO f", "CREATE VIEW frames AS SELECT * FROM f")
+    execute(
+        path, "ALTER TABLE frames RENAME TO f", "CREATE VIEW frames AS SELECT * FROM f"
+    )
     copy_database(path, tmp_path / "copy.db")
     assert rows(tmp_path / "copy.db", "SELECT * FROM frames") == []
 
@@ -342,6 +381,8 @@ def test_rows_that_no_table_can_hold_are_one_line(source: Path, tmp_path: Path) 
         "ALTER TABLE c RENAME TO cameras",
         "UPDATE cameras SET prior_focal_length = NULL",
     )
-    with pytest.raises(DatabaseError, match="has rows that COLMAP's tables cannot hold"):
+    with pytest.raises(
+        DatabaseError, match="has rows that COLMAP's tables cannot hold"
+    ):
         copy_database(path, tmp_path / "copy.db")
     assert not (tmp_path / "copy.db").exists()

@@ -39,12 +39,16 @@ def float_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> Ma
 
     forward = nearest(angles)
     backward = nearest(angles.T)
-    return {(i, j) for i, j in enumerate(forward.tolist()) if j >= 0 and backward[j] == i}
+    return {
+        (i, j) for i, j in enumerate(forward.tolist()) if j >= 0 and backward[j] == i
+    }
 
 
 def colmap_matches(path: Path) -> Matches:
     """What COLMAP's exact matcher finds between images 1 and 2."""
-    options = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True, use_gpu=False)
+    options = pycolmap.FeatureMatchingOptions(
+        skip_geometric_verification=True, use_gpu=False
+    )
     options.sift.cpu_brute_force_matcher = True
     options.sift.max_ratio = MAX_RATIO
     pycolmap.match_exhaustive(path, matching_options=options)
@@ -66,7 +70,9 @@ def test_colmap_matches_what_float_descriptors_match(tmp_path: Path) -> None:
     old = tmp_path / "old.db"
     assert export_database(path, old, descriptors=True) == 2
     with open_database(path) as database, closing(sqlite3.connect(old)) as copied:
-        data = copied.execute("SELECT data FROM descriptors WHERE image_id = 1").fetchone()[0]
+        data = copied.execute(
+            "SELECT data FROM descriptors WHERE image_id = 1"
+        ).fetchone()[0]
         assert data == np.asarray(database.read_descriptors(1).data).tobytes()
     assert len(expected & found) >= 0.95 * len(expected)
     assert len(found - expected) <= 0.05 * len(expected)
@@ -108,9 +114,13 @@ def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble(
 ) -> None:
     row = np.full((1, 128), np.sqrt((1.0 - 0.26) / 125))
     row[0, :3] = 0.3, 0.4, 0.1
-    values, none, zeros = written(tmp_path / "a.db", row, np.zeros((0, 128)), np.zeros((2, 128)))
+    values, none, zeros = written(
+        tmp_path / "a.db", row, np.zeros((0, 128)), np.zeros((2, 128))
+    )
     assert values[0, :3].tolist() == [154, 205, 51]
     assert len(none) == 0
     assert not zeros.any()
-    with pytest.raises(DatabaseError, match=r"64 elements.*leave out --database-descriptors"):
+    with pytest.raises(
+        DatabaseError, match=r"64 elements.*leave out --database-descriptors"
+    ):
         written(tmp_path / "b.db", np.ones((3, 64)))

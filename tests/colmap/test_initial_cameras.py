@@ -10,9 +10,17 @@ from numpy.testing import assert_allclose
 from photographs_with_exif import BODY, LENS_50, write_photograph
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records, write_camera_records
+from colmap_affrect.colmap.cameras import (
+    CameraRecord,
+    read_camera_records,
+    write_camera_records,
+)
 from colmap_affrect.colmap.database import camera_matrix, open_database
-from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
+from colmap_affrect.colmap.initial_cameras import (
+    InitialCameras,
+    import_images,
+    record_cameras,
+)
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.session.view_graph import ViewGraph
@@ -40,7 +48,9 @@ def photos(tmp_path: Path) -> Path:
 NAMES = ["a.jpg", "b.jpg", "c.jpg", "side/d.jpg", "side/e.jpg", "side/f.png"]
 
 
-def imported(path: Path, photos: Path, names: list[str], **options: object) -> list[str]:
+def imported(
+    path: Path, photos: Path, names: list[str], **options: object
+) -> list[str]:
     """Import images, and return for each the first image with the same camera."""
     assert import_images(path, photos, names, CameraOptions(**options)) == []
     return sharing(path)
@@ -71,7 +81,11 @@ def test_images_of_one_body_lens_focal_length_and_size_share_a_camera(
     scan = camera_of(path, "side/f.png")
     assert (scan.focal_length, scan.has_prior_focal_length) == (1.2 * 90, False)
     with open_database(path) as database:
-        assert (database.num_rigs(), database.num_frames(), database.num_images()) == (4, 6, 6)
+        assert (database.num_rigs(), database.num_frames(), database.num_images()) == (
+            4,
+            6,
+            6,
+        )
     assert imported(tmp_path / "b.db", photos, NAMES, mode="per-image") == NAMES
     assert imported(tmp_path / "c.db", photos, NAMES, ignore_exif=True) == NAMES
     assert not camera_of(tmp_path / "c.db", "a.jpg").has_prior_focal_length
@@ -92,7 +106,9 @@ def test_forced_camera_takes_no_focal_length_that_its_images_contradict(
     assert (record.source, record.focal_px) == ("exif", pytest.approx(WIDE_PX))
 
 
-def test_wrong_exif_of_a_shrunk_photograph_is_rescaled_in_the_database(tmp_path: Path) -> None:
+def test_wrong_exif_of_a_shrunk_photograph_is_rescaled_in_the_database(
+    tmp_path: Path,
+) -> None:
     tags = {**LENS_50, "ExifImageWidth": 4368, "ExifImageHeight": 2912}
     write_photograph(tmp_path / "photos" / "a.jpg", (728, 1092), tags)
     path = tmp_path / "a.db"
@@ -118,14 +134,20 @@ def test_wrong_exif_of_a_shrunk_photograph_is_rescaled_in_the_database(tmp_path:
     ),
 ])  # fmt: skip
 def test_what_is_given_stays_and_the_rest_is_as_it_would_be(
-    photos: Path, tmp_path: Path, options: dict[str, object], params: list[float], given: object
+    photos: Path,
+    tmp_path: Path,
+    options: dict[str, object],
+    params: list[float],
+    given: object,
 ) -> None:
     path = tmp_path / "a.db"
     imported(path, photos, ["a.jpg"], **options)
     camera = camera_of(path, "a.jpg")
     assert_allclose(camera.params, params)
     assert camera.has_prior_focal_length
-    _, record = InitialCameras(photos, CameraOptions(**options)).camera(["a.jpg"], (90, 60))
+    _, record = InitialCameras(photos, CameraOptions(**options)).camera(
+        ["a.jpg"], (90, 60)
+    )
     assert record.given == given
     assert record.source == ("given" if "focal" in record.given else "exif")
     assert record.is_fixed == ("distortion" in record.given)
@@ -154,7 +176,14 @@ def test_table_decides_who_shares_a_camera_and_the_rest_is_as_without(
     )
     path = tmp_path / "a.db"
     found = imported(path, photos, NAMES, cameras_path=str(listed))
-    assert found == ["a.jpg", "b.jpg", "a.jpg", "side/d.jpg", "side/d.jpg", "side/f.png"]
+    assert found == [
+        "a.jpg",
+        "b.jpg",
+        "a.jpg",
+        "side/d.jpg",
+        "side/d.jpg",
+        "side/f.png",
+    ]
     assert camera_of(path, "c.jpg").focal_length == pytest.approx(150 / 180 * 90)
     assert camera_of(path, "side/f.png").focal_length == pytest.approx(200 / 120 * 60)
     assert camera_of(path, "b.jpg").focal_length == pytest.approx(WIDE_PX)
@@ -175,7 +204,11 @@ def test_table_decides_who_shares_a_camera_and_the_rest_is_as_without(
     ),
 ])  # fmt: skip
 def test_cameras_that_cannot_be_are_one_clear_line(
-    photos: Path, tmp_path: Path, rows: list[str], options: dict[str, object], message: str
+    photos: Path,
+    tmp_path: Path,
+    rows: list[str],
+    options: dict[str, object],
+    message: str,
 ) -> None:
     listed = tmp_path / "plates.csv"
     listed.write_text("\n".join(["name,focal_px,camera", *rows]))
@@ -224,8 +257,12 @@ def test_images_of_several_sizes_that_should_share_a_camera_do_so_size_by_size(
     assert imported(tmp_path / "a.db", photos, NAMES, **given) == shared
 
 
-def test_lens_and_film_tell_the_focal_lengths_of_scans_of_all_sizes(photos: Path) -> None:
-    options = CameraOptions(mode="single", ignore_exif=True, focal_mm=50.0, film_width_mm=36.0)
+def test_lens_and_film_tell_the_focal_lengths_of_scans_of_all_sizes(
+    photos: Path,
+) -> None:
+    options = CameraOptions(
+        mode="single", ignore_exif=True, focal_mm=50.0, film_width_mm=36.0
+    )
     initial = InitialCameras(photos, options)
     for group, names in initial.groups(NAMES).items():
         camera, record = initial.camera(names, initial.size(names[0]))
@@ -256,7 +293,11 @@ def test_intrinsics_before_the_import_are_those_of_the_database(
     listed = tmp_path / "plates.csv"
     listed.write_text("name,cx,cy\na.jpg,40,33\n")
     for number, options in enumerate(
-        [{}, {"cameras_path": str(listed)}, {"mode": "per-image", "principal_point": "40,33"}]
+        [
+            {},
+            {"cameras_path": str(listed)},
+            {"mode": "per-image", "principal_point": "40,33"},
+        ]
     ):
         path = tmp_path / f"{number}.db"
         imported(path, photos, NAMES, **options)
@@ -289,10 +330,14 @@ def test_records_are_kept_and_follow_the_images_that_come_later(
     assert records[1].focal_px == 70.0
 
 
-def test_lens_in_mm_is_on_record_where_nothing_tells_the_size_of_the_sensor(tmp_path: Path) -> None:
+def test_lens_in_mm_is_on_record_where_nothing_tells_the_size_of_the_sensor(
+    tmp_path: Path,
+) -> None:
     tags = {"Make": "Nobody", "Model": "Knows", "FocalLength": 35.0}
     write_photograph(tmp_path / "photos" / "a.jpg", (90, 60), tags)
-    write_photograph(tmp_path / "photos" / "b.jpg", (90, 60), {**tags, "FocalLengthIn35mmFilm": 50})
+    write_photograph(
+        tmp_path / "photos" / "b.jpg", (90, 60), {**tags, "FocalLengthIn35mmFilm": 50}
+    )
     initial = InitialCameras(tmp_path / "photos", CameraOptions())
     records = {name: initial.camera([name], (90, 60))[1] for name in ("a.jpg", "b.jpg")}
     assert (records["a.jpg"].source, records["a.jpg"].lens_mm) == ("guess", 35.0)
@@ -308,17 +353,27 @@ def test_cameras_of_another_program_are_given_where_they_are_flagged(
 ) -> None:
     path = tmp_path / "a.db"
     records_path = tmp_path / "cameras.json"
-    options = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params="71,72,44,31")
+    options = pycolmap.ImageReaderOptions(
+        camera_model="PINHOLE", camera_params="71,72,44,31"
+    )
     with open_database(path):
         pass
     pycolmap.import_images(path, photos, pycolmap.CameraMode.SINGLE, NAMES[:1], options)
     pycolmap.import_images(path, photos, pycolmap.CameraMode.PER_IMAGE, NAMES[5:])
     record_cameras(ViewGraph(path).cameras, records_path)
     before = read_camera_records(records_path)
-    assert [(r.source, r.focal_px) for r in before.values()] == [("given", 71.5), ("guess", 108)]
+    assert [(r.source, r.focal_px) for r in before.values()] == [
+        ("given", 71.5),
+        ("guess", 108),
+    ]
     records_path.unlink()
-    record_cameras(ViewGraph(path).cameras, records_path, InitialCameras(photos, CameraOptions()))
-    assert [r.source for r in read_camera_records(records_path).values()] == ["given", "guess"]
+    record_cameras(
+        ViewGraph(path).cameras, records_path, InitialCameras(photos, CameraOptions())
+    )
+    assert [r.source for r in read_camera_records(records_path).values()] == [
+        "given",
+        "guess",
+    ]
     assert camera_of(path, "a.jpg").params.tolist() == [71, 72, 44, 31]
 
 

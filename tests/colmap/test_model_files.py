@@ -57,7 +57,9 @@ def test_missing_cut_and_lengthened_files_are_errors_that_name_them(
     rng = random.Random(1)
     for length in [0, 7, len(data) - 1, *(rng.randrange(len(data)) for _ in range(5))]:
         path.write_bytes(data[:length])
-        with pytest.raises(StoreError, match=rf"{name}: damaged \(it ends within a record"):
+        with pytest.raises(
+            StoreError, match=rf"{name}: damaged \(it ends within a record"
+        ):
             registered_names(model_path)
     path.write_bytes(data + b"x")
     with pytest.raises(StoreError, match=rf"{name}: damaged \(something follows"):
@@ -67,7 +69,9 @@ def test_missing_cut_and_lengthened_files_are_errors_that_name_them(
         registered_names(model_path)
 
 
-def test_damaged_models_are_an_error_or_can_be_used(model_path: Path, tmp_path: Path) -> None:
+def test_damaged_models_are_an_error_or_can_be_used(
+    model_path: Path, tmp_path: Path
+) -> None:
     rng = random.Random(2)
     num_errors = 0
     for _ in range(60):
@@ -101,7 +105,11 @@ def test_tracks_and_keypoints_name_each_other(
     other.mkdir()
     changed.write(other)
     shutil.copy(other / "points3D.bin", tmp_path)
-    what = "is not as it was written" if is_ours else "images and points are not of one model"
+    what = (
+        "is not as it was written"
+        if is_ours
+        else "images and points are not of one model"
+    )
     with pytest.raises(StoreError, match=what):
         read_given_model(tmp_path)
 
@@ -112,7 +120,9 @@ def _first(model: pycolmap.Reconstruction) -> pycolmap.Image:
 
 def set_pose(model: pycolmap.Reconstruction, quaternion: list[float], x: float) -> None:
     image = _first(model)
-    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(quaternion)), np.array([x, 0.0, 0.0]))
+    pose = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array(quaternion)), np.array([x, 0.0, 0.0])
+    )
     model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
 
 
@@ -140,13 +150,34 @@ NAN = float("nan")
 INF = float("inf")
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 UNSOUND: dict[str, tuple[Callable[[pycolmap.Reconstruction], None], str]] = {
-    "rotation": (lambda model: set_pose(model, [NAN, 0.0, 0.0, 1.0], 0.0), "the pose of .* is not"),
-    "no rotation": (lambda model: set_pose(model, [0.0] * 4, 0.0), "the pose of .* is not finite"),
-    "translation": (lambda model: set_pose(model, UPRIGHT, NAN), "the pose of .* is not finite"),
-    "infinite": (lambda model: set_pose(model, UPRIGHT, INF), "the pose of .* is not finite"),
-    "huge": (lambda model: set_pose(model, UPRIGHT, 1e300), "the pose of .* is not finite"),
-    "focal length": (lambda model: set_focal(model, NAN), "camera 1 has no size, or no finite"),
-    "negative focal length": (lambda model: set_focal(model, -5.0), "camera 1 has no size"),
+    "rotation": (
+        lambda model: set_pose(model, [NAN, 0.0, 0.0, 1.0], 0.0),
+        "the pose of .* is not",
+    ),
+    "no rotation": (
+        lambda model: set_pose(model, [0.0] * 4, 0.0),
+        "the pose of .* is not finite",
+    ),
+    "translation": (
+        lambda model: set_pose(model, UPRIGHT, NAN),
+        "the pose of .* is not finite",
+    ),
+    "infinite": (
+        lambda model: set_pose(model, UPRIGHT, INF),
+        "the pose of .* is not finite",
+    ),
+    "huge": (
+        lambda model: set_pose(model, UPRIGHT, 1e300),
+        "the pose of .* is not finite",
+    ),
+    "focal length": (
+        lambda model: set_focal(model, NAN),
+        "camera 1 has no size, or no finite",
+    ),
+    "negative focal length": (
+        lambda model: set_focal(model, -5.0),
+        "camera 1 has no size",
+    ),
     "point": (lambda model: set_point(model, NAN), "point 1 is at no finite place"),
     "no image": (deregister, "the model has no images with poses"),
     "two of one name": (name_twice, "two of its images are called"),
@@ -179,7 +210,9 @@ def test_model_of_cameras_alone_needs_no_pose(model_path: Path) -> None:
     assert len(read_given_model(model_path, needs_poses=False).images) == 12
 
 
-def test_folder_of_a_run_stands_for_its_largest_model(model_path: Path, tmp_path: Path) -> None:
+def test_folder_of_a_run_stands_for_its_largest_model(
+    model_path: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out" / "sparse"
     out.mkdir(parents=True)
     shutil.copytree(model_path, out / "0")

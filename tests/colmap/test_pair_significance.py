@@ -10,7 +10,11 @@ from mapping_tasks import write_images
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database, unverified_pairs, write_matches
+from colmap_affrect.colmap.database import (
+    open_database,
+    unverified_pairs,
+    write_matches,
+)
 from colmap_affrect.colmap.verification import (
     Side,
     VerificationOptions,
@@ -33,7 +37,9 @@ HOMOGRAPHY = np.array([[0.5, -0.6, 250.0], [0.8, 0.45, -90.0], [3e-4, -2e-4, 1.0
 
 def camera(camera_id: int, scale: float = 1.0) -> pycolmap.Camera:
     size = [round(scale * side) for side in SIZE]
-    found = pycolmap.Camera.create_from_model_name(camera_id, "PINHOLE", scale * 700, *size)
+    found = pycolmap.Camera.create_from_model_name(
+        camera_id, "PINHOLE", scale * 700, *size
+    )
     found.has_prior_focal_length = True
     return found
 
@@ -55,7 +61,9 @@ def frames_of(homographies: list[Array], num: int, seed: int) -> Frames:
     lafs[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, num)) * stretch
     lafs[:, :, 2] = rng.uniform((60, 50), (580, 430), (num, 2))
     parts = np.array_split(lafs, len(homographies))
-    seen = [transform_lafs(h, part) for h, part in zip(homographies, parts, strict=True)]
+    seen = [
+        transform_lafs(h, part) for h, part in zip(homographies, parts, strict=True)
+    ]
     return lafs, np.concatenate(seen)
 
 
@@ -64,9 +72,15 @@ def rows(lafs: NDArray[np.float64], columns: int = 6) -> NDArray[np.float32]:
     shapes = lafs[:, :, :2].reshape(-1, 4)
     if columns == 4:  # size and direction of the first axis
         shapes = np.stack(
-            [np.hypot(shapes[:, 0], shapes[:, 2]), np.arctan2(shapes[:, 2], shapes[:, 0])], axis=1
+            [
+                np.hypot(shapes[:, 0], shapes[:, 2]),
+                np.arctan2(shapes[:, 2], shapes[:, 0]),
+            ],
+            axis=1,
         )
-    return np.concatenate([lafs[:, :, 2], shapes[:, : columns - 2]], axis=1).astype(np.float32)
+    return np.concatenate([lafs[:, :, 2], shapes[:, : columns - 2]], axis=1).astype(
+        np.float32
+    )
 
 
 def weak_pair(*, frames_agree: bool, planar: bool = False) -> Frames:
@@ -98,7 +112,9 @@ def row_by_row(count: int) -> NDArray[np.int64]:
 
 def num_inliers(frames: Frames, columns: int = 6, **options: float) -> int:
     matches = row_by_row(len(frames[0]))
-    geometry = estimate_geometry(sides_of(frames, columns), matches, VerificationOptions(**options))
+    geometry = estimate_geometry(
+        sides_of(frames, columns), matches, VerificationOptions(**options)
+    )
     return len(geometry.inlier_matches)
 
 
@@ -110,14 +126,18 @@ def test_frames_decide_where_positions_do_not(planar: bool) -> None:
     wrong = weak_pair(frames_agree=False, planar=planar)
     by_colmap = VerificationOptions().min_num_inliers
     assert num_inliers(right, min_significance=0.0) >= by_colmap
-    assert num_inliers(wrong, min_significance=0.0) == num_inliers(right, min_significance=0.0)
+    assert num_inliers(wrong, min_significance=0.0) == num_inliers(
+        right, min_significance=0.0
+    )
     limit = 60.0 if planar else 5.0
     assert num_inliers(right, min_significance=limit) >= by_colmap
     assert num_inliers(wrong, min_significance=limit) == 0
 
 
 @pytest.mark.parametrize("frames_agree", [True, False])
-def test_homography_is_judged_where_epipolar_lines_are_not_significant(frames_agree: bool) -> None:
+def test_homography_is_judged_where_epipolar_lines_are_not_significant(
+    frames_agree: bool,
+) -> None:
     # Lines through 22 matches of a strongly tilted plane hold others of the 180 by chance.
     tilted = np.array([[0.33, 0.12, 180.0], [-0.1, 0.95, 40.0], [-5e-4, 1e-4, 1.0]])
     first, second = frames_of([tilted], 22, 11)
@@ -144,8 +164,12 @@ def test_homography_is_judged_where_epipolar_lines_are_not_significant(frames_ag
     inliers = np.asarray(plane.inlier_matches, np.int64)
     assert len(lines.inlier_matches) > len(inliers) >= 20
     assert (inliers < 22).all()
-    np.testing.assert_allclose(project(plane.H, first[:, :, 2]), second[:, :, 2], atol=6.0)
-    assert len(estimated(min_significance=30.0, min_inlier_ratio=0.13).inlier_matches) == 0
+    np.testing.assert_allclose(
+        project(plane.H, first[:, :, 2]), second[:, :, 2], atol=6.0
+    )
+    assert (
+        len(estimated(min_significance=30.0, min_inlier_ratio=0.13).inlier_matches) == 0
+    )
 
 
 @pytest.mark.long
@@ -158,7 +182,10 @@ def test_database_without_shapes_needs_more_inliers() -> None:
     for lafs in upright:
         lafs[:, :, :2] = 3.0 * np.eye(2)
     assert num_inliers((upright[0], upright[1]), min_significance=5.0) == 0
-    many = (np.concatenate([frames[0], frames[0]]), np.concatenate([frames[1], frames[1]]))
+    many = (
+        np.concatenate([frames[0], frames[0]]),
+        np.concatenate([frames[1], frames[1]]),
+    )
     assert num_inliers(many, columns=2, min_significance=5.0) > 0
 
 
@@ -195,7 +222,9 @@ def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
     options = VerificationOptions(min_significance=5.0)
     write_pairs(path)
 
-    def interrupted(sides: tuple[Side, Side], *given: object) -> pycolmap.TwoViewGeometry:
+    def interrupted(
+        sides: tuple[Side, Side], *given: object
+    ) -> pycolmap.TwoViewGeometry:
         if np.array_equal(sides[1].keypoints, last):
             raise KeyboardInterrupt
         return estimate_geometry(sides, *given)
@@ -203,7 +232,9 @@ def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
     with open_database(path) as database:
         last = database.read_keypoints(4)
     with monkeypatch.context() as patched:
-        patched.setattr("colmap_affrect.colmap.verification.estimate_geometry", interrupted)
+        patched.setattr(
+            "colmap_affrect.colmap.verification.estimate_geometry", interrupted
+        )
         patched.setattr("colmap_affrect.colmap.verification.PAIRS_PER_WRITE", 1)
         with pytest.raises(KeyboardInterrupt):
             verify(path, options)
@@ -218,11 +249,15 @@ def test_preset_colmap_writes_what_pycolmap_does(tmp_path: Path) -> None:
         write_pairs(path)
     options = VerificationOptions.preset("colmap", max_num_trials=300)
     verify(paths[0], options)
-    pycolmap.geometric_verification(paths[1], two_view_geometry_options=two_view_options(options))
+    pycolmap.geometric_verification(
+        paths[1], two_view_geometry_options=two_view_options(options)
+    )
     found = []
     for path in paths:
         with open_database(path) as database:
-            found.append([database.read_two_view_geometry(*pair) for pair in ((1, 2), (3, 4))])
+            found.append(
+                [database.read_two_view_geometry(*pair) for pair in ((1, 2), (3, 4))]
+            )
     for ours, theirs in zip(*found, strict=True):
         assert ours.config == theirs.config
         np.testing.assert_array_equal(ours.inlier_matches, theirs.inlier_matches)
@@ -243,7 +278,9 @@ def with_caption(frames: Frames) -> Frames:
     """Add forty matches of print below, which is a little larger and elsewhere in image 2."""
     lafs, _ = frames_of([np.eye(3)], 40, 11)
     lafs[:, :, 2] = np.random.default_rng(12).uniform((200, 440), (350, 446), (40, 2))
-    moved = transform_lafs(np.array([[1.05, 0.02, 60.0], [-0.02, 1.05, -390.0], [0, 0, 1]]), lafs)
+    moved = transform_lafs(
+        np.array([[1.05, 0.02, 60.0], [-0.02, 1.05, -390.0], [0, 0, 1]]), lafs
+    )
     return np.concatenate([frames[0], lafs]), np.concatenate([frames[1], moved])
 
 
@@ -258,7 +295,9 @@ def test_writing_at_another_place_ties_no_pair_and_leaves_none() -> None:
         found = estimate_geometry((sides[0], sides[1]), matches, VerificationOptions())
         inliers = np.asarray(found.inlier_matches).reshape(-1, 2)[:, 0]
         assert (inliers < 80).sum() >= 0.95 * expected
-        assert (inliers >= 80).sum() <= 4  # those that the epipolar geometry explains by chance
+        assert (
+            inliers >= 80
+        ).sum() <= 4  # those that the epipolar geometry explains by chance
         accepted = estimate_geometry(
             (sides[0], sides[1]), matches, VerificationOptions(min_significance=0.0)
         )

@@ -12,7 +12,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.colmap.native_options import differences, flat_values
-from colmap_affrect.colmap.verification import VerificationOptions, two_view_options, verify
+from colmap_affrect.colmap.verification import (
+    VerificationOptions,
+    two_view_options,
+    verify,
+)
 from colmap_affrect.comparison.results import pair_errors
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -48,19 +52,25 @@ def reconstruct(
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
-def max_rotation_error_deg(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction) -> float:
+def max_rotation_error_deg(
+    model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction
+) -> float:
     """Largest error of the relative rotation of two registered images."""
     errors = pair_errors(model_poses(model), model_poses(truth))
     return max(degrees for degrees, _ in errors.values())
 
 
-def test_two_images_register_with_our_preset_and_not_with_colmaps_default(tmp_path: Path) -> None:
+def test_two_images_register_with_our_preset_and_not_with_colmaps_default(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "database.db"
     truth = synthesize(path, num_rigs=1, num_frames_per_rig=2, num_points3D=400)
     with open_database(path) as database:
         database.clear_two_view_geometries()
     verify(path, VerificationOptions(random_seed=SEED))
-    assert reconstruct(path, pycolmap.IncrementalPipelineOptions(random_seed=SEED)) == []
+    assert (
+        reconstruct(path, pycolmap.IncrementalPipelineOptions(random_seed=SEED)) == []
+    )
     (model,) = reconstruct(path)
     assert model.num_reg_images() == 2
     assert {point.track.length() for point in model.points3D.values()} == {2}
@@ -69,7 +79,11 @@ def test_two_images_register_with_our_preset_and_not_with_colmaps_default(tmp_pa
 
 def test_options_are_passed_on_to_pycolmap() -> None:
     verification = VerificationOptions.preset(
-        "colmap", max_error_px=3.0, min_num_inliers=21, min_inlier_ratio=0.17, random_seed=5
+        "colmap",
+        max_error_px=3.0,
+        min_num_inliers=21,
+        min_inlier_ratio=0.17,
+        random_seed=5,
     )
     assert of_verification(verification) == {
         "ransac.max_error": 3.0, "min_num_inliers": 21, "min_inlier_ratio": 0.17,
@@ -90,12 +104,16 @@ def repeatable() -> dict[str, int]:
     """What makes results repeatable: all seeds and numbers of threads that pycolmap has."""
     names = {"num_threads": 1, "random_seed": SEED}
     keys = flat_values(pycolmap.IncrementalPipelineOptions())
-    return {key: names[key.split(".")[-1]] for key in keys if key.split(".")[-1] in names}
+    return {
+        key: names[key.split(".")[-1]] for key in keys if key.split(".")[-1] in names
+    }
 
 
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("mapper", ["sparse", "incremental"])
-def test_colmap_preset_is_what_pycolmap_has_by_default(mapper: str, given: bool) -> None:
+def test_colmap_preset_is_what_pycolmap_has_by_default(
+    mapper: str, given: bool
+) -> None:
     verification = VerificationOptions.preset("colmap", random_seed=SEED)
     assert of_verification(verification) == {"ransac.random_seed": SEED}
     made = mapper_of(mapper, "colmap")
@@ -105,7 +123,11 @@ def test_colmap_preset_is_what_pycolmap_has_by_default(mapper: str, given: bool)
 
 def test_unknown_preset_and_mapper_are_refused() -> None:
     for make in (VerificationOptions.preset, IncrementalOptions.preset):
-        with pytest.raises(OptionError, match="preset 'dense' is not one of sparse, colmap"):
+        with pytest.raises(
+            OptionError, match="preset 'dense' is not one of sparse, colmap"
+        ):
             make("dense")
-    with pytest.raises(OptionError, match=r"unknown mapper 'sparce' .did you mean 'sparse'"):
+    with pytest.raises(
+        OptionError, match=r"unknown mapper 'sparce' .did you mean 'sparse'"
+    ):
         MAPPERS.options("sparce")

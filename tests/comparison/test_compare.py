@@ -68,7 +68,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def options(scene: Path) -> CompareOptions:
     return CompareOptions(
-        methods=METHODS, seeds=(0, 1), cameras=CAMERAS, ground_truth_path=scene / "truth"
+        methods=METHODS,
+        seeds=(0, 1),
+        cameras=CAMERAS,
+        ground_truth_path=scene / "truth",
     )
 
 
@@ -120,7 +123,10 @@ def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> N
     assert comparison.registered_by_none == ("broken.png",)
     ours = f"our features (unrectified-rootsift): 3 of {len(GIVEN)}, 3 of them correct"
     assert ours in verdict(comparison)
-    assert any(text.startswith("depth-planes-recommended failed: ") for text in verdict(comparison))
+    assert any(
+        text.startswith("depth-planes-recommended failed: ")
+        for text in verdict(comparison)
+    )
 
 
 def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
@@ -128,9 +134,13 @@ def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
     shared = []
     for method in comparison.finished:
         with open_copy(out / method.folder / "database.db") as database:
-            images = [(i.image_id, i.name, i.camera_id) for i in database.read_all_images()]
+            images = [
+                (i.image_id, i.name, i.camera_id) for i in database.read_all_images()
+            ]
             cameras = [list(camera.params) for camera in database.read_all_cameras()]
-            shared.append((sorted(images), cameras, sorted(database.read_num_matches()[0])))
+            shared.append(
+                (sorted(images), cameras, sorted(database.read_num_matches()[0]))
+            )
     assert shared[0] == shared[1]
 
 
@@ -143,7 +153,9 @@ def test_finished_methods_are_not_run_again_where_photographs_moved_only(
     assert compare(images, compared[1], chosen).methods == compared[0].methods[:2]
     name = min(path.name for path in images.iterdir())
     (images / name).write_bytes((images / name).read_bytes() + b" ")
-    with pytest.raises(StoreError, match=rf"run there with photographs\.{name}='.*, and"):
+    with pytest.raises(
+        StoreError, match=rf"run there with photographs\.{name}='.*, and"
+    ):
         compare(images, compared[1], chosen)
     assert asked == []
 
@@ -155,7 +167,10 @@ def test_finished_methods_are_not_run_again_where_photographs_moved_only(
             {"cameras": CameraOptions()},
             "sift was run there with camera.mode='per-image', and it is",
         ),
-        ({"mapping": SparseOptions(min_model_size=3)}, "mapping.min_model_size=2, and it is 3"),
+        (
+            {"mapping": SparseOptions(min_model_size=3)},
+            "mapping.min_model_size=2, and it is 3",
+        ),
         (
             {"methods": ["unrectified-rootsift=default"]},
             "unrectified-rootsift was run there with rectifier.name='identity', and it is",
@@ -175,11 +190,27 @@ def test_other_options_than_before_are_refused(
     [
         ({"methods": ["sift", "defualt"]}, OptionError, "did you mean 'default'"),
         ({"seeds": (1, 1)}, OptionError, "give different seeds"),
-        ({"seeds": (0, -5)}, OptionError, "random_seed=-5: should be greater than or equal to -1"),
+        (
+            {"seeds": (0, -5)},
+            OptionError,
+            "random_seed=-5: should be greater than or equal to -1",
+        ),
         ({"resources": Resources(device="cuda:99")}, AffrectError, "--device cuda:99"),
-        ({"ground_truth_path": Path("nowhere")}, OptionError, "nowhere: no such folder"),
-        ({"pairs": PairOptions(match_list_path="nowhere")}, OptionError, "nowhere: cannot be read"),
-        ({"cameras": CameraOptions(model="PINHOLES")}, OptionError, "PINHOLES is not one of"),
+        (
+            {"ground_truth_path": Path("nowhere")},
+            OptionError,
+            "nowhere: no such folder",
+        ),
+        (
+            {"pairs": PairOptions(match_list_path="nowhere")},
+            OptionError,
+            "nowhere: cannot be read",
+        ),
+        (
+            {"cameras": CameraOptions(model="PINHOLES")},
+            OptionError,
+            "PINHOLES is not one of",
+        ),
     ],
 )
 def test_bad_input_is_refused_before_any_work(
@@ -189,7 +220,9 @@ def test_bad_input_is_refused_before_any_work(
         compare(scene / "images", tmp_path / "out", options.changed(**changes))
     write_ground_truth(tmp_path / "truth", ".jpg")
     options = options.changed(ground_truth_path=tmp_path / "truth")
-    with pytest.raises(AffrectError, match=r"shares no image name .* \(it has a.jpg, they"):
+    with pytest.raises(
+        AffrectError, match=r"shares no image name .* \(it has a.jpg, they"
+    ):
         compare(scene / "images", tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
 
@@ -238,7 +271,9 @@ def dying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_page", "dying")
-def test_record_of_many_photographs_reaches_the_process(scene, options, tmp_path, asked) -> None:
+def test_record_of_many_photographs_reaches_the_process(
+    scene, options, tmp_path, asked
+) -> None:
     """It is longer than an argument of a command may be."""
     compare(scene / "images", tmp_path / "out", options.changed(methods=["sift"]))
     many = replace(asked[0], inputs={"photographs": "x" * 200_000})
@@ -295,18 +330,25 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
     (error,) = ended.errors
     assert error.startswith("error: could not read 1 of the images: broken.png; ")
     assert ended.stdout.startswith("method")
-    assert "Photographs that are registered:\nour mapper with SIFT (sift): 3 of 4" in ended.stdout
+    assert (
+        "Photographs that are registered:\nour mapper with SIFT (sift): 3 of 4"
+        in ended.stdout
+    )
 
 
 @pytest.mark.usefixtures("no_page")
-def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path, asked) -> None:
+def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(
+    scene, tmp_path, asked
+) -> None:
     compare(scene / "images", tmp_path, CompareOptions(methods=["sift-colmap", "sift"]))
     presets = [(run.verification.preset_name, run.mapping.preset_name) for run in asked]
     assert presets == [("colmap", "colmap"), ("sparse", "sparse")]
     assert [run.mapping.name for run in asked] == ["incremental", "sparse"]
 
 
-def test_a_folder_of_a_run_is_refused(scene: Path, options: CompareOptions, tmp_path: Path) -> None:
+def test_a_folder_of_a_run_is_refused(
+    scene: Path, options: CompareOptions, tmp_path: Path
+) -> None:
     page = tmp_path / "out" / "report.html"
     page.parent.mkdir()
     page.write_text("of the run")
@@ -318,7 +360,9 @@ def test_a_folder_of_a_run_is_refused(scene: Path, options: CompareOptions, tmp_
 
 
 def test_colmaps_sift_has_the_masks_of_alpha_channels(tmp_path: Path) -> None:
-    photographs = Photographs(tmp_path / "photos", MaskOptions(path=str(tmp_path / "masks")))
+    photographs = Photographs(
+        tmp_path / "photos", MaskOptions(path=str(tmp_path / "masks"))
+    )
     (tmp_path / "masks").mkdir()
     (tmp_path / "photos" / "side").mkdir(parents=True)
     image = np.full((40, 60, 4), 255, np.uint8)

@@ -16,7 +16,10 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 
 
 def test_options_of_a_recipe_are_changed_by_what_follows_the_colon():
-    texts = ["sift, tuned=default:matching.max_ratio=0.7,max_image_size_px=640", "unrectified"]
+    texts = [
+        "sift, tuned=default:matching.max_ratio=0.7,max_image_size_px=640",
+        "unrectified",
+    ]
     sift, tuned, unrectified = parse_methods(texts)
     assert (sift.recipe, unrectified.label) == (None, "unrectified")
     assert tuned.label == "tuned"
@@ -32,7 +35,11 @@ def test_depth_goes_to_the_recipes_that_use_it():
 
 
 def test_folders_of_methods_differ_and_stay_inside():
-    texts = ["default:max_image_size_px=640", "default:max_image_size_px=641", "a/../b=default"]
+    texts = [
+        "default:max_image_size_px=640",
+        "default:max_image_size_px=641",
+        "a/../b=default",
+    ]
     folders = [method.folder_name for method in parse_methods(texts)]
     assert len(set(folders)) == 3
     assert not any("/" in folder or "." in folder for folder in folders)

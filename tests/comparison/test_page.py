@@ -53,7 +53,9 @@ class Page(HTMLParser):
 
     def values(self, tag: str, name: str) -> list[str]:
         """The values of an attribute of all tags of a kind."""
-        return [at[name] or "" for found, at in self.tags if found == tag and name in at]
+        return [
+            at[name] or "" for found, at in self.tags if found == tag and name in at
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +73,9 @@ def page(comparison: Comparison, folder: Path) -> Page:
     return Page(write_page(comparison, folder).read_text(encoding="utf-8"))
 
 
-def test_verdict_table_failures_and_settings_are_told(page: Page, comparison: Comparison) -> None:
+def test_verdict_table_failures_and_settings_are_told(
+    page: Page, comparison: Comparison
+) -> None:
     for title, cells in table(comparison).items():
         assert [page.cells[title, name] for name in ("default", "sift")] == cells
     assert page.cells["registered", "default"] == "4.5 (4-5)"
@@ -89,24 +93,37 @@ def test_marks_say_what_each_method_does_with_a_photograph(page: Page) -> None:
     assert titles.count("default: registered, correctly") == 4
     assert titles.count("default: registered with 1 of 2 seeds, wrongly") == 1
     groups = " ".join(page.values("li", "data-groups")).split()
-    expected = {"all": 6, "seeds": 1, "wrong": 1, "none": 2}  # "usually" differ: not with half
+    expected = {
+        "all": 6,
+        "seeds": 1,
+        "wrong": 1,
+        "none": 2,
+    }  # "usually" differ: not with half
     assert {group: groups.count(group) for group in set(groups)} == expected
 
 
-def test_photographs_that_their_method_doubts_are_marked(comparison: Comparison) -> None:
+def test_photographs_that_their_method_doubts_are_marked(
+    comparison: Comparison,
+) -> None:
     seeds = [
         replace(seed, scores=None, doubtful={NAMES[1]: "any focal length fits"})
         for seed in comparison.methods[2].seeds
     ]
-    compared = replace(comparison, methods=(replace(comparison.methods[2], seeds=tuple(seeds)),))
+    compared = replace(
+        comparison, methods=(replace(comparison.methods[2], seeds=tuple(seeds)),)
+    )
     cards = contact_sheet(compared)
     assert [card.name for card in cards if "uncertain" in card.groups] == [NAMES[1]]
 
 
-def test_page_loads_nothing_and_names_are_never_markup(page: Page, folder: Path) -> None:
+def test_page_loads_nothing_and_names_are_never_markup(
+    page: Page, folder: Path
+) -> None:
     for tag, attributes in page.tags:
         assert not any(name.startswith("on") for name in attributes)
-        for name in {"src", "href", "action", "data", "poster", "srcset"} & {*attributes}:
+        for name in {"src", "href", "action", "data", "poster", "srcset"} & {
+            *attributes
+        }:
             assert str(attributes[name]).startswith(("data:", "#")), (tag, name)
     html = (folder / "report.html").read_text(encoding="utf-8")
     assert re.findall(r"https?://[^\s\"'<]*|url\(|@import", html) == []
@@ -136,7 +153,9 @@ def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
     assert "No method finished" in page.text
 
 
-def test_lost_models_are_said_in_their_place(comparison: Comparison, tmp_path: Path) -> None:
+def test_lost_models_are_said_in_their_place(
+    comparison: Comparison, tmp_path: Path
+) -> None:
     page = Page(write_page(comparison, tmp_path).read_text(encoding="utf-8"))
     assert "The model cannot be shown" in page.text
     assert page.cells["registered", "sift"] == "4"

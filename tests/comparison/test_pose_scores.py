@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
-from colmap_affrect.comparison.results import PoseScores, correct_images, pair_errors, pose_scores
+from colmap_affrect.comparison.results import (
+    PoseScores,
+    correct_images,
+    pair_errors,
+    pose_scores,
+)
 from colmap_affrect.errors import AffrectError
 
 
@@ -66,7 +71,9 @@ def test_half_of_the_others_decides(truth: Poses) -> None:
 
 
 @pytest.mark.parametrize(("degrees", "expected"), [(4.9, 5), (5.1, 4)])
-def test_poses_are_correct_within_5_degrees(truth: Poses, degrees: float, expected: int) -> None:
+def test_poses_are_correct_within_5_degrees(
+    truth: Poses, degrees: float, expected: int
+) -> None:
     assert num_correct(turned(truth, "4.jpg", degrees), truth) == expected
 
 
@@ -83,7 +90,10 @@ def test_only_images_that_are_given_and_have_truth_are_judged(truth: Poses) -> N
     estimated = turned({name: truth[name] for name in names}, "2.jpg", 20)
     estimated["without truth.jpg"] = truth["0.jpg"]
     scores = pose_scores(estimated, truth, given)
-    assert (scores.correct_names, scores.wrong_names) == (("0.jpg", "1.jpg"), ("2.jpg",))
+    assert (scores.correct_names, scores.wrong_names) == (
+        ("0.jpg", "1.jpg"),
+        ("2.jpg",),
+    )
 
 
 @pytest.mark.parametrize("content", [None, "nothing of COLMAP\n"])

@@ -8,7 +8,12 @@ from typing import Any
 
 import pytest
 
-from colmap_affrect.comparison.results import Comparison, MethodResult, PoseScores, SeedResult
+from colmap_affrect.comparison.results import (
+    Comparison,
+    MethodResult,
+    PoseScores,
+    SeedResult,
+)
 from colmap_affrect.comparison.tables import headline, notes, summary, table, to_json
 
 NAMES = tuple("abcdef")
@@ -67,7 +72,10 @@ FAILED = MethodResult("sift", failed="no weights")
             ],
         ),
         (
-            [method("sift", "abc", correct="abc"), method("default", "abcdef", correct="ab")],
+            [
+                method("sift", "abc", correct="abc"),
+                method("default", "abcdef", correct="ab"),
+            ],
             [
                 FIRST,
                 "our mapper with SIFT (sift): 3 of 6, 3 of them correct",
@@ -76,11 +84,15 @@ FAILED = MethodResult("sift", failed="no weights")
         ),
         (
             [method("sift", ""), method("default", "ab", "")],
-            ["Nothing was reconstructed: no method registers more than 2 of the 6 photographs."],
+            [
+                "Nothing was reconstructed: no method registers more than 2 of the 6 photographs."
+            ],
         ),
     ],
 )
-def test_headline_counts_what_each_kind_of_method_registers(methods: Methods, expected: list[str]):
+def test_headline_counts_what_each_kind_of_method_registers(
+    methods: Methods, expected: list[str]
+):
     assert headline(comparison(*methods)) == expected
 
 
@@ -129,7 +141,9 @@ def test_table_has_the_best_method_first_and_ranges_over_the_seeds():
 
 
 def test_json_and_summary_say_the_same():
-    compared = comparison(SIFT, method("default", "abcd", "abcde", correct="abc"), FAILED)
+    compared = comparison(
+        SIFT, method("default", "abcd", "abcde", correct="abc"), FAILED
+    )
     values = json.loads(to_json(compared))
     assert values["verdict"] == [*headline(compared), *notes(compared)]
     assert (values["images_total"], values["registered_by_none"]) == (6, ["e", "f"])

@@ -104,7 +104,9 @@ class ExtractorContract(Contract):
         for image, both in zip(images, together, strict=True):
             alone = self.extract((image, None))
             assert_allclose(both.lafs, alone.lafs, atol=SAME_DESCRIPTOR_ERROR, rtol=0)
-            assert_allclose(both.descriptors, alone.descriptors, atol=SAME_DESCRIPTOR_ERROR)
+            assert_allclose(
+                both.descriptors, alone.descriptors, atol=SAME_DESCRIPTOR_ERROR
+            )
         again = extractor.describe(images, detected)
         assert_array_equal(again[0].descriptors, together[0].descriptors)
 
@@ -127,7 +129,9 @@ class MatcherContract(Contract):
     def things(self) -> np.ndarray:
         return np.random.default_rng(0).gamma(0.4, size=(NUM_THINGS, 128))
 
-    def test_same_things_are_matched_in_rising_order_of_the_first_image(self, things) -> None:
+    def test_same_things_are_matched_in_rising_order_of_the_first_image(
+        self, things
+    ) -> None:
         matcher: Matcher = self.make()
         order = np.random.default_rng(1).permutation(NUM_THINGS)[:45]
         first = image_of(things, 2)
@@ -152,9 +156,13 @@ class MatcherContract(Contract):
             found = matcher.match(*pair)
             assert (found.indices.shape, len(found.scores)) == ((0, 2), 0)
 
-    def test_what_is_kept_of_an_image_has_a_size_and_serves_every_pair(self, things) -> None:
+    def test_what_is_kept_of_an_image_has_a_size_and_serves_every_pair(
+        self, things
+    ) -> None:
         matcher: Matcher = self.make()
-        first, second, third = (matcher.prepare(image_of(things, seed)) for seed in (2, 3, 4))
+        first, second, third = (
+            matcher.prepare(image_of(things, seed)) for seed in (2, 3, 4)
+        )
         assert first.nbytes > NUM_THINGS
         before = matcher.match(first, second)
         matcher.match(third, first)
@@ -166,10 +174,14 @@ class RectifierContract(Contract):
 
     def extractor(self) -> ImageExtractor:
         rectifier: Rectifier = self.make()
-        return ImageExtractor(ExtractionOptions(), (RootSift(SiftOptions()),), (rectifier,))
+        return ImageExtractor(
+            ExtractionOptions(), (RootSift(SiftOptions()),), (rectifier,)
+        )
 
     @pytest.mark.parametrize("kind", IMAGES)
-    def test_plan_keeps_the_invariants_and_features_their_region(self, kind: str) -> None:
+    def test_plan_keeps_the_invariants_and_features_their_region(
+        self, kind: str
+    ) -> None:
         photograph = photograph_of(IMAGES[kind].copy())
         extractor = self.extractor()
         plan, _ = extractor.plan(photograph)
@@ -211,7 +223,9 @@ def check_rectification(item: Rectification, size: tuple[int, int]) -> None:
     mapped = project(matrix, points)
     assert (mapped >= -ROUNDING_PX).all()
     assert (mapped <= np.array(item.canvas_size) - 1 + ROUNDING_PX).all()
-    frames = np.concatenate([np.tile(np.eye(2), (len(points), 1, 1)), points[:, :, None]], axis=2)
+    frames = np.concatenate(
+        [np.tile(np.eye(2), (len(points), 1, 1)), points[:, :, None]], axis=2
+    )
     assert (np.linalg.det(transform_lafs(matrix, frames)[:, :, :2]) > 0).all()
 
 

@@ -36,7 +36,12 @@ from colmap_affrect.stages.pairs import choose_pairs
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
-PARTS = {"mutual": MATCHERS, "orb": EXTRACTORS, "along-street": RECTIFIERS, "plain": MAPPERS}
+PARTS = {
+    "mutual": MATCHERS,
+    "orb": EXTRACTORS,
+    "along-street": RECTIFIERS,
+    "plain": MAPPERS,
+}
 
 
 def example(name: str) -> tuple[str, str, str]:
@@ -54,7 +59,9 @@ def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A package on the path, as pip leaves it, with the lines that the text gives for each part."""
     info = tmp_path / "other_affrect-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-affrect\nVersion: 1.0\n")
+    (info / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: other-affrect\nVersion: 1.0\n"
+    )
     points = []
     for name, registry in PARTS.items():
         path, code, part = example(name)
@@ -98,7 +105,15 @@ def needs(package: str) -> pytest.MarkDecorator:
 @pytest.mark.parametrize("check", ["check", "format --check"])
 def test_example_passes_lint_where_it_is_to_be(name: str, check: str) -> None:
     path, code, _ = example(name)
-    command = [sys.executable, "-m", "ruff", *check.split(), "--stdin-filename", path, "-"]
+    command = [
+        sys.executable,
+        "-m",
+        "ruff",
+        *check.split(),
+        "--stdin-filename",
+        path,
+        "-",
+    ]
     done = subprocess.run(
         command, input=code, cwd=ROOT, capture_output=True, text=True, check=False
     )
@@ -113,8 +128,17 @@ def test_examples_pass_type_checks(tmp_path: Path) -> None:
         path, code, _ = example(name)
         files.append(tmp_path / Path(path).name)
         files[-1].write_text(code, encoding="utf-8")
-    command = [sys.executable, "-m", "mypy", "--config-file", "pyproject.toml", *map(str, files)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--config-file",
+        "pyproject.toml",
+        *map(str, files),
+    ]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout
 
 
@@ -185,7 +209,9 @@ task = test_mappers.task
 def test_new_mapper_keeps_the_contract(task: MappingTask, tmp_path: Path) -> None:
     own = tmp_path / "own"
     own.mkdir()
-    test_mappers.test_mapper_registers_tells_of_it_and_keeps_given_cameras("plain", task, own)
+    test_mappers.test_mapper_registers_tells_of_it_and_keeps_given_cameras(
+        "plain", task, own
+    )
     test_mappers.test_mapper_has_presets_and_refuses_unknown_options("plain")
 
 
@@ -224,5 +250,7 @@ def test_new_mapper_is_chosen_by_name(photos: Path, tmp_path: Path) -> None:
 def test_names_and_options_of_other_packages_are_checked_as_our_own() -> None:
     with pytest.raises(OptionError, match=r"unknown option 'num' .did you mean 'name'"):
         load_recipe("default", ["matching=mutual", "matching.num=3"])
-    with pytest.raises(OptionError, match=r"unknown matcher 'mutal' .did you mean 'mutual'"):
+    with pytest.raises(
+        OptionError, match=r"unknown matcher 'mutal' .did you mean 'mutual'"
+    ):
         load_recipe("default", ["matching=mutal"])

@@ -21,7 +21,9 @@ def task(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> MappingTask:
     """Four photographs, verified."""
     path = tmp_path_factory.mktemp("mappers") / "database.db"
     cameras = {"camera_model": "PINHOLE", "camera_params": INTRINSICS}
-    colmap_affrect.extract_features(path, photos, (), "single", cameras, "unrectified-rootsift")
+    colmap_affrect.extract_features(
+        path, photos, (), "single", cameras, "unrectified-rootsift"
+    )
     colmap_affrect.match_exhaustive(path)
     return replace(task_with_given_cameras(path), image_path=photos)
 

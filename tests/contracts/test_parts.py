@@ -7,18 +7,33 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contracts.contracts import IMAGES, ExtractorContract, MatcherContract, RectifierContract
+from contracts.contracts import (
+    IMAGES,
+    ExtractorContract,
+    MatcherContract,
+    RectifierContract,
+)
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from random_weights import write_comparing_lightglue, write_random_weights
 
 from colmap_affrect.data import Photograph
-from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
+from colmap_affrect.features.base import (
+    EXTRACTORS,
+    SHAPES,
+    FeatureExtractor,
+    NetworkContext,
+)
 from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.tilts import STEP_PX
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
 from colmap_affrect.rectifiers.affine_warps import AsiftOptions
-from colmap_affrect.rectifiers.base import RECTIFIERS, Rectifier, RectifierInputs, RectifierOptions
+from colmap_affrect.rectifiers.base import (
+    RECTIFIERS,
+    Rectifier,
+    RectifierInputs,
+    RectifierOptions,
+)
 from colmap_affrect.rectifiers.depth_planes import DepthPlanesOptions
 
 FEATURES = {
@@ -36,7 +51,11 @@ LONG = ["aliked"]  # takes seconds
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in FEATURES]
+    "case",
+    [
+        pytest.param(name, marks=[pytest.mark.long] * (name in LONG))
+        for name in FEATURES
+    ],
 )
 class TestExtractors(ExtractorContract):
     @pytest.fixture(autouse=True)
@@ -62,7 +81,9 @@ class TestMatchers(MatcherContract):
         self.comparing = comparing
 
     def make(self) -> Matcher:
-        return MATCHERS.make(MATCHERS.options(self.name), MatcherContext(self.comparing))
+        return MATCHERS.make(
+            MATCHERS.options(self.name), MatcherContext(self.comparing)
+        )
 
 
 class Corner:
@@ -86,10 +107,22 @@ class NoDepth:
 RECTIFIER_INPUTS = RectifierInputs(SecondMoment(SecondMomentOptions()), Corner())
 
 RECTIFIER_CASES: dict[str, tuple[RectifierOptions, RectifierInputs]] = {
-    **{name: (RECTIFIERS.options(name), RECTIFIER_INPUTS) for name in RECTIFIERS.names()},
-    "asift of the paper": (AsiftOptions(covering="asift", area_preserving=False), RECTIFIER_INPUTS),
-    "depth-planes of the paper": (DepthPlanesOptions(keep_original="outside"), RECTIFIER_INPUTS),
-    "depth-planes without depth": (DepthPlanesOptions(), RectifierInputs(None, NoDepth())),
+    **{
+        name: (RECTIFIERS.options(name), RECTIFIER_INPUTS)
+        for name in RECTIFIERS.names()
+    },
+    "asift of the paper": (
+        AsiftOptions(covering="asift", area_preserving=False),
+        RECTIFIER_INPUTS,
+    ),
+    "depth-planes of the paper": (
+        DepthPlanesOptions(keep_original="outside"),
+        RECTIFIER_INPUTS,
+    ),
+    "depth-planes without depth": (
+        DepthPlanesOptions(),
+        RectifierInputs(None, NoDepth()),
+    ),
 }
 
 
@@ -129,7 +162,9 @@ def test_shapes_are_unit_metrics_by_block_and_by_sample(
     assert samples.points.shape == (len(samples.metrics), 2)
     assert len(samples.points) > 10
     assert (samples.points >= 0).all()
-    assert (samples.points < STEP_PX * np.array(cells[::-1])).all()  # the last ones may stick out
+    assert (
+        samples.points < STEP_PX * np.array(cells[::-1])
+    ).all()  # the last ones may stick out
     assert_unit_metrics(samples.metrics)
     flat = source.grid(IMAGES["flat"])
     assert not flat.textured.any()

@@ -61,7 +61,9 @@ def folders(finished: Folders, tmp_path: Path) -> Folders:
     copy = Folders(tmp_path / "my photos", tmp_path / "out")
     shutil.copytree(finished.photos, copy.photos)
     shutil.copytree(finished.out, copy.out)
-    copy.change_record(lambda record: record["extract"].update(image_path=str(copy.photos)))
+    copy.change_record(
+        lambda record: record["extract"].update(image_path=str(copy.photos))
+    )
     return copy
 
 
@@ -130,7 +132,9 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
 
 
 @pytest.mark.parametrize("case", FOLDER_CASES)
-def test_what_is_broken_in_a_folder_is_the_one_finding(folders: Folders, case: str) -> None:
+def test_what_is_broken_in_a_folder_is_the_one_finding(
+    folders: Folders, case: str
+) -> None:
     damage, expected = FOLDER_CASES[case]
     damage(folders)
     found = findings(folders.out)
@@ -150,7 +154,13 @@ def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     out = str(folders.out)
     edit_model(model)
     before = (model / "points3D.bin").read_bytes()
-    target = ["--model-path", str(model), "--output-path", str(tmp_path / "new"), "--format=ply"]
+    target = [
+        "--model-path",
+        str(model),
+        "--output-path",
+        str(tmp_path / "new"),
+        "--format=ply",
+    ]
     for inputs in (None, "0" * 64):  # and where mapping would begin anew
         if inputs:
             Workspace(folders.out).record_mapped(MappedFrom(inputs))
@@ -206,7 +216,9 @@ def test_installation_is_examined_without_a_path(tmp_path: Path) -> None:
     found = {finding.where: finding for finding in diagnosis.findings}
     other = found[str(tmp_path / "AffNet.pth")]
     assert other.what == "not the published file of affnet"
-    fetch = f"remove it and run: colmap-affrect weights fetch affnet --weights {tmp_path}"
+    fetch = (
+        f"remove it and run: colmap-affrect weights fetch affnet --weights {tmp_path}"
+    )
     assert other.advice == f"unless it is your own, {fetch}"
     assert diagnosis.num_errors == 0
 

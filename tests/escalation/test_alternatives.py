@@ -50,7 +50,9 @@ name = "identity"
 [[escalation]]
 features = { name = "shapeless", max_num_features = 900 }
 """
-UNSURE = ModelSummary(NAMES[:2], 50, 2.0, 0.5, probabilities=dict.fromkeys(NAMES[:2], 0.6))
+UNSURE = ModelSummary(
+    NAMES[:2], 50, 2.0, 0.5, probabilities=dict.fromkeys(NAMES[:2], 0.6)
+)
 
 
 pytestmark = pytest.mark.usefixtures("shapeless_features_are_known")
@@ -64,9 +66,13 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> Recipe:
 
 
 @pytest.fixture(scope="module")
-def matched(photos: Path, recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+def matched(
+    photos: Path, recipe: Recipe, tmp_path_factory: pytest.TempPathFactory
+) -> Workspace:
     """All pairs were matched by both kinds; the learned ones have fewer features."""
-    workspace = verified(photos, tmp_path_factory.mktemp("matched") / "out", recipe.name)
+    workspace = verified(
+        photos, tmp_path_factory.mktemp("matched") / "out", recipe.name
+    )
     escalation, _ = begin(Context(workspace), recipe.escalate)
     escalation.matches.keep(learning=Begun(1, tuple(escalation.state.pairs)))
     assert escalation.learn() == len(escalation.state.pairs)
@@ -92,7 +98,10 @@ def levels(context: Context) -> set[int]:
 
 
 def with_models(
-    monkeypatch: pytest.MonkeyPatch, *, found: ModelSummary, there: Sequence[ModelSummary]
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    found: ModelSummary,
+    there: Sequence[ModelSummary],
 ) -> list[Choice]:
     """Say what models are there, and what a copy gives; return the choices that are mapped."""
     asked = list[Choice]()
@@ -161,7 +170,9 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     before = escalation.state.states()
     look_at_learned(escalation, mapper)
     assert len(asked) == 1
-    assert not choose_learned(escalation, at_once=True)  # more may be tried without them
+    assert not choose_learned(
+        escalation, at_once=True
+    )  # more may be tried without them
     assert levels(context) == {0}
     assert choose_learned(escalation, at_once=False)
     looked_at = looked_at_before(context)
@@ -169,7 +180,9 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     assert (looked_at.score, looked_at.score_without) == pytest.approx((2.4, 1.4))
     assert looked_at.is_chosen
     assert present_score(context) == looked_at.score
-    assert context.matches.state.modelled == context.matches.state.listed  # are gone on from
+    assert (
+        context.matches.state.modelled == context.matches.state.listed
+    )  # are gone on from
     assert context.matches.state.follows == ""
     assert context.workspace.mapped_from() == context.to_map()
     assert levels(context) == {1}
@@ -186,7 +199,9 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
 def test_learned_models_that_are_sure_of_all_are_chosen_at_once(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sure = replace(UNSURE, registered_names=NAMES, probabilities=dict.fromkeys(NAMES, 0.95))
+    sure = replace(
+        UNSURE, registered_names=NAMES, probabilities=dict.fromkeys(NAMES, 0.95)
+    )
     with_models(monkeypatch, found=sure, there=[UNSURE])
     look_at_learned(escalation_of(context), mapper)
     assert choose_learned(escalation_of(context), at_once=True)
@@ -258,7 +273,9 @@ def made_worse(workspace: Workspace, mapper: Mapper) -> Escalation:
     for pair in escalation.state.pairs:
         if NAMES[0] in pair:
             (there,) = escalation.matches.read([pair])
-            none = replace(there, indices=there.indices[:0], scores=there.scores[:0], level=1)
+            none = replace(
+                there, indices=there.indices[:0], scores=there.scores[:0], level=1
+            )
             escalation.matches.write([none])
     escalation.write()
     map_images(context, mapper)
@@ -291,12 +308,16 @@ def test_best_models_and_their_matches_come_back(
             assert_array_equal([point.xy for point in image.points2D], keypoints[:, :2])
             was = old.images[image.image_id]
             ids = [point.point3D_id for point in image.points2D]
-            assert ids[: was.num_points2D()] == [point.point3D_id for point in was.points2D]
+            assert ids[: was.num_points2D()] == [
+                point.point3D_id for point in was.points2D
+            ]
             assert image.num_points3D == was.num_points3D
     assert model.num_points3D() == old.num_points3D()
     tried = context.matches.levels(escalation.state.pairs, "tried")
     assert {levels for pair, levels in tried.items() if NAMES[0] in pair} == {0b11}
-    assert map_images(context, mapper, goes_on=True)[0].num_done == 0  # nothing is mapped anew
+    assert (
+        map_images(context, mapper, goes_on=True)[0].num_done == 0
+    )  # nothing is mapped anew
     assert not restore_best(escalation)
     forget_others(context)
     assert best_score(context) == 0.0
@@ -305,7 +326,11 @@ def test_best_models_and_their_matches_come_back(
 
 @pytest.mark.parametrize("where", ["guide", "_replaced"])
 def test_run_killed_while_it_goes_back_does_so_afterwards(
-    mapped: Workspace, mapper: Mapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+    mapped: Workspace,
+    mapper: Mapper,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
 ) -> None:
     workspace = copy_of(mapped, tmp_path / "out")
     summaries = read_summaries(workspace.sparse)
@@ -352,7 +377,9 @@ def test_images_that_are_left_out_need_nothing_and_are_no_lack(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     others = NAMES[1:]
-    sure = replace(UNSURE, registered_names=others, probabilities=dict.fromkeys(others, 0.95))
+    sure = replace(
+        UNSURE, registered_names=others, probabilities=dict.fromkeys(others, 0.95)
+    )
     with_models(monkeypatch, found=sure, there=[UNSURE])
     said = replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
     assert NAMES[0] not in escalation_of(said).state.weights([UNSURE])
@@ -385,7 +412,9 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     assert escalation.is_learned
 
 
-def test_matches_of_pairs_that_are_removed_take_learned_ones_along(context: Context) -> None:
+def test_matches_of_pairs_that_are_removed_take_learned_ones_along(
+    context: Context,
+) -> None:
     pairs = list(escalation_of(context).state.pairs)
     context.matches.keep(looked_at=LookedAt("set", 1.0, True, 0.5))
     context.matches.remove(pairs=pairs[:1])
@@ -396,7 +425,11 @@ def test_matches_of_pairs_that_are_removed_take_learned_ones_along(context: Cont
 
 @pytest.mark.long
 def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
-    photos: Path, recipe: Recipe, mapper: Mapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    photos: Path,
+    recipe: Recipe,
+    mapper: Mapper,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Also the copy of the workspace is mapped here."""
     weights = SetState.weights
@@ -417,7 +450,10 @@ def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
         model = (workspace.sparse / "0" / "images.bin").stat().st_mtime_ns
         again = climb.climb(context, mapper, recipe)
     assert {report.num_done for report in again} == {0}
-    assert (hdf5_content(workspace.matches), database_content(workspace.database)) == before
+    assert (
+        hdf5_content(workspace.matches),
+        database_content(workspace.database),
+    ) == before
     assert (workspace.sparse / "0" / "images.bin").stat().st_mtime_ns == model
     assert not workspace.best.exists()
     done = matched_again(context)
@@ -452,7 +488,9 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
         model = pycolmap.Reconstruction(context.workspace.sparse / "0")
         with open_database(context.workspace.database) as database:
             for image in model.images.values():
-                assert image.num_points2D() == len(database.read_keypoints(image.image_id))
+                assert image.num_points2D() == len(
+                    database.read_keypoints(image.image_id)
+                )
     contents = [database_content(space.database) for space in spaces]
     assert contents[0] == contents[1]
 

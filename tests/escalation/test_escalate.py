@@ -55,7 +55,9 @@ def facade_run(photos: Path, output: Path, recipe: str) -> Workspace:
     return verified(photos, output, recipe, SMALL, CAMERAS)
 
 
-def escalate(workspace: Workspace, options: EscalateOptions | None = None) -> StageReport:
+def escalate(
+    workspace: Workspace, options: EscalateOptions | None = None
+) -> StageReport:
     with workspace.locked():
         return escalation.escalate(Context(workspace), options)
 
@@ -81,7 +83,9 @@ def geometry(workspace: Workspace, pair: tuple[str, str]) -> np.ndarray:
     """Inlier matches of a pair in the database."""
     ids = image_ids(workspace.database)
     with open_database(workspace.database) as database:
-        return database.read_two_view_geometry(*(ids[name] for name in pair)).inlier_matches
+        return database.read_two_view_geometry(
+            *(ids[name] for name in pair)
+        ).inlier_matches
 
 
 def matches(workspace: Workspace, pair: tuple[str, str]) -> np.ndarray:
@@ -95,7 +99,9 @@ def same_state(first: Workspace, second: Workspace) -> None:
         assert_array_equal(matches(first, pair), matches(second, pair))
         assert_array_equal(geometry(first, pair), geometry(second, pair))
     for name in NAMES:
-        one, other = (FeatureStore(item.features).read(name) for item in (first, second))
+        one, other = (
+            FeatureStore(item.features).read(name) for item in (first, second)
+        )
         assert_array_equal(one.lafs, other.lafs)
         assert_array_equal(one.rectification_ids, other.rectification_ids)
     levels = [MatchStore(item.matches).levels([EASY, HARD]) for item in (first, second)]
@@ -108,10 +114,14 @@ def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path) -> 
     assert not Workspace(tmp_path).config.exists()
 
 
-def test_other_thresholds_than_before_are_refused(escalated: Workspace, tmp_path: Path) -> None:
+def test_other_thresholds_than_before_are_refused(
+    escalated: Workspace, tmp_path: Path
+) -> None:
     workspace = copy_of(escalated, tmp_path)
     before = workspace.config.read_bytes()
-    with pytest.raises(StoreError, match="with strong_num_inliers=100, and it is 5 now"):
+    with pytest.raises(
+        StoreError, match="with strong_num_inliers=100, and it is 5 now"
+    ):
         escalate(workspace, EscalateOptions(strong_num_inliers=5))
     assert workspace.config.read_bytes() == before
 
@@ -121,7 +131,9 @@ def test_device_that_is_not_there_discards_nothing(
 ) -> None:
     workspace = copy_of(escalated, tmp_path)
     before = database_content(workspace.database)
-    ended = call("match", "--output-path", tmp_path, "--device", "cuda:99", "--overwrite")
+    ended = call(
+        "match", "--output-path", tmp_path, "--device", "cuda:99", "--overwrite"
+    )
     assert (ended.code, len(ended.errors)) == (2, 1)
     assert "--device cuda:99" in ended.errors[0]
     with pytest.raises(AffrectError, match="--device cuda:99"):
@@ -130,9 +142,13 @@ def test_device_that_is_not_there_discards_nothing(
     assert database_content(workspace.database) == before
 
 
-def test_first_level_is_the_unrectified_recipe(before: Workspace, plain: Workspace) -> None:
+def test_first_level_is_the_unrectified_recipe(
+    before: Workspace, plain: Workspace
+) -> None:
     for name in NAMES:
-        one, other = (FeatureStore(item.features).read(name) for item in (before, plain))
+        one, other = (
+            FeatureStore(item.features).read(name) for item in (before, plain)
+        )
         assert_array_equal(one.lafs, other.lafs)
         assert_array_equal(one.descriptors, other.descriptors)
     assert len(geometry(before, EASY)) >= VerificationOptions().min_num_inliers
@@ -175,7 +191,9 @@ strong_num_inliers = 1000000
 
 
 @pytest.mark.long
-def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: Path) -> None:
+def test_levels_with_features_and_matching_of_their_own(
+    photos: Path, tmp_path: Path
+) -> None:
     """The first of them looks at the photographs again; others add warps to what it found."""
     recipe = tmp_path / "recipe.toml"
     recipe.write_text(OTHER_FEATURES)
@@ -188,13 +206,19 @@ def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: 
     assert max(tried.values()).bit_length() - 1 == 2
     sizes = extracted_px(Context(workspace))
     for name in HARD:
-        first, second, third = (part.stop for part in features.level_ranges(name).values())
+        first, second, third = (
+            part.stop for part in features.level_ranges(name).values()
+        )
         origin = features.read(name).rectification_ids
         assert not origin[:second].any()
         assert (origin[second:] > 0).all()
         scales = features.read(name).scales
-        assert scales[first:second].min() > 1.2 * scales[:first].min()  # it was shrunk more
-        assert_array_equal(features.level_indices(name, 2, base=1), np.arange(first, third))
+        assert (
+            scales[first:second].min() > 1.2 * scales[:first].min()
+        )  # it was shrunk more
+        assert_array_equal(
+            features.level_indices(name, 2, base=1), np.arange(first, third)
+        )
     for pair in (EASY, HARD):
         level = store.levels([pair])[pair]
         low, high = sorted(ids[name] for name in pair)
@@ -226,7 +250,9 @@ def numbered(*rows: tuple[int, int]) -> np.ndarray:
     ({("b", "a"): numbered()}, {"a": 0, "b": 0}),
     ({}, {}),
 ])  # fmt: skip
-def test_images_with_few_features_in_tracks_of_three_are_weakly_connected(matches, tracks) -> None:
+def test_images_with_few_features_in_tracks_of_three_are_weakly_connected(
+    matches, tracks
+) -> None:
     for limit in range(4):
         expected = {name for name, count in tracks.items() if count < limit}
         assert weakly_connected_images(matches, limit) == expected
@@ -264,8 +290,12 @@ def test_each_step_has_a_bar_that_ends_full(before: Workspace, tmp_path: Path) -
     shown = io.StringIO()
     with workspace.locked():
         escalation.escalate(Context(workspace, progress=Progress(shown)))
-    lines = [line for line in shown.getvalue().splitlines() if line.startswith("escalate, ")]
-    last = {line.split(":")[0]: line.split(": ")[1].split()[0].split("/") for line in lines}
+    lines = [
+        line for line in shown.getvalue().splitlines() if line.startswith("escalate, ")
+    ]
+    last = {
+        line.split(":")[0]: line.split(": ")[1].split()[0].split("/") for line in lines
+    }
     assert all(done == total for done, total in last.values())
 
 
@@ -287,7 +317,9 @@ def test_pairs_that_verify_well_escalate_nowhere(
     assert_array_equal(matches(workspace, EASY), first)
 
 
-def test_features_of_levels_follow_one_another(escalated: Workspace, before: Workspace) -> None:
+def test_features_of_levels_follow_one_another(
+    escalated: Workspace, before: Workspace
+) -> None:
     store = FeatureStore(escalated.features)
     earlier = FeatureStore(before.features)
     for name in NAMES:
@@ -309,7 +341,9 @@ def test_again_does_nothing(
     escalated: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     workspace = copy_of(escalated, tmp_path / "again")
-    monkeypatch.setattr(escalation, "prepare", None)  # no features, so nothing to prepare
+    monkeypatch.setattr(
+        escalation, "prepare", None
+    )  # no features, so nothing to prepare
     assert escalate(workspace).num_done == 0
     same_state(workspace, escalated)
 
@@ -320,7 +354,9 @@ def killed_at(patch: pytest.MonkeyPatch, where: str) -> None:
     def killed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    patch.setattr(escalation if where == "update_verified" else verification, where, killed)
+    patch.setattr(
+        escalation if where == "update_verified" else verification, where, killed
+    )
 
 
 def killed_after(patch: pytest.MonkeyPatch, path: Path, number: int) -> None:
@@ -338,7 +374,9 @@ def killed_after(patch: pytest.MonkeyPatch, path: Path, number: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("when", ["update_verified", "write_matches", "verify_pairs", 1, 2, 3])
+@pytest.mark.parametrize(
+    "when", ["update_verified", "write_matches", "verify_pairs", 1, 2, 3]
+)
 def test_killed_run_goes_on_to_the_same_result(
     before: Workspace,
     escalated: Workspace,
@@ -369,7 +407,9 @@ def test_photographs_without_a_feature_escalate_nowhere(tmp_path: Path) -> None:
     assert set(Context(workspace).features.num_keypoints().values()) == {0}
 
 
-def test_recipe_without_levels_has_nothing_to_escalate(plain: Workspace, tmp_path: Path) -> None:
+def test_recipe_without_levels_has_nothing_to_escalate(
+    plain: Workspace, tmp_path: Path
+) -> None:
     workspace = copy_of(plain, tmp_path / "plain")
     assert escalate(workspace).num_done == 0
     assert_array_equal(geometry(workspace, EASY), geometry(plain, EASY))

@@ -49,7 +49,9 @@ def test_parts_come_by_size_with_lone_images() -> None:
 
 
 @pytest.mark.parametrize("level", LEVELS[1:], ids=lambda level: level.name)
-def test_what_hints_at_a_surface_makes_a_level_likelier_and_levels_differ(level: Level) -> None:
+def test_what_hints_at_a_surface_makes_a_level_likelier_and_levels_differ(
+    level: Level,
+) -> None:
     gain = gain_of(level)
     few, many = (gain.chance(terms(PairState(0, count), 0, 0)) for count in (0, 10))
     assert 0.0 < few < 0.7 * many < many < 1.0
@@ -86,15 +88,28 @@ def gains(
     return ExpectedGain(states, weak, weights, sizes, [2, 4], lacking, registered, 100)
 
 
-def best(found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf) -> Step:
+def best(
+    found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf
+) -> Step:
     return found.best_step(1, level, 0b10, budget_s)
 
 
-def chosen(found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf) -> list[str]:
+def chosen(
+    found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf
+) -> list[str]:
     return ["".join(pair) for pair in best(found, level, budget_s).pairs]
 
 
-INLIERS = {"ab": 200, "ac": 150, "bc": 120, "ad": 0, "bd": 0, "cd": 0, "ae": 90, "be": 0}
+INLIERS = {
+    "ab": 200,
+    "ac": 150,
+    "bc": 120,
+    "ad": 0,
+    "bd": 0,
+    "cd": 0,
+    "ae": 90,
+    "be": 0,
+}
 
 
 def test_pairs_of_images_in_need_come_by_what_hints_at_a_surface() -> None:
@@ -135,22 +150,33 @@ def test_what_joins_a_part_counts_for_all_of_its_images() -> None:
     apart = {"ab": 200, "cd": 90, "ac": 0}
     small = best(gains(apart, {"c": 1.0}, {"ac": 3}))
     large = best(gains(apart, {"c": 1.0, "d": 1.0}, {"ac": 3}))
-    assert small.pairs == large.pairs == [("a", "c")]  # and not the weak pair inside of it
+    assert (
+        small.pairs == large.pairs == [("a", "c")]
+    )  # and not the weak pair inside of it
     assert large.rate > 1.5 * small.rate
 
 
 def test_images_are_not_saved_twice() -> None:
-    many = {f"{name}f": 0 for name in "abcde"} | {"ab": 200, "bc": 200, "cd": 200, "de": 200}
+    many = {f"{name}f": 0 for name in "abcde"} | {
+        "ab": 200,
+        "bc": 200,
+        "cd": 200,
+        "de": 200,
+    }
     likely = dict.fromkeys(many, 1000)
     assert len(chosen(gains(many, {"f": 1.0}, likely))) < 5
 
 
-def test_levels_that_were_tried_are_done_and_strong_pairs_but_for_weakly_connected_images() -> None:
+def test_levels_that_were_tried_are_done_and_strong_pairs_but_for_weakly_connected_images() -> (
+    None
+):
     pairs = {"ab": 200, "bc": 90}
     weights = {"a": 1.0, "b": 1.0}
     assert chosen(gains(pairs, weights)) == ["bc"]
     assert "ab" in chosen(gains(pairs, weights, weakly_connected="a"))
-    assert chosen(gains(pairs, weights, weakly_connected="a", tried={"ab": 0b11})) == ["bc"]
+    assert chosen(gains(pairs, weights, weakly_connected="a", tried={"ab": 0b11})) == [
+        "bc"
+    ]
 
 
 def test_a_level_that_verified_nothing_is_less_likely_to() -> None:
@@ -159,7 +185,9 @@ def test_a_level_that_verified_nothing_is_less_likely_to() -> None:
     assert gain_of(COVERS).chance(terms(PairState(0, 3), 5, 0)) > fresh
 
 
-def test_the_more_mapping_costs_the_more_pairs_a_step_has(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_more_mapping_costs_the_more_pairs_a_step_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pairs = gains(INLIERS, {"d": 1.0}, {"ad": 1, "bd": 8, "cd": 2}, lacking="c")
     monkeypatch.setattr(expected_gain, "MAPPING_S", 0.0)
     assert chosen(pairs) == ["bd"]
@@ -184,4 +212,6 @@ def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_anoth
     )
     assert rate(tied) == pytest.approx(rate(lost) / 2)
     assert rate(tied_twice) == pytest.approx(rate(lost) / 3)
-    assert rate(tied_twice, "ab") == pytest.approx(rate(lost) / 2)  # c is not in the model
+    assert rate(tied_twice, "ab") == pytest.approx(
+        rate(lost) / 2
+    )  # c is not in the model

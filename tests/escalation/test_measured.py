@@ -75,9 +75,13 @@ def test_images_that_measured_frames_hold_need_no_others(context: Context) -> No
     names = tuple(sorted(NAMES))
     escalation = escalation_of(context)
     states = escalation_of(context).state.states()
-    model = ModelSummary(names, 9, 2.0, 0.5, doubtful={NAMES[0]: (Doubt("few_matches"),)})
+    model = ModelSummary(
+        names, 9, 2.0, 0.5, doubtful={NAMES[0]: (Doubt("few_matches"),)}
+    )
     assert escalation.state._anchored(model, states) == set(NAMES) - {NAMES[3]}
-    all_doubtful = replace(model, doubtful=dict.fromkeys(names, (Doubt("few_matches"),)))
+    all_doubtful = replace(
+        model, doubtful=dict.fromkeys(names, (Doubt("few_matches"),))
+    )
     assert escalation.state._anchored(all_doubtful, states) == set()
     without = replace(model, registered_names=names[1:])
     assert names[0] not in escalation.state._anchored(without, states)

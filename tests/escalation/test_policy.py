@@ -37,7 +37,9 @@ def situation(names: str | list[str] = NAMES, **given: Any) -> Situation:
     values: dict[str, Any] = {
         "levels": LEVELS,
         "usable": [1, 2, 3, 4],
-        "states": {pair: PairState(0, 3, tried=done.get("".join(pair), 1)) for pair in pairs},
+        "states": {
+            pair: PairState(0, 3, tried=done.get("".join(pair), 1)) for pair in pairs
+        },
         "weights": dict.fromkeys(weights, 1.0),
         "weakly_connected": (),
         "anchored": (),
@@ -53,10 +55,20 @@ def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need(
 ) -> None:
     """The others are matched, too, where that takes no longer than the first model."""
     assert len(learned_step(situation()).pairs) == 10
-    monkeypatch.setattr(Situation, "first_model_s", 3 * gain_of(LEVELS[LEARNED]).pair_s - 0.1)
+    monkeypatch.setattr(
+        Situation, "first_model_s", 3 * gain_of(LEVELS[LEARNED]).pair_s - 0.1
+    )
     step = learned_step(situation())
     assert step.level == LEARNED
-    assert ["".join(pair) for pair in step.pairs] == ["ad", "ae", "bd", "be", "cd", "ce", "de"]
+    assert ["".join(pair) for pair in step.pairs] == [
+        "ad",
+        "ae",
+        "bd",
+        "be",
+        "cd",
+        "ce",
+        "de",
+    ]
     assert not learned_step(situation(weights="")).pairs
     assert not next_step(situation(weights=""), "high").step.pairs
 
@@ -69,7 +81,9 @@ def test_pairs_that_have_learned_matches_used_or_not_get_no_others(
     states = dict(before.states)
     states["a", "d"] = PairState(0, 3, level=LEARNED, tried=1 | 1 << LEARNED)
     states["a", "e"] = PairState(0, 3, learned_level=LEARNED)
-    states["b", "d"] = PairState(0, 3, level=LEARNED, tried=0b111, measured_worth=(9, 0))
+    states["b", "d"] = PairState(
+        0, 3, level=LEARNED, tried=0b111, measured_worth=(9, 0)
+    )
     after = replace(before, states=states)
     found = {"".join(pair) for pair in learned_step(after).pairs}
     assert found == {"be", "cd", "ce", "de"}
@@ -81,7 +95,9 @@ def test_strong_pairs_of_images_in_need_are_matched_by_networks_too(
     """They may be wrong: of repeated structure, or of a flat part alone."""
     monkeypatch.setattr(Situation, "first_model_s", 0.0)
     strong = situation()
-    states = {pair: replace(state, num_inliers=500) for pair, state in strong.states.items()}
+    states = {
+        pair: replace(state, num_inliers=500) for pair, state in strong.states.items()
+    }
     assert len(learned_step(replace(strong, states=states)).pairs) == 7
 
 
@@ -96,7 +112,9 @@ def test_learned_matching_of_a_large_set_takes_as_long_as_the_first_model() -> N
     step = learned_step(large)
     assert 0 < len(step.pairs) < len(large.states)
     assert step.seconds <= large.first_model_s + len(names)
-    assert len(learned_step(situation(names[:SMALL], weights=names[:SMALL])).pairs) == 435
+    assert (
+        len(learned_step(situation(names[:SMALL], weights=names[:SMALL])).pairs) == 435
+    )
 
 
 def done_with_learned(**given: Any) -> Situation:
@@ -124,12 +142,17 @@ def test_learned_level_of_a_large_set_is_a_step_of_its_own() -> None:
     assert next_step(situation(names, weights=names), "low").step.level == LEARNED
 
 
-def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one() -> None:
+def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one() -> (
+    None
+):
     normal = EFFORTS["normal"]
     assert normal.budget_s(1.0, has_model=True) == normal.least_s == 120.0
     assert normal.budget_s(1000.0, has_model=True) == 1000.0
     assert normal.budget_s(1.0, has_model=False) == normal.without_model_s == 900.0
-    times = [EFFORTS[name].budget_s(1000.0, has_model=True) for name in ("low", "normal", "high")]
+    times = [
+        EFFORTS[name].budget_s(1000.0, has_model=True)
+        for name in ("low", "normal", "high")
+    ]
     assert times == [0.0, 1000.0, 5000.0]
 
 
@@ -139,13 +162,19 @@ def test_what_is_spent_is_counted_but_for_learned_matching_of_small_sets() -> No
     covers = situation(tried={"ab": 0b11})
     gain = gain_of(LEVELS[1])
     assert covers.spent_s() == pytest.approx(2 * gain.image_s + gain.pair_s)
-    gone = replace(done_with_learned(), usable=[1, 3])  # weights that are not there any more
+    gone = replace(
+        done_with_learned(), usable=[1, 3]
+    )  # weights that are not there any more
     assert gone.spent_s() == 0.0
     names = [f"{number:03}" for number in range(SMALL + 1)]
     large = situation(names)
-    states = {pair: replace(s, tried=1 | 1 << LEARNED) for pair, s in large.states.items()}
+    states = {
+        pair: replace(s, tried=1 | 1 << LEARNED) for pair, s in large.states.items()
+    }
     large = replace(large, states=states)
-    assert large.spent_s() == pytest.approx(large.spent_on(LEARNED) - large.first_model_s)
+    assert large.spent_s() == pytest.approx(
+        large.spent_on(LEARNED) - large.first_model_s
+    )
 
 
 def test_little_hope_ends_it_but_while_nothing_is_registered(

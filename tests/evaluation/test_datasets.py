@@ -17,9 +17,17 @@ from small_scene import FOCAL_PX
 
 from colmap_affrect.colmap.model_files import relative_pose
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.evaluation.datasets import Pairs, load_evd, load_imc, load_pairs, load_svp
+from colmap_affrect.evaluation.datasets import (
+    Pairs,
+    load_evd,
+    load_imc,
+    load_pairs,
+    load_svp,
+)
 
-SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
+SCRIPT = (
+    Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
+)
 Entry = dict[str, Any]
 INTRINSICS = [[FOCAL_PX, 0, 159.5], [0, FOCAL_PX, 119.5], [0, 0, 1]]
 """Of the photographs of the small scene, in pixel-centre px."""
@@ -43,7 +51,9 @@ def test_layouts_of_pairs_with_homographies(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "H_my_wall_1_3.txt", TRUTH)
     cafe, wall = load_evd(tmp_path)
     assert (cafe.name, cafe.images) == ("cafe", ("1/cafe.png", "2/cafe.png"))
-    np.testing.assert_allclose(cafe.truth.matrix, 3.0 * TRUTH)  # positive where it is visible
+    np.testing.assert_allclose(
+        cafe.truth.matrix, 3.0 * TRUTH
+    )  # positive where it is visible
     assert cafe.truth.size1 == SIZE == (160, 120)
     assert (wall.name, wall.images[1]) == ("my_wall 1-3", "my_wall_3.png")
 
@@ -55,7 +65,9 @@ def test_layouts_of_pairs_with_homographies(tmp_path: Path) -> None:
     (lambda f: np.savetxt(f / "h" / "cafe.txt", np.array([[1, 0, 900], [0, 1, 0], [0, 0, 1]])),
      "shows no part of image 1"),
 ])  # fmt: skip
-def test_pairs_that_cannot_be_used_are_refused(change: Any, message: str, tmp_path: Path) -> None:
+def test_pairs_that_cannot_be_used_are_refused(
+    change: Any, message: str, tmp_path: Path
+) -> None:
     write_extreme_views(tmp_path, ["cafe", "dance"])
     change(tmp_path)
     with pytest.raises(AffrectError, match=message):
@@ -107,7 +119,9 @@ def test_pairs_without_an_image_or_pose_are_left_out_and_named(
     ("cameras.txt", "300.0", "nan"),
     ("images.txt", "1 0.99", "1 one"),
 ])  # fmt: skip
-def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, new: str) -> None:
+def test_unusable_cameras_and_poses_are_refused(
+    svp: Path, file: str, old: str, new: str
+) -> None:
     path = svp / "0" / file
     text = path.read_text()
     assert old in text
@@ -118,10 +132,14 @@ def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, 
 
 def test_points_of_images_are_passed_over_and_bad_lines_are_refused(svp: Path) -> None:
     images = svp / "0" / "images.txt"
-    images.write_text(images.read_text().replace("png\n", "png\n10.5 20.5 1 30.5 40.5 -1\n"))
+    images.write_text(
+        images.read_text().replace("png\n", "png\n10.5 20.5 1 30.5 40.5 -1\n")
+    )
     assert len(load_svp(svp)) == 3
     (svp / "scene4_image_pairs.txt").write_text("a.png b.png 0\nb.png\n")
-    with pytest.raises(AffrectError, match=r"scene4_image_pairs\.txt: 'b\.png' is no pair"):
+    with pytest.raises(
+        AffrectError, match=r"scene4_image_pairs\.txt: 'b\.png' is no pair"
+    ):
         load_svp(svp)
 
 
@@ -207,7 +225,9 @@ def test_set_made_from_a_model_is_read_back(imc: Path, tmp_path: Path) -> None:
 
 
 def listed(folder: Path, *entries: Entry, **top: Any) -> Pairs:
-    (folder / "pairs.json").write_text(json.dumps({"pairs": entries, **top}), encoding="utf-8")
+    (folder / "pairs.json").write_text(
+        json.dumps({"pairs": entries, **top}), encoding="utf-8"
+    )
     return load_pairs(folder)
 
 
@@ -242,13 +262,24 @@ def posed(**changes: Any) -> Entry:
 def test_poses_and_points_in_pixels_of_both_origins(
     origin: str, offset_px: float, tmp_path: Path, planar: Entry
 ) -> None:
-    marked = {**planar, "name": "c", "category": "night", "correspondences": [[10, 20, 30, 40]]}
+    marked = {
+        **planar,
+        "name": "c",
+        "category": "night",
+        "correspondences": [[10, 20, 30, 40]],
+    }
     pose_given = {**planar, "relative_pose": posed()}
-    pair, points = listed(tmp_path, pose_given, marked, pixel_origin=origin, convention="mine")
-    np.testing.assert_array_equal(points.truth.points, np.array([[10, 20, 30, 40]]) + offset_px)
+    pair, points = listed(
+        tmp_path, pose_given, marked, pixel_origin=origin, convention="mine"
+    )
+    np.testing.assert_array_equal(
+        points.truth.points, np.array([[10, 20, 30, 40]]) + offset_px
+    )
     assert (points.name, points.category) == ("c", "night")
     require_pose(pair.truth, 0, 3)
-    for matrix, (x, y) in zip(pair.intrinsics, ((159.5, 119.5), (100, 110)), strict=True):
+    for matrix, (x, y) in zip(
+        pair.intrinsics, ((159.5, 119.5), (100, 110)), strict=True
+    ):
         np.testing.assert_allclose(matrix[:2, 2], np.array([x, y]) + offset_px)
     np.testing.assert_allclose(np.diag(pair.intrinsics[1]), [2 * FOCAL_PX, FOCAL_PX, 1])
 

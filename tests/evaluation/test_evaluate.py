@@ -17,7 +17,12 @@ from posed_photographs import TRUTH, write_extreme_views, write_imc
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.evaluation.datasets import load_evd
-from colmap_affrect.evaluation.evaluate import PROTOCOLS, EvaluateOptions, RecipeRun, evaluate
+from colmap_affrect.evaluation.evaluate import (
+    PROTOCOLS,
+    EvaluateOptions,
+    RecipeRun,
+    evaluate,
+)
 from colmap_affrect.evaluation.results import Evaluation, RecipeResult
 from colmap_affrect.evaluation.truths import ScoreOptions, TrueHomography
 from colmap_affrect.stages.one_image import ImageExtractor
@@ -69,9 +74,13 @@ def calls(monkeypatch: Patch) -> Calls:
     return counts
 
 
-def run(path: Path, out: Path, recipes: Sequence[str] = RECIPES, **options: Any) -> Evaluation:
+def run(
+    path: Path, out: Path, recipes: Sequence[str] = RECIPES, **options: Any
+) -> Evaluation:
     scores = ScoreOptions(max_num_iterations=2000)
-    return evaluate("evd", path, out, EvaluateOptions(recipes=recipes, scores=scores, **options))
+    return evaluate(
+        "evd", path, out, EvaluateOptions(recipes=recipes, scores=scores, **options)
+    )
 
 
 def errors(recipe: RecipeResult) -> list[float]:
@@ -97,12 +106,21 @@ def test_files_and_tables_say_the_same(done: Done) -> None:
     text = (out / "evaluation.json").read_text(encoding="utf-8")
     assert text == evaluation.to_json()
     values = json.loads(text)
-    assert (values["protocol"], values["settings"]["scores"]["threshold_px"]) == ("evd", 0.5)
+    assert (values["protocol"], values["settings"]["scores"]["threshold_px"]) == (
+        "evd",
+        0.5,
+    )
     pair = values["recipes"]["rectified"]["pairs"][0]
     assert {"name", "error", "num_inliers", "seconds"} <= pair.keys()
     row = evaluation.published["paper: AffNetShapes (Table 2: EVD, 15 pairs)"]
-    assert list(row.items())[4:] == [("< 10 px", 9), ("< 20 px", 10), ("seconds", 185.47)]
-    (line,) = (s for s in evaluation.summary().splitlines() if s.startswith("paper: AffNetS"))
+    assert list(row.items())[4:] == [
+        ("< 10 px", 9),
+        ("< 20 px", 10),
+        ("seconds", 185.47),
+    ]
+    (line,) = (
+        s for s in evaluation.summary().splitlines() if s.startswith("paper: AffNetS")
+    )
     assert line.split()[-7:] == ["0", "2", "5", "8", "9", "10", "185.47"]
 
 
@@ -161,7 +179,9 @@ def test_escalation_stops_where_it_suffices_and_most_verified_inliers_count(
 ) -> None:  # fmt: skip
     for path in changed.glob("*/[ds]*"):
         path.unlink()
-    monkeypatch.setattr(RecipeRun, "_verified_inliers", lambda *given: inliers[given[-1]])
+    monkeypatch.setattr(
+        RecipeRun, "_verified_inliers", lambda *given: inliers[given[-1]]
+    )
     (recipe,) = run(changed, tmp_path / "out", [f"{climbing}{strong}"]).recipes
     assert (recipe.pairs[0].level, calls["extract_file"]) == (level, 2 * num_levels)
     assert recipe.summary["homographies"]["< 1 px"] == 1
@@ -181,21 +201,27 @@ def test_bad_options(
 
 def test_poses_are_evaluated_by_category(tmp_path: Path) -> None:
     scene = write_imc(tmp_path / "set" / "garden")
-    options = EvaluateOptions(recipes=[PLAIN], scores=ScoreOptions(max_num_iterations=1000))
+    options = EvaluateOptions(
+        recipes=[PLAIN], scores=ScoreOptions(max_num_iterations=1000)
+    )
     (recipe,) = evaluate("imc", scene, tmp_path / "out", options).recipes
     columns = ("0.1", "0.2", "all")
     assert [recipe.summary["poses"][column] for column in columns] == [1.0] * 3
 
 
 @pytest.mark.long
-def test_command_prints_tables_and_errors_are_one_line(dataset: Path, tmp_path: Path) -> None:
+def test_command_prints_tables_and_errors_are_one_line(
+    dataset: Path, tmp_path: Path
+) -> None:
     common = ["evaluate", "evd", "--output-path", tmp_path / "out", "-q"]
     ended = run_in_process_of_its_own(
         *common, "--dataset-path", dataset, "--recipes", PLAIN,
     )  # fmt: skip
     assert (ended.code, ended.errors) == (0, [])
     assert "< 1 px  < 2 px  < 3 px  < 5 px  < 10 px  < 20 px  seconds" in ended.stdout
-    row = next(line for line in ended.stdout.splitlines() if line.startswith("unrectified-roo"))
+    row = next(
+        line for line in ended.stdout.splitlines() if line.startswith("unrectified-roo")
+    )
     assert row.split()[1:7] == ["3"] * 6
     missing = run_in_process_of_its_own(*common, "--dataset-path", tmp_path / "nowhere")
     assert missing.code == 2

@@ -44,19 +44,29 @@ def error_px(estimate: np.ndarray | None) -> float:
 
 def test_error_agrees_with_all_visible_pixels_carried_there_and_back() -> None:
     """The protocol in words: the mask of image 1, pushed to image 2 and back, and its pixels."""
-    estimate = TRUTH @ np.array([[1.01, 0.02, 1.0], [0.0, 0.99, -2.0], [1e-5, 0.0, 1.0]])
+    estimate = TRUTH @ np.array(
+        [[1.01, 0.02, 1.0], [0.0, 0.99, -2.0], [1e-5, 0.0, 1.0]]
+    )
     ones = np.ones(SIZE1[::-1], np.uint8)
     there = cv2.warpPerspective(ones, TRUTH, SIZE2, flags=cv2.INTER_NEAREST)
-    back = cv2.warpPerspective(there, np.linalg.inv(TRUTH), SIZE1, flags=cv2.INTER_NEAREST)
+    back = cv2.warpPerspective(
+        there, np.linalg.inv(TRUTH), SIZE1, flags=cv2.INTER_NEAREST
+    )
     rows, columns = np.nonzero(back)
     points = np.stack([columns, rows], axis=1).astype(np.float64)[:, None]
-    carried = [cv2.perspectiveTransform(points, matrix)[:, 0] for matrix in (estimate, TRUTH)]
+    carried = [
+        cv2.perspectiveTransform(points, matrix)[:, 0] for matrix in (estimate, TRUTH)
+    ]
     expected = np.linalg.norm(carried[0] - carried[1], axis=1).mean()
     assert expected > 1.0
-    assert error_px(estimate) == pytest.approx(expected, rel=0.02)  # every 16th pixel, the border
+    assert error_px(estimate) == pytest.approx(
+        expected, rel=0.02
+    )  # every 16th pixel, the border
     assert error_px(shift(0.3, -0.4) @ TRUTH) == pytest.approx(0.5, abs=ROUNDING_PX)
     assert error_px(-2.0 * TRUTH) == pytest.approx(0, abs=ROUNDING_PX)
-    horizon = TRUTH + np.array([[0, 0, 0], [0, 0, 0], [-0.01, 0, 0]])  # within the image
+    horizon = TRUTH + np.array(
+        [[0, 0, 0], [0, 0, 0], [-0.01, 0, 0]]
+    )  # within the image
     assert error_px(horizon) == error_px(None) == math.inf
 
 
@@ -117,7 +127,9 @@ POSE2 = (turn((-1, 2, 0.5), 40), np.array([-1.1, 0.4, 5.0]))
 CAMERA1 = pycolmap.Camera(
     model="SIMPLE_RADIAL", width=900, height=700, params=[800.0, 460, 340, 0.15]
 )
-CAMERA2 = pycolmap.Camera(model="PINHOLE", width=640, height=800, params=[600.0, 650, 300, 420])
+CAMERA2 = pycolmap.Camera(
+    model="PINHOLE", width=640, height=800, params=[600.0, 650, 300, 420]
+)
 
 
 def pose_score(points: tuple[np.ndarray, np.ndarray], pose2: Pose = POSE2) -> PairScore:
@@ -173,7 +185,9 @@ def test_points_that_give_no_pose() -> None:
 
 
 def pose_result(category: str, error: float, direction_error: float) -> PairResult:
-    return PairResult(error, 50, None, direction_error, kind="poses", name="p", category=category)
+    return PairResult(
+        error, 50, None, direction_error, kind="poses", name="p", category=category
+    )
 
 
 def test_pose_columns_are_shares_by_category_and_count_failures() -> None:
@@ -204,7 +218,9 @@ def test_epipolar_distances_by_hand() -> None:
     assert np.isinf(symmetric_epipolar_distances(None, points1, points2)).all()
     # Image 2 three times as large: 3 px off there are 1 px in image 1.
     larger = np.diag([1 / 3, 1 / 3, 1.0]) @ SHIFT_X
-    distances = symmetric_epipolar_distances(larger, points1[:1], np.array([[90.0, 24.0]]))
+    distances = symmetric_epipolar_distances(
+        larger, points1[:1], np.array([[90.0, 24.0]])
+    )
     np.testing.assert_allclose(distances, [np.hypot(3.0, 1.0)])
 
 
@@ -236,7 +252,9 @@ def test_of_five_fundamental_matrices_the_one_of_median_error_counts(
 
     monkeypatch.setattr(truths, "estimate_matrix", estimate)
     points = np.random.default_rng(0).uniform(0, 300, (9, 2))
-    score = Correspondences(np.hstack([points, points])).score(points, points, ScoreOptions())
+    score = Correspondences(np.hstack([points, points])).score(
+        points, points, ScoreOptions()
+    )
     assert score.error == pytest.approx(np.sqrt(2.0) * 5.0)
     assert score.num_inliers == 2
 
@@ -255,7 +273,11 @@ def test_tables_are_by_kind_of_truth() -> None:
     results = [PairResult(**vars(score), name="p") for score in scores]
     results += [PairResult(math.inf, 0, name="bad"), pose_result("indoors", 4.0, 1.0)]
     found = columns(results)
-    assert found["poses"] == {"indoors": 1.0, "all": 1.0, "pose AUC 10°": pytest.approx(0.6)}
+    assert found["poses"] == {
+        "indoors": 1.0,
+        "all": 1.0,
+        "pose AUC 10°": pytest.approx(0.6),
+    }
     assert found["correspondences"] == {"WxBS score": 0.0}
     assert set(found["homographies"].values()) == {0.0}
     assert columns([]) == {}

@@ -50,17 +50,22 @@ def image() -> GrayImage:
 # Frames and patches.
 
 
-def test_describe_computes_what_kornia_does(weights: dict[str, Path], image: GrayImage) -> None:
+def test_describe_computes_what_kornia_does(
+    weights: dict[str, Path], image: GrayImage
+) -> None:
     detected = circles([[60.2, 50.9], [151.3, 77.0], [90.0, 90.0]], [1.5, 2.2, 4.0])
     profile = make(weights)
     (described,) = profile.describe([image], [detected])
 
     def reference(network: nn.Module, name: str) -> nn.Module:
-        network.load_state_dict(torch.load(weights[name], weights_only=True)["state_dict"])
+        network.load_state_dict(
+            torch.load(weights[name], weights_only=True)["state_dict"]
+        )
         return network.eval()
 
     affnet = reference(
-        feature.LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False), "affnet"
+        feature.LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False),
+        "affnet",
     )
     orienter = feature.LAFOrienter(
         32, angle_detector=reference(feature.OriNet(pretrained=False), "orinet")
@@ -90,7 +95,9 @@ def test_orientation_points_along_the_gradient_of_a_turned_pattern(
     # kornia's gradient histogram has OriNet's convention. The pattern gets brighter in one
     # direction, x towards y; the first column of the frame must point there.
     columns, rows = np.meshgrid(np.arange(121), np.arange(101))
-    direction = np.array([np.cos(np.deg2rad(direction_deg)), np.sin(np.deg2rad(direction_deg))])
+    direction = np.array(
+        [np.cos(np.deg2rad(direction_deg)), np.sin(np.deg2rad(direction_deg))]
+    )
     distance = (columns - 62.0) * direction[0] + (rows - 48.0) * direction[1]
     edge = (128 + 100 * np.tanh(distance / 8.0)).astype(np.uint8)
     profile = make(weights)
@@ -100,7 +107,9 @@ def test_orientation_points_along_the_gradient_of_a_turned_pattern(
     first = described.lafs[0, :, 0] / described.scales[0]
     assert_allclose(first @ direction, 1.0, atol=1.0 - np.cos(np.deg2rad(ANGLE_DEG)))
     # A rotation: the second column is a quarter turn on, x towards y.
-    assert_allclose(described.lafs[0, :, 1], rotation(np.pi / 2) @ described.lafs[0, :, 0])
+    assert_allclose(
+        described.lafs[0, :, 1], rotation(np.pi / 2) @ described.lafs[0, :, 0]
+    )
 
 
 @pytest.mark.parametrize(("outputs", "kept"), [
@@ -118,10 +127,14 @@ def test_describe_leaves_out_degenerate_shapes(
     bad = torch.tensor(outputs)
 
     def every_second_is_bad(patches: torch.Tensor) -> torch.Tensor:
-        return torch.stack([bad if number % 2 else good for number in range(len(patches))])
+        return torch.stack(
+            [bad if number % 2 else good for number in range(len(patches))]
+        )
 
     profile.affnet = every_second_is_bad
     detected = circles([[60.0, 50.0], [70.0, 60.0], [80.0, 70.0]], [2.0, 2.0, 2.0])
     (described,) = profile.describe([image], [detected])
     assert described.rectification_ids.tolist() == ([0, 1, 2] if kept else [0, 2])
-    assert_allclose(described.keypoints, detected.keypoints[described.rectification_ids])
+    assert_allclose(
+        described.keypoints, detected.keypoints[described.rectification_ids]
+    )

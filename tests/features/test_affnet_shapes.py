@@ -39,7 +39,9 @@ ODD_SIZE = (117, 83)
 
 def no_keypoints(image: GrayImage) -> LocalFeatures:
     """Detector for tests of dense shapes."""
-    raise AssertionError(f"dense shapes need no keypoints of an image of {image.shape=}")
+    raise AssertionError(
+        f"dense shapes need no keypoints of an image of {image.shape=}"
+    )
 
 
 def random_network(seed: int = 0) -> LAFAffNetShapeEstimator:
@@ -57,7 +59,9 @@ def random_network(seed: int = 0) -> LAFAffNetShapeEstimator:
 def calibrated(network: LAFAffNetShapeEstimator) -> LAFAffNetShapeEstimator:
     """Scale the last convolution so that outputs on texture deviate by about 0.4."""
     windows = sliding_window_view(texture((160, 160), seed=1), (32, 32))[::16, ::16]
-    patches = torch.from_numpy(standardised(windows.reshape(-1, 1, 32, 32)).astype(np.float32))
+    patches = torch.from_numpy(
+        standardised(windows.reshape(-1, 1, 32, 32)).astype(np.float32)
+    )
     with torch.inference_mode():
         deviation = network.features[:-2](patches).std()
     network.features[-3].weight.data *= 0.4 / deviation
@@ -104,7 +108,9 @@ def patch_metrics(network: LAFAffNetShapeEstimator, patches: Array) -> Array:
     """Metrics by kornia's layers of (..., 32, 32) patches as they are."""
     inputs = torch.from_numpy(patches.reshape(-1, 1, 32, 32).astype(np.float32))
     with torch.inference_mode():
-        outputs = torch.cat([network.features(batch)[:, :, 0, 0] for batch in inputs.split(512)])
+        outputs = torch.cat(
+            [network.features(batch)[:, :, 0, 0] for batch in inputs.split(512)]
+        )
     return metrics_of_outputs(outputs).reshape(*patches.shape[:-2], 3)
 
 
@@ -117,7 +123,9 @@ def standardised(patches: Array) -> Array:
 
 def locally_normalised(image: GrayImage) -> Array:
     """Pixels by mean and deviation of the 33 x 33 px around them, border reflected."""
-    windows = sliding_window_view(np.pad(image.astype(float), 16, mode="reflect"), (33, 33))
+    windows = sliding_window_view(
+        np.pad(image.astype(float), 16, mode="reflect"), (33, 33)
+    )
     mean = windows.mean(axis=(2, 3))
     deviation = windows.std(axis=(2, 3))
     return np.clip((image - mean) / (deviation + 2.55), -6.0, 6.0)
@@ -126,7 +134,9 @@ def locally_normalised(image: GrayImage) -> Array:
 def reflected(values: Array) -> Array:
     """Add 14 px, and at the end what is missing to whole blocks."""
     height, width = values.shape
-    return np.pad(values, ((14, 14 + -height % 4), (14, 14 + -width % 4)), mode="reflect")
+    return np.pad(
+        values, ((14, 14 + -height % 4), (14, 14 + -width % 4)), mode="reflect"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +145,11 @@ def image() -> GrayImage:
     width, height = ODD_SIZE
     x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
     values = texture(ODD_SIZE, seed=3).astype(float)
-    return np.rint((values - 128) * (0.3 + 0.6 * x) + 90 + 60 * y).clip(0, 255).astype(np.uint8)
+    return (
+        np.rint((values - 128) * (0.3 + 0.6 * x) + 90 + 60 * y)
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
 
 
 @pytest.mark.parametrize("size", [ODD_SIZE, (34, 33)])
@@ -145,7 +159,9 @@ def test_grid_is_the_network_on_the_window_in_the_middle_of_which_a_block_lies(
     image = image[: size[1], : size[0]]
     network = centered_network()
     grid = source(network, scales=(1.0,), min_deviation=0.0).grid(image)
-    windows = sliding_window_view(reflected(locally_normalised(image)), (32, 32))[::4, ::4]
+    windows = sliding_window_view(reflected(locally_normalised(image)), (32, 32))[
+        ::4, ::4
+    ]
     expected = patch_metrics(network, windows)
     rows = ceil(size[1] / 4)
     columns = ceil(size[0] / 4)
@@ -174,16 +190,22 @@ def test_paper_grid_has_global_normalisation_and_replicated_borders(
     assert grid.textured.shape == (ceil(size[1] / 4), ceil(size[0] / 4))
     assert grid.textured.all()
     assert (grid.origin_px, grid.step_px) == (1.5, 4)
-    assert_array_equal(grid.metrics[:4], np.broadcast_to(grid.metrics[4], grid.metrics[:4].shape))
+    assert_array_equal(
+        grid.metrics[:4], np.broadcast_to(grid.metrics[4], grid.metrics[:4].shape)
+    )
     last = grid.metrics[:, -4:]
     assert_array_equal(last[:, 1:], np.broadcast_to(last[:, :1], last[:, 1:].shape))
 
 
-def test_strips_equal_the_whole(image: GrayImage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strips_equal_the_whole(
+    image: GrayImage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     affnet_source = source(random_network(), scales=(1.0,), min_deviation=0.0)
     whole = affnet_source.grid(image)
     monkeypatch.setattr(affnet, "STRIP_CELLS", 5)
-    assert_allclose(affnet_source.grid(image).metrics, whole.metrics, atol=SINGLE, rtol=SINGLE)
+    assert_allclose(
+        affnet_source.grid(image).metrics, whole.metrics, atol=SINGLE, rtol=SINGLE
+    )
 
 
 def test_shapes_of_a_smaller_size_are_interpolated_between_the_centers_of_its_blocks(
@@ -193,14 +215,20 @@ def test_shapes_of_a_smaller_size_are_interpolated_between_the_centers_of_its_bl
     full = source(network, scales=(0.5,), min_deviation=0.0).grid(image)
     small = shrink_to(image, 58)
     assert small.shape == (41, 58)
-    logs = log_metrics(source(network, scales=(1.0,), min_deviation=0.0).grid(small).metrics)
-    for axis, (length, small_length) in enumerate(zip(image.shape, small.shape, strict=True)):
+    logs = log_metrics(
+        source(network, scales=(1.0,), min_deviation=0.0).grid(small).metrics
+    )
+    for axis, (length, small_length) in enumerate(
+        zip(image.shape, small.shape, strict=True)
+    ):
         cells = np.arange(ceil(length / 4))
         small_cells = np.arange(ceil(small_length / 4))
         # Distances from the edge of the image scale: the middle of cell k is at 4 k + 2.
         at = (4 * cells + 2) * small_length / length
         logs = np.apply_along_axis(
-            lambda values, at=at, known=4 * small_cells + 2: np.interp(at, known, values),
+            lambda values, at=at, known=4 * small_cells + 2: np.interp(
+                at, known, values
+            ),
             axis,
             logs,
         )

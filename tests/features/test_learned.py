@@ -52,7 +52,9 @@ def published() -> dict[str, Path]:
     folder = SHARED_WEIGHTS if SHARED_WEIGHTS.is_dir() else None
     path = find(KEY, folder)
     if path is None:
-        pytest.skip(f"{WEIGHT_FILES[KEY].file_name} is not here: see colmap-affrect weights")
+        pytest.skip(
+            f"{WEIGHT_FILES[KEY].file_name} is not here: see colmap-affrect weights"
+        )
     return {KEY: path}
 
 
@@ -80,7 +82,10 @@ def test_features_are_those_of_kornia(weights, photograph) -> None:
     nearest = np.where(shift < 2, same, -1.0).argmax(axis=1)
     offsets = features.keypoints - points[nearest]
     as_kornia = np.abs(offsets - np.median(offsets, axis=0)).max(axis=1) < 0.01
-    as_kornia &= np.abs(features.descriptors - descriptors[nearest]).max(axis=1) < SAME_DESCRIPTOR
+    as_kornia &= (
+        np.abs(features.descriptors - descriptors[nearest]).max(axis=1)
+        < SAME_DESCRIPTOR
+    )
     assert as_kornia.mean() > 0.99
 
 
@@ -99,7 +104,9 @@ def test_points_are_where_they_are_in_a_shrunk_photograph(published) -> None:
         distances = np.linalg.norm(first.keypoints[:, None] - points[None], axis=2)
         nearest = distances.argmin(axis=1)
         rows = np.arange(len(first))
-        again = (distances.argmin(axis=0)[nearest] == rows) & (distances[rows, nearest] < 4.0)
+        again = (distances.argmin(axis=0)[nearest] == rows) & (
+            distances[rows, nearest] < 4.0
+        )
         again &= (first.descriptors * second.descriptors[nearest]).sum(axis=1) > 0.7
         offsets.append((points[nearest] - first.keypoints)[again] * 3.0)
     assert np.linalg.norm(np.concatenate(offsets).mean(axis=0)) < MOST_OFFSET_PX
@@ -109,14 +116,18 @@ def test_mask_chooses_among_what_is_found_without_it(weights, photograph) -> Non
     part = photograph[:150, :221]
     mask = np.zeros(part.shape[:2], np.uint8)
     mask[:, 60:] = 255
-    whole = make(weights, score_threshold=0.001, max_num_features=ALL).detect((part, None))
+    whole = make(weights, score_threshold=0.001, max_num_features=ALL).detect(
+        (part, None)
+    )
     few = make(weights, score_threshold=0.001, max_num_features=30).detect((part, mask))
     inside = whole.select(np.rint(whole.keypoints[:, 0]) >= 60)
     assert len(inside) < len(whole)
     assert_array_equal(few.keypoints, inside.keypoints[:30])
     assert_allclose(few.descriptors, inside.descriptors[:30], atol=1e-5)
     assert (np.diff(few.responses) <= 0).all()
-    assert_allclose(few.lafs[:, :, :2], np.tile(12.0 * np.eye(2), (30, 1, 1)), atol=1e-9)
+    assert_allclose(
+        few.lafs[:, :, :2], np.tile(12.0 * np.eye(2), (30, 1, 1)), atol=1e-9
+    )
 
 
 def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:

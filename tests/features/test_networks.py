@@ -64,7 +64,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def patches() -> torch.Tensor:
     """Patches in [0, 1], each of another contrast."""
     generator = torch.Generator().manual_seed(5)
-    smooth = functional.avg_pool2d(torch.rand(7, 1, 36, 36, generator=generator), 5, stride=1)
+    smooth = functional.avg_pool2d(
+        torch.rand(7, 1, 36, 36, generator=generator), 5, stride=1
+    )
     return smooth * torch.linspace(0.1, 1.0, 7)[:, None, None, None]
 
 
@@ -75,11 +77,15 @@ def patches() -> torch.Tensor:
 def test_resolve_device_that_is_not_there_says_what_to_use_instead() -> None:
     assert resolve_device("auto") == torch.device("cpu")
     for name in ("cuda", "cuda:1", "mps"):
-        with pytest.raises(AffrectError, match=rf"^--device {name}: .*use --device cpu or auto$"):
+        with pytest.raises(
+            AffrectError, match=rf"^--device {name}: .*use --device cpu or auto$"
+        ):
             resolve_device(name)
 
 
-@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "CPU", "", "cpu:1", "cuda:-1"])
+@pytest.mark.parametrize(
+    "name", ["gpu", "cuda:", "cuda:x", "CPU", "", "cpu:1", "cuda:-1"]
+)
 def test_resolve_device_of_an_unknown_name_lists_the_known_ones(name: str) -> None:
     with pytest.raises(OptionError, match="not one of auto, cpu, cuda, cuda:0, mps"):
         resolve_device(name)
@@ -88,7 +94,9 @@ def test_resolve_device_of_an_unknown_name_lists_the_known_ones(name: str) -> No
 # Files.
 
 
-def test_load_hardnet_computes_what_kornia_does(folder: Path, patches: torch.Tensor) -> None:
+def test_load_hardnet_computes_what_kornia_does(
+    folder: Path, patches: torch.Tensor
+) -> None:
     reference = feature.HardNet(pretrained=False).eval()
     path = folder / "hardnet.pth"
     reference.load_state_dict(torch.load(path, weights_only=True)["state_dict"])
@@ -98,11 +106,15 @@ def test_load_hardnet_computes_what_kornia_does(folder: Path, patches: torch.Ten
 
 
 def test_loaders_refuse_the_file_of_another_network(folder: Path) -> None:
-    with pytest.raises(AffrectError, match=r"orinet\.pth: not the weights of AffNet \("):
+    with pytest.raises(
+        AffrectError, match=r"orinet\.pth: not the weights of AffNet \("
+    ):
         load_affnet(folder / "orinet.pth", "cpu")
     with pytest.raises(AffrectError, match=r"affnet\.pth: not the weights of OriNet"):
         load_orinet(folder / "affnet.pth", "cpu")
-    with pytest.raises(AffrectError, match=r"hardtfeat\.pth: not the weights of hardnet \("):
+    with pytest.raises(
+        AffrectError, match=r"hardtfeat\.pth: not the weights of hardnet \("
+    ):
         load_descriptor("hardnet", folder / "hardtfeat.pth", "cpu")
 
 
@@ -124,7 +136,9 @@ def test_load_affnet_refuses_a_file_that_differs_in_one_place(
 # Architectures.
 
 
-def test_affnet_and_orinet_compute_what_kornia_does(folder: Path, patches: torch.Tensor) -> None:
+def test_affnet_and_orinet_compute_what_kornia_does(
+    folder: Path, patches: torch.Tensor
+) -> None:
     affnet = feature.LAFAffNetShapeEstimator(pretrained=False).eval()
     orinet = feature.OriNet(pretrained=False).eval()
     for name, network in (("affnet", affnet), ("orinet", orinet)):
@@ -146,9 +160,13 @@ def test_hardtfeat_is_the_published_chain(folder: Path, patches: torch.Tensor) -
     deviations = patches.std((1, 2, 3), keepdim=True)
     values = (patches - patches.mean((1, 2, 3), keepdim=True)) / (deviations + 1e-7)
     # Here tanh comes before the maximum, as its authors wrote it.
-    values = functional.conv2d(values, state["features.0.weight"], state["features.0.bias"])
+    values = functional.conv2d(
+        values, state["features.0.weight"], state["features.0.bias"]
+    )
     values = functional.max_pool2d(torch.tanh(values), 2)
-    values = functional.conv2d(values, state["features.3.weight"], state["features.3.bias"])
+    values = functional.conv2d(
+        values, state["features.3.weight"], state["features.3.bias"]
+    )
     values = torch.tanh(values).flatten(1)
     weight = state["classifier.1.weight"].flatten(1)
     expected = torch.tanh(values @ weight.T + state["classifier.1.bias"])
@@ -163,8 +181,12 @@ def some_frames(count: int, size: tuple[int, int], largest_px: float) -> np.ndar
     shapes[:, 1, 0] = random.uniform(-0.8, 0.8, count)
     shapes[:, 0, 0] = random.uniform(0.5, 2.0, count)
     radii = np.exp(random.uniform(np.log(3.0), np.log(largest_px), count))
-    centers = random.uniform(-5, 5, (count, 2)) + random.uniform(0, 1, (count, 2)) * size
-    matrices = radii[:, None, None] * shapes @ rotation(random.uniform(-np.pi, np.pi, count))
+    centers = (
+        random.uniform(-5, 5, (count, 2)) + random.uniform(0, 1, (count, 2)) * size
+    )
+    matrices = (
+        radii[:, None, None] * shapes @ rotation(random.uniform(-np.pi, np.pi, count))
+    )
     return np.concatenate([matrices, centers[:, :, None]], axis=2)
 
 
@@ -185,7 +207,9 @@ def test_patches_are_those_of_kornia(
     frames = some_frames(150, size, largest_px=max(size))
     found = PatchSampler(image, CPU).sample(frames)
     expected = extract_patches_from_pyramid(
-        torch.from_numpy(image)[None, None], torch.from_numpy(frames.astype(np.float32))[None], 32
+        torch.from_numpy(image)[None, None],
+        torch.from_numpy(frames.astype(np.float32))[None],
+        32,
     )[0]
     assert found.dtype == torch.float32
     assert_allclose(found, expected, atol=1e-4)

@@ -33,7 +33,9 @@ def mean_class(grid: ShapeGrid, border_px: int = 48) -> tuple[float, float]:
     return float(tilt), float(np.rad2deg(angle))
 
 
-def resample(image: GrayImage, image_from_result: Array, size: tuple[int, int]) -> GrayImage:
+def resample(
+    image: GrayImage, image_from_result: Array, size: tuple[int, int]
+) -> GrayImage:
     """Show an image through a (2, 2) map about the centres of image and result."""
     height, width = image.shape
     matrix = np.zeros((2, 3))

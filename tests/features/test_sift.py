@@ -27,11 +27,15 @@ SCALE_BAND = 0.03
 """Relative: scales are interpolated between levels a third of an octave apart."""
 
 
-def rootsift(image: GrayImage, mask: np.ndarray | None = None, **options: Any) -> LocalFeatures:
+def rootsift(
+    image: GrayImage, mask: np.ndarray | None = None, **options: Any
+) -> LocalFeatures:
     return RootSift(SiftOptions(**options)).detect((image, mask))
 
 
-def dog(image: GrayImage, mask: np.ndarray | None = None, **options: Any) -> LocalFeatures:
+def dog(
+    image: GrayImage, mask: np.ndarray | None = None, **options: Any
+) -> LocalFeatures:
     return detect_dog(image, DogOptions(**options), mask)
 
 
@@ -52,7 +56,9 @@ def test_rootsift_orders_by_response_and_keeps_the_largest_responses_times_scale
     kept = strengths >= np.sort(strengths)[-37]
     assert len(some) == kept.sum() == 37
     assert not kept[:37].all(), "neither those of the largest responses"
-    assert not (everything.scales[kept].min() >= everything.scales[~kept]).all(), "nor scales"
+    assert not (everything.scales[kept].min() >= everything.scales[~kept]).all(), (
+        "nor scales"
+    )
     assert_array_equal(some.responses, everything.responses[kept])
     assert_array_equal(some.lafs, everything.lafs[kept])
 
@@ -66,7 +72,8 @@ def test_dog_finds_each_location_of_rootsift_once(image: GrayImage) -> None:
     assert len(np.unique(locations, axis=0)) == len(found)
     expected = np.column_stack([oriented.keypoints, oriented.scales])
     assert_allclose(
-        np.unique(np.round(locations, 6), axis=0), np.unique(np.round(expected, 6), axis=0)
+        np.unique(np.round(locations, 6), axis=0),
+        np.unique(np.round(expected, 6), axis=0),
     )
 
 
@@ -76,7 +83,9 @@ def test_dog_of_a_round_blob_gives_one_upright_circle_of_six_sigma() -> None:
     found = dog(blobs((121, 101), [center], sigma_px * np.eye(2)))
     assert len(found) == 1
     assert_allclose(found.keypoints[0], center, atol=CENTER_PX)
-    assert_allclose(found.scales[0], MEASUREMENT_SIGMAS * DOG_SIGMA * sigma_px, rtol=SCALE_BAND)
+    assert_allclose(
+        found.scales[0], MEASUREMENT_SIGMAS * DOG_SIGMA * sigma_px, rtol=SCALE_BAND
+    )
     assert_allclose(found.lafs[0, :, :2], found.scales[0] * np.eye(2), rtol=1e-12)
 
 

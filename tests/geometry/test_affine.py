@@ -37,7 +37,8 @@ def test_homography_errors_are_distances_from_the_nearest_true_match() -> None:
     offsets = np.array([[6.0, 0.0], [0.0, 6.0]])
     expected = [6.0 / np.sqrt(10.0), 6.0 / np.sqrt(2.0)]
     assert_allclose(
-        homography_errors(stretched, points, project(stretched, points) + offsets), expected
+        homography_errors(stretched, points, project(stretched, points) + offsets),
+        expected,
     )
     tilted = np.array([[0.6, -0.3, 40.0], [0.2, 1.3, -9.0], [1e-3, -4e-4, 1.0]])
     others = project(tilted, points) + offsets / 6
@@ -47,8 +48,12 @@ def test_homography_errors_are_distances_from_the_nearest_true_match() -> None:
     assert (there < np.linalg.norm(offsets / 6, axis=1)).all()
 
 
-def test_transform_lafs_maps_lafs_of_a_warp_to_the_image_by_the_inverse_on_the_left() -> None:
-    rectified_from_image = np.array([[2.0, 1.0, 3.0], [0.0, 1.0, -5.0], [0.0, 0.0, 1.0]])
+def test_transform_lafs_maps_lafs_of_a_warp_to_the_image_by_the_inverse_on_the_left() -> (
+    None
+):
+    rectified_from_image = np.array(
+        [[2.0, 1.0, 3.0], [0.0, 1.0, -5.0], [0.0, 0.0, 1.0]]
+    )
     warp_lafs = np.array([[[1.0, 4.0, 7.0], [0.0, 2.0, 1.0]]])
     # A^-1 = [[1/2, -1/2], [0, 1]]; the other order, L A^-1, would be [[1/2, 7/2], [0, 2]].
     # Centre: y = 1 + 5 = 6, x = (7 - 3 - 6) / 2 = -1.
@@ -70,14 +75,18 @@ def test_transform_lafs_by_homography_has_the_jacobian_of_finite_differences(
         ahead = project(homography, centers + move)
         behind = project(homography, centers - move)
         derivative = (ahead - behind) / (2 * step)
-        assert_allclose(mapped[:, :, column], derivative, rtol=1e-4, atol=JACOBIAN_ERROR)
+        assert_allclose(
+            mapped[:, :, column], derivative, rtol=1e-4, atol=JACOBIAN_ERROR
+        )
 
 
 def test_lafs_from_keypoints_point_their_first_column_along_the_orientation() -> None:
     points = np.array([[3.0, 5.0], [8.0, 1.0]])
     lafs = lafs_from_keypoints(points, np.array([2.0, 4.0]), np.deg2rad([90.0, 30.0]))
     assert_allclose(lafs[:, :, 2], points)
-    assert_allclose(lafs[:, :, 0], [[0.0, 2.0], [2.0 * np.sqrt(3.0), 2.0]], atol=ROUNDING)
+    assert_allclose(
+        lafs[:, :, 0], [[0.0, 2.0], [2.0 * np.sqrt(3.0), 2.0]], atol=ROUNDING
+    )
     assert_allclose(np.linalg.det(lafs[:, :, :2]), [4.0, 16.0])
 
 
@@ -98,7 +107,9 @@ points_in_image = st.lists(
 
 
 @given(classes())
-def test_rectifying_affine_has_unit_area_and_the_class_asked_for(cls: tuple[float, float]) -> None:
+def test_rectifying_affine_has_unit_area_and_the_class_asked_for(
+    cls: tuple[float, float],
+) -> None:
     matrix = rectifying_affine(*cls)
     assert_allclose(np.linalg.det(matrix), 1.0)
     assert_allclose(unit_metrics(matrix), metrics_from_tilts(*cls), atol=1e-12)

@@ -20,7 +20,9 @@ from colmap_affrect.geometry.significance import (
 )
 
 SIZE = np.array([1200.0, 700.0])
-MAP = np.array([[2.6, 0.9, 40.0], [-0.4, 1.2, 310.0]])  # neither its transpose nor its inverse
+MAP = np.array(
+    [[2.6, 0.9, 40.0], [-0.4, 1.2, 310.0]]
+)  # neither its transpose nor its inverse
 
 
 def random_lafs(count: int, seed: int) -> np.ndarray:

@@ -8,7 +8,9 @@ import pytest
 from colmap_affrect.geometry.earth import why_not_on_earth
 
 
-@pytest.mark.parametrize("position", [(47.5, 8.2, 400.0), (5e-6, 0.0, 0.0), (0.0, -3.0, 99_000.0)])
+@pytest.mark.parametrize(
+    "position", [(47.5, 8.2, 400.0), (5e-6, 0.0, 0.0), (0.0, -3.0, 99_000.0)]
+)
 def test_positions_on_earth_are_taken(position: tuple[float, float, float]) -> None:
     assert why_not_on_earth(np.array(position)) == ""
 

@@ -42,10 +42,18 @@ def plane() -> dict[str, NDArray[np.float64]]:
     points1 = np.random.default_rng(3).uniform((40, 30), (600, 450), (60, 2))
     step = 1e-4
     maps = np.stack(
-        [(warp(points1 + step * e) - warp(points1 - step * e)) / (2 * step) for e in np.eye(2)],
+        [
+            (warp(points1 + step * e) - warp(points1 - step * e)) / (2 * step)
+            for e in np.eye(2)
+        ],
         axis=2,
     )
-    return {"F": fundamental, "points1": points1, "points2": warp(points1), "maps": maps}
+    return {
+        "F": fundamental,
+        "points1": points1,
+        "points2": warp(points1),
+        "maps": maps,
+    }
 
 
 def test_matches_lie_on_their_epipolar_lines_and_others_as_far_as_they_were_moved(
@@ -70,8 +78,12 @@ def test_matches_lie_on_their_epipolar_lines_and_others_as_far_as_they_were_move
 def test_true_frames_carry_the_epipolar_direction_of_image_1_to_that_of_image_2(
     plane: dict[str, NDArray[np.float64]],
 ) -> None:
-    F, points1, points2, maps = (plane[key] for key in ("F", "points1", "points2", "maps"))
-    shapes1 = rotation((0, 0, 37.0))[:2, :2] @ np.diag([5.0, 2.0]) + np.zeros((len(points1), 1, 1))
+    F, points1, points2, maps = (
+        plane[key] for key in ("F", "points1", "points2", "maps")
+    )
+    shapes1 = rotation((0, 0, 37.0))[:2, :2] @ np.diag([5.0, 2.0]) + np.zeros(
+        (len(points1), 1, 1)
+    )
     rows = np.arange(len(points1))
 
     def cosines_of(F: NDArray, points: tuple, shapes: tuple) -> NDArray:

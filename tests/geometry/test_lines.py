@@ -42,7 +42,9 @@ def test_segments_count_from_the_middle_of_the_image_in_longer_sides() -> None:
     edges = np.array([[749.5, 499.5, 1499.5, 499.5], [749.5, 499.5, 749.5, 799.5]])
     segments = Segments.of_image(edges, SIZE)
     assert_allclose(segments.starts, 0.0)
-    assert_allclose(segments.ends, [[0.5, 0.0], [0.0, 0.2]])  # x right, y down, the longer first
+    assert_allclose(
+        segments.ends, [[0.5, 0.0], [0.0, 0.2]]
+    )  # x right, y down, the longer first
     assert_allclose(segments.lengths, [0.5, 0.2])
     assert_allclose(segments.directions, [[1.0, 0.0], [0.0, 1.0]])
 
@@ -60,7 +62,9 @@ def test_a_line_in_pieces_counts_as_one_and_parallel_lines_count_each() -> None:
     apart = [[100.0, 600.0, 500.0, 600.0]]
     crossing = [[800.0, 200.0, 800.0, 700.0]]
     segments = Segments.of_image(np.array(pieces + apart + crossing), SIZE)
-    by_length = dict(zip(segments.lengths.round(4).tolist(), segments.weights, strict=True))
+    by_length = dict(
+        zip(segments.lengths.round(4).tolist(), segments.weights, strict=True)
+    )
     assert by_length[round(200 / 1500, 4)] == pytest.approx(2 / 3)
     assert by_length[round(100 / 1500, 4)] == pytest.approx(1 / 3)
     assert by_length[round(400 / 1500, 4)] == pytest.approx(1.0)
@@ -68,7 +72,9 @@ def test_a_line_in_pieces_counts_as_one_and_parallel_lines_count_each() -> None:
 
 
 def test_directions_of_short_segments_are_less_sure() -> None:
-    segments = Segments.of_image(np.array([[0.0, 0.0, 750.0, 0.0], [0.0, 0.0, 15.0, 0.0]]), SIZE)
+    segments = Segments.of_image(
+        np.array([[0.0, 0.0, 750.0, 0.0], [0.0, 0.0, 15.0, 0.0]]), SIZE
+    )
     assert_allclose(segments.sigmas, np.hypot(0.008, [0.0008 / 0.5, 0.0008 / 0.01]))
 
 
@@ -90,7 +96,9 @@ def test_a_vanishing_point_lies_where_the_camera_sees_its_direction() -> None:
     middle = away + across / 2.0
     sine = np.linalg.norm(away) / np.linalg.norm(middle)  # of the angle at the middle
     assert abs(fit.sines[0, 0, 1]) == pytest.approx(sine)
-    other_sign = VanishingFit(segments, rotation[None], np.array([0.8]), np.array([-0.1]))
+    other_sign = VanishingFit(
+        segments, rotation[None], np.array([0.8]), np.array([-0.1])
+    )
     assert abs(other_sign.sines[0, 0, 0]) > 0.1
 
 
@@ -106,7 +114,9 @@ def test_a_rotation_is_refined_to_the_true_one() -> None:
 
 
 @pytest.mark.parametrize("focal", [0.55, 0.9, 1.6])
-def test_the_focal_length_of_a_building_is_found_among_lines_by_chance(focal: float) -> None:
+def test_the_focal_length_of_a_building_is_found_among_lines_by_chance(
+    focal: float,
+) -> None:
     edges = np.concatenate([Building(focal=focal).edges(3), chance_edges(40, 4)])
     camera = camera_of(edges)
     assert camera.is_known
@@ -122,7 +132,9 @@ def test_rows_of_the_rotation_are_the_directions_and_up_points_up() -> None:
     cosines = np.abs(camera.rotation @ building.rotation)
     assert_allclose(np.sort(cosines.max(axis=1)), 1.0, atol=1e-3)
     assert sorted(cosines.argmax(axis=1).tolist()) == [0, 1, 2]
-    assert angle_deg(camera.up, -building.rotation[:, 1]) < 1.5  # down is the second column
+    assert (
+        angle_deg(camera.up, -building.rotation[:, 1]) < 1.5
+    )  # down is the second column
     assert camera.up[1] < -0.9
     assert camera.up[2] == pytest.approx(-building.rotation[2, 1], abs=0.02)
 
@@ -215,7 +227,9 @@ def test_the_grid_and_the_constants_are_what_was_fitted() -> None:
     assert camera.focal == pytest.approx(FOCALS[row])
     assert 0.03 < camera.focal_sigma < 0.08
     # Nothing known: the usual focal length, with the deviation of those that photographs have.
-    nothing = LineLikelihood(np.zeros(logs.shape), np.tile(np.eye(3), (*logs.shape, 1, 1)))
+    nothing = LineLikelihood(
+        np.zeros(logs.shape), np.tile(np.eye(3), (*logs.shape, 1, 1))
+    )
     camera = line_camera(nothing)
     assert camera.focal == pytest.approx(1.2, rel=0.02)
     assert camera.focal_sigma == pytest.approx(0.5, rel=0.05)

@@ -33,12 +33,16 @@ def noise(sigma_px: float, count: int) -> Array:
     return np.random.default_rng(2).normal(0.0, sigma_px, (count, 2))
 
 
-def test_matches_of_a_caption_are_on_a_text_line_and_those_of_the_scene_are_not() -> None:
+def test_matches_of_a_caption_are_on_a_text_line_and_those_of_the_scene_are_not() -> (
+    None
+):
     points1 = caption(height_px=6.0, angle_deg=2.0)
     scene = np.random.default_rng(3).uniform((0, 0), (1000, 800), (30, 2))
     others = np.random.default_rng(4).uniform((0, 0), (1000, 800), (30, 2))
     points1 = np.concatenate([points1, scene])
-    points2 = np.concatenate([0.8 * points1[:60] + (30.0, 240.0) + noise(0.1, 60), others])
+    points2 = np.concatenate(
+        [0.8 * points1[:60] + (30.0, 240.0) + noise(0.1, 60), others]
+    )
     found = text_line_matches(points1, points2, SIZES)
     assert np.count_nonzero(found[:60]) > 54
     assert np.count_nonzero(found[60:]) < 3
@@ -47,7 +51,9 @@ def test_matches_of_a_caption_are_on_a_text_line_and_those_of_the_scene_are_not(
 @pytest.mark.parametrize(
     ("height_px", "angle_deg"), [(60.0, 0.0), (6.0, 20.0)], ids=["too high", "oblique"]
 )
-def test_thick_or_oblique_bands_are_no_text_line(height_px: float, angle_deg: float) -> None:
+def test_thick_or_oblique_bands_are_no_text_line(
+    height_px: float, angle_deg: float
+) -> None:
     points = caption(height_px, angle_deg)
     assert not text_line_matches(points, points + SHIFT_PX, SIZES).any()
 
@@ -62,7 +68,9 @@ def copies(num_wrong: int, sigma_px: float) -> tuple[Array, Array]:
     """Matches of a photograph and a smaller print of it."""
     points1 = np.random.default_rng(5).uniform((0, 0), (1000, 800), (200, 2))
     points2 = 0.6 * points1 + (20.0, 30.0) + noise(sigma_px, 200)
-    points2[:num_wrong] = np.random.default_rng(6).uniform((0, 0), (700, 500), (num_wrong, 2))
+    points2[:num_wrong] = np.random.default_rng(6).uniform(
+        (0, 0), (700, 500), (num_wrong, 2)
+    )
     return points1, points2
 
 
@@ -92,7 +100,9 @@ def gray_texture(seed: int, deviation: float) -> Bytes:
     return np.rint(128.0 + deviation * smooth / smooth.std()).astype(np.uint8)
 
 
-def test_copies_correlate_whatever_their_contrast_and_other_photographs_do_not() -> None:
+def test_copies_correlate_whatever_their_contrast_and_other_photographs_do_not() -> (
+    None
+):
     photograph = gray_texture(7, 15.0)
     shading = 60.0 * np.sin(np.arange(400) / 30.0)
     copy = np.rint(0.8 * photograph + 30.0 + shading).clip(0, 255).astype(np.uint8)

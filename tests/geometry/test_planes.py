@@ -39,13 +39,17 @@ def visible_normals(draw: st.DrawFn, max_angle_deg: float = 80.0) -> Array:
     normal = draw(st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 0.3)))
     assume(np.linalg.norm(normal) > 0.1)
     normal = unit(normal)
-    assume(viewing_cosines(normal, CAMERA, SIZE).min() > np.cos(np.deg2rad(max_angle_deg)))
+    assume(
+        viewing_cosines(normal, CAMERA, SIZE).min() > np.cos(np.deg2rad(max_angle_deg))
+    )
     return normal
 
 
 @settings(max_examples=30)
 @given(visible_normals(), st.floats(0.01, 100.0))
-def test_normals_of_a_plane_are_its_normal_to_the_last_pixel(normal: Array, unit_m: float) -> None:
+def test_normals_of_a_plane_are_its_normal_to_the_last_pixel(
+    normal: Array, unit_m: float
+) -> None:
     normals = normals_from_depth(plane_depth(normal, unit_m), CAMERA)
     assert normals.shape == (70, 90, 3)
     assert angles_deg(normals, normal).max() < EXACT_DEG
@@ -75,7 +79,9 @@ def test_shrink_depth_keeps_planes_exact_and_says_where_pixels_went() -> None:
     assert angles_deg(normals, normal).max() < EXACT_DEG
 
 
-def scattered(center: Array, count: int, spread_deg: float, rng: np.random.Generator) -> Array:
+def scattered(
+    center: Array, count: int, spread_deg: float, rng: np.random.Generator
+) -> Array:
     """Unit normals about a direction."""
     return unit(center + np.deg2rad(spread_deg) * rng.standard_normal((count, 3)))
 
@@ -118,13 +124,19 @@ def test_cluster_normals_finds_planes_by_falling_size() -> None:
 def test_cluster_normals_keeps_opposite_normals_apart() -> None:
     rng = np.random.default_rng(8)
     right = unit([1.0, 0.1, -0.1])
-    normals = np.concatenate([scattered(right, 300, 5.0, rng), scattered(-right, 200, 5.0, rng)])
+    normals = np.concatenate(
+        [scattered(right, 300, 5.0, rng), scattered(-right, 200, 5.0, rng)]
+    )
     clusters = clustered(normals[None])
     assert angles_deg(clusters.normals, np.stack([right, -right])).max() < 1.0
     assert np.bincount(clusters.labels[0]).tolist() == [300, 200]
 
 
-@given(visible_normals(), st.floats(0.0, np.pi), st.tuples(st.floats(0, 89), st.floats(0, 69)))
+@given(
+    visible_normals(),
+    st.floats(0.0, np.pi),
+    st.tuples(st.floats(0, 89), st.floats(0, 69)),
+)
 def test_fronto_parallel_homography_shows_squares_of_the_plane_as_squares(
     normal: Array, angle_rad: float, pixel: tuple[float, float]
 ) -> None:
@@ -133,18 +145,27 @@ def test_fronto_parallel_homography_shows_squares_of_the_plane_as_squares(
     right = unit(np.cross([0.1, 1.0, 0.2], normal))
     down = np.cross(normal, right)
     turns = angle_rad + np.pi / 2 * np.arange(4)
-    corners = center + 0.05 * (np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * down)
+    corners = center + 0.05 * (
+        np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * down
+    )
     seen = corners @ CAMERA.T
-    frontal = project(fronto_parallel_homography(normal, CAMERA), seen[:, :2] / seen[:, 2:])
+    frontal = project(
+        fronto_parallel_homography(normal, CAMERA), seen[:, :2] / seen[:, 2:]
+    )
     sides = np.diff(frontal, axis=0, append=frontal[:1]) / [CAMERA[0, 0], CAMERA[1, 1]]
     lengths = np.linalg.norm(sides, axis=1)
     assert_allclose(lengths, lengths.mean(), rtol=1e-6)
-    turned = sides[:, 0] * np.roll(sides, -1, 0)[:, 0] + sides[:, 1] * np.roll(sides, -1, 0)[:, 1]
+    turned = (
+        sides[:, 0] * np.roll(sides, -1, 0)[:, 0]
+        + sides[:, 1] * np.roll(sides, -1, 0)[:, 1]
+    )
     assert np.abs(turned).max() < 1e-6 * lengths.mean() ** 2
 
 
 @given(visible_normals())
-def test_fronto_parallel_homography_is_positive_where_the_plane_is_seen(normal: Array) -> None:
+def test_fronto_parallel_homography_is_positive_where_the_plane_is_seen(
+    normal: Array,
+) -> None:
     homography = fronto_parallel_homography(normal, CAMERA)
     assert_allclose(np.linalg.det(homography), 1.0)
     rows, columns = np.indices(SIZE[::-1])

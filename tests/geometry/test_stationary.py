@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.stationary import num_moving_together, stationary_log_ratios
+from colmap_affrect.geometry.stationary import (
+    num_moving_together,
+    stationary_log_ratios,
+)
 
 LIMIT_PX = 5.0
 TOLERANCE_PX = 1.0
@@ -22,16 +25,22 @@ def noise(count: int) -> Array:
 
 def mean_ratio(places: Array, motions: Array) -> float:
     is_small = np.linalg.norm(motions, axis=1) <= LIMIT_PX
-    ratios = stationary_log_ratios(places[is_small], motions[is_small], TOLERANCE_PX, LIMIT_PX)
+    ratios = stationary_log_ratios(
+        places[is_small], motions[is_small], TOLERANCE_PX, LIMIT_PX
+    )
     return float(ratios.mean())
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (1.5, -1.5), (-3.0, 1.0)])
 @pytest.mark.parametrize("degrees", [0.0, 0.15])
-def test_print_on_sheets_laid_anew_stands_still(shift: tuple[float, float], degrees: float) -> None:
+def test_print_on_sheets_laid_anew_stands_still(
+    shift: tuple[float, float], degrees: float
+) -> None:
     places = points(80)
     from_centre = places - (500, 350)
-    turn = np.deg2rad(degrees) * np.stack([-from_centre[:, 1], from_centre[:, 0]], axis=1)
+    turn = np.deg2rad(degrees) * np.stack(
+        [-from_centre[:, 1], from_centre[:, 0]], axis=1
+    )
     assert mean_ratio(places, turn + shift + noise(80)) > 1.0
 
 
@@ -44,7 +53,9 @@ def test_print_on_sheets_laid_anew_stands_still(shift: tuple[float, float], degr
         [[-0.1, 0.02], [0.01, 0.03]],
     ],
 )
-def test_motions_that_pass_through_zero_do_not_stand_still(slopes: list[list[float]]) -> None:
+def test_motions_that_pass_through_zero_do_not_stand_still(
+    slopes: list[list[float]],
+) -> None:
     places = points(3000)
     motions = (places - (500, 350)) @ np.array(slopes).T + noise(3000)
     assert mean_ratio(places, motions) < -0.5

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from strategies import Array, affine_shapes, classes, compose_affine, scales, tilt_distance, turns
+from strategies import (
+    Array,
+    affine_shapes,
+    classes,
+    compose_affine,
+    scales,
+    tilt_distance,
+    turns,
+)
 
 from colmap_affrect.geometry.tilts import (
     IDENTITY_LABEL,
@@ -54,7 +62,9 @@ def test_tilt_distance_is_the_log_of_the_transition_tilt_by_svd(
     matrix1 = compose_affine(scale1, psi1, *class1)
     matrix2 = compose_affine(scale2, psi2, *class2)
     expected = transition_tilt(matrix1, matrix2)
-    assert_allclose(np.exp(tilt_distance(*class1, *class2)), expected, rtol=ARCCOSH_ROUNDING)
+    assert_allclose(
+        np.exp(tilt_distance(*class1, *class2)), expected, rtol=ARCCOSH_ROUNDING
+    )
 
 
 def test_unit_metrics_hold_s11_s22_s12_of_the_gram_matrix() -> None:
@@ -106,7 +116,9 @@ def test_cover_shapes_covers_the_share_asked_for_or_reaches_a_limit(
     tilts, angles = random_classes(seed, count, MAX_TILT)
     metrics = metrics_from_tilts(tilts, angles)
     limits = {"covered_frac": covered_frac, "max_num_centers": max_num_centers}
-    cover = cover_shapes(metrics, np.ones(count), radius=radius, max_tilt=MAX_TILT, **limits)
+    cover = cover_shapes(
+        metrics, np.ones(count), radius=radius, max_tilt=MAX_TILT, **limits
+    )
     references = [(1.0, 0.0), *cover.centers]
     distances = np.array(
         [[tilt_distance(t, a, *reference) for reference in references]
@@ -116,7 +128,9 @@ def test_cover_shapes_covers_the_share_asked_for_or_reaches_a_limit(
     np.testing.assert_array_equal(cover.labels != UNCOVERED_LABEL, covered)
     chosen = np.where(cover.labels == IDENTITY_LABEL, 0, cover.labels + 1)[covered]
     assert_allclose(
-        distances[covered, chosen], distances[covered].min(axis=1), atol=ARCCOSH_ROUNDING
+        distances[covered, chosen],
+        distances[covered].min(axis=1),
+        atol=ARCCOSH_ROUNDING,
     )
     assert len(cover.centers) <= max_num_centers
     reachable = cosh_distances(metrics, metrics_from_tilts(*covering_grid().T))
@@ -126,7 +140,9 @@ def test_cover_shapes_covers_the_share_asked_for_or_reaches_a_limit(
     assert enough or len(cover.centers) == max_num_centers or stuck
 
 
-def cover_with_defaults(tilts: list[float], angles: list[float], weights: list[float]) -> Array:
+def cover_with_defaults(
+    tilts: list[float], angles: list[float], weights: list[float]
+) -> Array:
     """Centres that cover all votes with at most 8 balls of 1.7."""
     cover = cover_shapes(
         metrics_from_tilts(tilts, angles),
@@ -174,7 +190,9 @@ def test_rectifying_metrics_are_those_of_the_inverse(shape: Array) -> None:
 
 
 @given(classes(), st.floats(1e-3, 1e3))
-def test_log_metrics_are_matrix_logarithms_whatever_the_scale(shape: Class, scale: float) -> None:
+def test_log_metrics_are_matrix_logarithms_whatever_the_scale(
+    shape: Class, scale: float
+) -> None:
     metric = metrics_from_tilts(*shape)
     values, vectors = np.linalg.eigh(matrices(metric))
     expected = vectors @ np.diag(np.log(values)) @ vectors.T
@@ -198,7 +216,9 @@ def test_circles_that_a_warp_made_ellipses_are_no_shapes_of_their_own() -> None:
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.3, False), (0.8, True)])
-def test_most_shapes_that_were_measured_one_by_one_differ(share: float, expected: bool) -> None:
+def test_most_shapes_that_were_measured_one_by_one_differ(
+    share: float, expected: bool
+) -> None:
     shapes = np.tile(np.diag([2.0, 0.5]), (1000, 1, 1))
     num_measured = int(share * 1000)
     # Steps of 3e-4 of shapes of unit area.

@@ -41,15 +41,22 @@ def test_depths_are_those_of_the_points_in_both_cameras() -> None:
     center = -ROTATION.T @ TRANSLATION
     cosines = (points * (points - center)).sum(axis=1)
     cosines /= np.linalg.norm(points, axis=1) * np.linalg.norm(points - center, axis=1)
-    np.testing.assert_allclose(depths.angles_deg, np.degrees(np.arccos(cosines)), atol=1e-6)
-    assert sampson_errors(essential_matrix(ROTATION, TRANSLATION), rays1, rays2).max() < 1e-9
+    np.testing.assert_allclose(
+        depths.angles_deg, np.degrees(np.arccos(cosines)), atol=1e-6
+    )
+    assert (
+        sampson_errors(essential_matrix(ROTATION, TRANSLATION), rays1, rays2).max()
+        < 1e-9
+    )
     turned = triangulated_depths(ROTATION, -TRANSLATION, rays1, rays2)
     assert not turned.in_front.any()
     assert depths.in_front.all()
 
 
 @pytest.mark.parametrize("share_wrong", [0.0, 0.4])
-def test_scale_is_found_between_features_that_lie_beside_each_other(share_wrong: float) -> None:
+def test_scale_is_found_between_features_that_lie_beside_each_other(
+    share_wrong: float,
+) -> None:
     random = np.random.default_rng(2)
     known = random.uniform(0, 1000, (600, 2))
     places = random.uniform(0, 1000, (200, 2))
@@ -89,7 +96,9 @@ def test_errors_of_poses_are_shared_by_all_depths_beyond_ten() -> None:
 
 
 @pytest.mark.parametrize("estimate", [scale_between, scale_by_planes])
-def test_without_known_depths_or_places_there_is_no_scale(estimate: Callable[..., object]) -> None:
+def test_without_known_depths_or_places_there_is_no_scale(
+    estimate: Callable[..., object],
+) -> None:
     nothing = (np.zeros((0, 2)), np.zeros(0))
     something = (np.zeros((20, 2)), np.ones(20))
     assert estimate(nothing, something, 10.0) is None
@@ -102,7 +111,9 @@ MATRIX = np.array([[880.0, 0, 320], [0, 880, 240], [0, 0, 1]])
 
 def rotation(yaw_deg: float, pitch_deg: float) -> np.ndarray:
     yaw, pitch = np.deg2rad([yaw_deg, pitch_deg])
-    around_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
+    around_y = np.array(
+        [[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]]
+    )
     tilt = np.array([[np.cos(pitch), -np.sin(pitch)], [np.sin(pitch), np.cos(pitch)]])
     around_x = np.eye(3)
     around_x[1:, 1:] = tilt
@@ -113,7 +124,9 @@ def strip_of_turned_view(num: int) -> tuple[np.ndarray, np.ndarray]:
     """Matches in the strip that two views 34 degrees apart have in common."""
     rng = np.random.default_rng(4)
     points1 = rng.uniform((15.0, 40.0), (85.0, 440.0), (num, 2))
-    turned = homogeneous(points1) @ (MATRIX @ rotation(34.0, -5.0) @ np.linalg.inv(MATRIX)).T
+    turned = (
+        homogeneous(points1) @ (MATRIX @ rotation(34.0, -5.0) @ np.linalg.inv(MATRIX)).T
+    )
     return points1, turned[:, :2] / turned[:, 2:]
 
 
@@ -122,7 +135,9 @@ def test_turned_views_of_which_things_that_repeat_match_too(share_wrong: float) 
     points1, points2 = strip_of_turned_view(400)
     num_wrong = int(share_wrong * 400)
     points1[:num_wrong] += (380.0, -25.0)
-    points2[:num_wrong] = np.random.default_rng(1).uniform((40, 20), (600, 460), (num_wrong, 2))
+    points2[:num_wrong] = np.random.default_rng(1).uniform(
+        (40, 20), (600, 460), (num_wrong, 2)
+    )
     share = pure_rotation_ratio(points1, points2, SIZES, 2.0)
     assert share == pytest.approx(1.0 - share_wrong, abs=0.05)
 
@@ -131,7 +146,10 @@ def test_moved_camera_is_no_turned_one() -> None:
     rng = np.random.default_rng(7)
     scene = rng.uniform((-1.5, -1.0, 3.0), (1.5, 1.2, 7.0), (300, 3))
     views = []
-    for matrix, center in ((np.eye(3), (0.0, 0, 0)), (rotation(9.0, 2.0), (0.7, -0.2, 0.1))):
+    for matrix, center in (
+        (np.eye(3), (0.0, 0, 0)),
+        (rotation(9.0, 2.0), (0.7, -0.2, 0.1)),
+    ):
         seen = (scene - center) @ (MATRIX @ matrix).T
         views.append(seen[:, :2] / seen[:, 2:])
     assert pure_rotation_ratio(views[0], views[1], SIZES, 2.0) < 0.3

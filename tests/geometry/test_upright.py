@@ -16,7 +16,9 @@ def leaning(*degrees: float) -> Array:
     """Directions that lean from ``UP``, each to another side."""
     found = []
     for number, angle in enumerate(degrees):
-        found.append(turn(0, 20.0) @ turn(1, 77.0 * number) @ turn(0, angle) @ [0.0, -1.0, 0.0])
+        found.append(
+            turn(0, 20.0) @ turn(1, 77.0 * number) @ turn(0, angle) @ [0.0, -1.0, 0.0]
+        )
     return np.array(found)
 
 

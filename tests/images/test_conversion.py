@@ -53,7 +53,9 @@ def scans(tmp_path: Path) -> Path:
     return folder
 
 
-def test_every_photograph_arrives_as_colmap_reads_it(scans: Path, tmp_path: Path) -> None:
+def test_every_photograph_arrives_as_colmap_reads_it(
+    scans: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "photos"
     report = convert_images(scans, out)
     assert list(report.failures) == ["broken.jp2"]
@@ -68,11 +70,15 @@ def test_every_photograph_arrives_as_colmap_reads_it(scans: Path, tmp_path: Path
     np.testing.assert_array_equal(Image.open(out / "box" / "a.jp2.png"), picture(1))
     deep = decode(out / "d.tif-page1.png")
     assert (deep.dtype, int(deep[29, 44])) == (np.uint16, 1349 * 40)
-    np.testing.assert_array_equal(decode(out / "d.tif-page2.png"), picture(5).convert("L"))
+    np.testing.assert_array_equal(
+        decode(out / "d.tif-page2.png"), picture(5).convert("L")
+    )
     for path in sorted(out.rglob("*.png")):
         assert pycolmap.Bitmap.read(path, as_rgb=False) is not None
     bitmap = pycolmap.Bitmap.read(out / "b.webp.png", as_rgb=True)
-    assert bitmap.exif_focal_length() == pytest.approx(80 / 43.27 * np.hypot(45, 30), rel=0.01)
+    assert bitmap.exif_focal_length() == pytest.approx(
+        80 / 43.27 * np.hypot(45, 30), rel=0.01
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -81,7 +87,9 @@ def test_pages_that_lie_on_their_side_are_upright(tmp_path: Path, dtype: type) -
     (tmp_path / "scans").mkdir()
     with TiffImagePlugin.AppendingTiffWriter(str(tmp_path / "scans" / "a.tif")) as file:
         for orientation, page in ((6, np.rot90(upright)), (3, np.rot90(upright, 2))):
-            Image.fromarray(page).save(file, format="TIFF", tiffinfo={ORIENTATION: orientation})
+            Image.fromarray(page).save(
+                file, format="TIFF", tiffinfo={ORIENTATION: orientation}
+            )
             file.newFrame()
     convert_images(tmp_path / "scans", tmp_path / "photos")
     for name in ("a.tif-page1.png", "a.tif-page2.png"):
@@ -111,7 +119,9 @@ def test_only_what_can_be_decoded_is_copied(scans: Path, tmp_path: Path) -> None
     picture(7).save(scans / "old.tga")
     (scans / "old.tga").rename(scans / "old.jpg")
     for name in ("half.jpg", "half.png"):
-        large = Image.fromarray(np.random.default_rng(1).integers(0, 256, (300, 400, 3), np.uint8))
+        large = Image.fromarray(
+            np.random.default_rng(1).integers(0, 256, (300, 400, 3), np.uint8)
+        )
         large.save(scans / name)
         data = (scans / name).read_bytes()
         (scans / name).write_bytes(data[: len(data) // 2])
@@ -151,7 +161,9 @@ def test_no_photograph_takes_the_place_of_another(scans: Path, tmp_path: Path) -
     assert "b.webp-2.png: instead of b.webp.png" in report.summary()
     made = Image.open(tmp_path / "photos" / "b.webp.png")
     np.testing.assert_array_equal(made, picture(8))
-    np.testing.assert_array_equal(Image.open(tmp_path / "photos" / "b.webp-2.png"), picture(2))
+    np.testing.assert_array_equal(
+        Image.open(tmp_path / "photos" / "b.webp-2.png"), picture(2)
+    )
 
 
 def test_of_a_damaged_page_no_other_page_is_left(
@@ -181,7 +193,9 @@ def test_converted_photographs_with_long_names_get_shorter_ones(tmp_path: Path) 
     assert (tmp_path / "photos" / new).is_file()
 
 
-@pytest.mark.parametrize("is_picture", [True, False], ids=["a picture and a hole", "a hole"])
+@pytest.mark.parametrize(
+    "is_picture", [True, False], ids=["a picture and a hole", "a hole"]
+)
 def test_long_file_that_is_not_what_it_says_is_named_and_not_read(
     tmp_path: Path, is_picture: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,7 +217,11 @@ def test_long_file_that_is_not_what_it_says_is_named_and_not_read(
     monkeypatch.setattr(reading.np, "empty", counted)
     report = convert_images(folder, tmp_path / "photos")
     assert report.copied == ["a.png"]
-    why = "is 3.0 GB long, which its 0.0 megapixels do not need" if is_picture else "not a readable"
+    why = (
+        "is 3.0 GB long, which its 0.0 megapixels do not need"
+        if is_picture
+        else "not a readable"
+    )
     assert why in report.failures["b.jpg"]
     assert max(read) < 1_000_000
 

@@ -74,7 +74,11 @@ def test_png_of_sixteen_bits_counts_steps_and_zero_is_unknown(tmp_path):
 
 def test_places_are_searched_in_the_documented_order(tmp_path):
     suffixes = (".npy", ".png", ".tif", ".tiff")
-    places = [f"{stem}{suffix}" for stem in ("v1.2/č d.x.jpg", "v1.2/č d.x") for suffix in suffixes]
+    places = [
+        f"{stem}{suffix}"
+        for stem in ("v1.2/č d.x.jpg", "v1.2/č d.x")
+        for suffix in suffixes
+    ]
     for number, place in enumerate(places, 1):
         write_map(tmp_path / place, np.full((4, 6), 1000 * number, np.uint16))
     for number, place in enumerate(places, 1):
@@ -109,20 +113,30 @@ def test_distances_along_rays_become_depths_along_the_axis(tmp_path, scale_x, sc
             [0.0, 0.0, 1.0],
         ]
     )
-    z_depth, ray_length = slanted_plane((round(144 * scale_x), round(96 * scale_y)), camera)
-    assert np.abs(ray_length / z_depth - 1).max() > 0.04, "the test must tell the two apart"
+    z_depth, ray_length = slanted_plane(
+        (round(144 * scale_x), round(96 * scale_y)), camera
+    )
+    assert np.abs(ray_length / z_depth - 1).max() > 0.04, (
+        "the test must tell the two apart"
+    )
     write_map(tmp_path / "a.npy", ray_length)
     original = np.array([[300.0, 0.0, 50.0], [0.0, 210.0, 30.0], [0.0, 0.0, 1.0]])
     image = photograph(size=(144, 96), camera_matrix=original)
-    assert_allclose(source(tmp_path, kind="ray").depth(image), z_depth, rtol=FLOAT32_RTOL)
+    assert_allclose(
+        source(tmp_path, kind="ray").depth(image), z_depth, rtol=FLOAT32_RTOL
+    )
     assert_allclose(source(tmp_path).depth(image), ray_length, rtol=FLOAT32_RTOL)
 
 
-def test_inverse_depth_is_inverted_after_scaling_and_what_is_not_positive_is_unknown(tmp_path):
+def test_inverse_depth_is_inverted_after_scaling_and_what_is_not_positive_is_unknown(
+    tmp_path,
+):
     steps = np.array([[0, 1, 2], [10, 50, 65535]], np.uint16)
     write_map(tmp_path / "a.png", steps)
     depth = source(tmp_path, kind="inverse").depth(photograph())
-    assert_allclose(depth, [[np.nan, 1000, 500], [100, 20, 1000 / 65535]], rtol=FLOAT32_RTOL)
+    assert_allclose(
+        depth, [[np.nan, 1000, 500], [100, 20, 1000 / 65535]], rtol=FLOAT32_RTOL
+    )
 
 
 # --- files: errors
@@ -149,10 +163,14 @@ def test_file_of_another_format_or_with_pickled_objects_is_unreadable(tmp_path, 
             source(tmp_path).depth(photograph())
 
 
-@pytest.mark.parametrize("values", [np.ones((1, 4, 6)), np.ones((0, 6)), np.ones((4, 6), complex)])
+@pytest.mark.parametrize(
+    "values", [np.ones((1, 4, 6)), np.ones((0, 6)), np.ones((4, 6), complex)]
+)
 def test_array_that_is_no_map_of_numbers_is_refused(tmp_path, values):
     write_map(tmp_path / "a.npy", values)
-    with pytest.raises(DepthError, match=r"expected numbers of shape \(height, width\), found"):
+    with pytest.raises(
+        DepthError, match=r"expected numbers of shape \(height, width\), found"
+    ):
         source(tmp_path).depth(photograph())
 
 
@@ -167,7 +185,9 @@ def test_map_of_too_many_values_is_refused_by_its_header(tmp_path, suffix, monke
 @pytest.mark.parametrize("size", [(4, 6), (12, 7)])
 def test_map_of_another_aspect_is_refused_unless_networks_round_so(tmp_path, size):
     write_map(tmp_path / "a.npy", asymmetric_map(size))
-    with pytest.raises(DepthError, match=rf"is {size[0]} x {size[1]} px, the photograph 12 x 8"):
+    with pytest.raises(
+        DepthError, match=rf"is {size[0]} x {size[1]} px, the photograph 12 x 8"
+    ):
         source(tmp_path).depth(photograph())
     for rounded in ((6, 4), (120, 80), (352, 224), (64, 42)):
         write_map(tmp_path / "a.npy", asymmetric_map(rounded))
@@ -178,6 +198,8 @@ def test_require_some_needs_a_map_of_one_image(tmp_path):
     with pytest.raises(OptionError, match="no such folder"):
         source(tmp_path / "nowhere").require_some(["a.jpg"])
     write_map(tmp_path / "side" / "č d.npy", asymmetric_map())
-    with pytest.raises(OptionError, match=r"any of the 2 images; looked for a\.jpg\.\* and a\.\*"):
+    with pytest.raises(
+        OptionError, match=r"any of the 2 images; looked for a\.jpg\.\* and a\.\*"
+    ):
         source(tmp_path).require_some(["a.jpg", "side/b.jpg"])
     source(tmp_path).require_some(["a.jpg", "side/č d.png"])

@@ -38,11 +38,18 @@ def test_focal_length_of_right_exif_is_exactly_colmaps(
 ) -> None:
     path = tmp_path / f"a{suffix}"
     found = exif_focal(tags_of(path, (180, 120), tags))
-    assert found.focal_px == pycolmap.Bitmap.read(path, as_rgb=False).exif_focal_length()
-    assert (found.is_rescaled, found.why) == (False, "" if tags else "no EXIF focal length in px")
+    assert (
+        found.focal_px == pycolmap.Bitmap.read(path, as_rgb=False).exif_focal_length()
+    )
+    assert (found.is_rescaled, found.why) == (
+        False,
+        "" if tags else "no EXIF focal length in px",
+    )
 
 
-@pytest.mark.parametrize(("size", "scale"), [((1092, 728), 4), ((728, 1092), 4), ((546, 364), 8)])
+@pytest.mark.parametrize(
+    ("size", "scale"), [((1092, 728), 4), ((728, 1092), 4), ((546, 364), 8)]
+)
 def test_photograph_that_was_shrunk_is_rescaled_also_if_it_was_turned(
     tmp_path: Path, size: tuple[int, int], scale: int
 ) -> None:
@@ -86,7 +93,10 @@ def tags(size: tuple[int, int], **values: Any) -> CameraTags:
     (tags((4368, 2912)), 35.8, 6100.6, False),
 ])  # fmt: skip
 def test_statements_that_contradict_each_other(
-    given: CameraTags, sensor_mm: float | None, focal_px: float | None, is_rescaled: bool
+    given: CameraTags,
+    sensor_mm: float | None,
+    focal_px: float | None,
+    is_rescaled: bool,
 ) -> None:
     found = exif_focal(given, sensor_mm)
     if focal_px is None:
@@ -104,7 +114,9 @@ def test_damaged_headers_never_raise(tmp_path: Path, num_bytes: int) -> None:
     content = path.read_bytes()
     path.write_bytes(content[:num_bytes])
     read_camera_tags(path)
-    path.write_bytes(content[:num_bytes] + b"\xee\x00\xff" * 5 + content[num_bytes + 15 :])
+    path.write_bytes(
+        content[:num_bytes] + b"\xee\x00\xff" * 5 + content[num_bytes + 15 :]
+    )
     found = read_camera_tags(path)
     if found:
         exif_focal(found)
@@ -113,9 +125,16 @@ def test_damaged_headers_never_raise(tmp_path: Path, num_bytes: int) -> None:
 ORIGINAL = {"ExifImageWidth": 4368, "ExifImageHeight": 2912}
 
 
-def test_exif_of_a_crop_tells_the_focal_length_of_the_whole_photograph(tmp_path: Path) -> None:
-    found = exif_focal(tags_of(tmp_path / "a.jpg", (1092, 600), {**LENS_50, **ORIGINAL}))
-    assert (found.focal_px, found.uncropped_px) == (None, pytest.approx(50 / 35.8 * 4368))
+def test_exif_of_a_crop_tells_the_focal_length_of_the_whole_photograph(
+    tmp_path: Path,
+) -> None:
+    found = exif_focal(
+        tags_of(tmp_path / "a.jpg", (1092, 600), {**LENS_50, **ORIGINAL})
+    )
+    assert (found.focal_px, found.uncropped_px) == (
+        None,
+        pytest.approx(50 / 35.8 * 4368),
+    )
     equivalent = {**BODY, "FocalLengthIn35mmFilm": 50, **ORIGINAL}
     found = exif_focal(tags_of(tmp_path / "b.jpg", (1092, 600), equivalent))
     assert found.uncropped_px == pytest.approx(50 / 43.27 * math.hypot(4368, 2912))
@@ -127,6 +146,9 @@ def test_a_photograph_that_kept_its_shape_is_no_shrunk_one_where_others_are_crop
     tags = tags_of(tmp_path / "a.jpg", (1092, 728), {**LENS_50, **ORIGINAL})
     assert exif_focal(tags).focal_px == pytest.approx(50 / 35.8 * 1092)
     found = exif_focal(tags, has_crops=True)
-    assert (found.focal_px, found.uncropped_px) == (None, pytest.approx(50 / 35.8 * 4368))
+    assert (found.focal_px, found.uncropped_px) == (
+        None,
+        pytest.approx(50 / 35.8 * 4368),
+    )
     whole = tags_of(tmp_path / "b.jpg", (4368, 2912), {**LENS_50, **ORIGINAL})
     assert exif_focal(whole, has_crops=True) == exif_focal(whole)

@@ -45,12 +45,16 @@ def test_large_pictures_have_the_same_segments_as_small_ones() -> None:
     assert len(small_segments) == len(large_segments)
     order = np.lexsort(small_segments.middles.round(1).T)
     other = np.lexsort(large_segments.middles.round(1).T)
-    assert_allclose(small_segments.middles[order], large_segments.middles[other], atol=1.5 / 600.0)
+    assert_allclose(
+        small_segments.middles[order], large_segments.middles[other], atol=1.5 / 600.0
+    )
 
 
 def test_frames_at_the_border_are_left_out_and_lines_that_only_end_there_stay() -> None:
     image = np.full((400, 600), 235, np.uint8)
-    cv2.rectangle(image, (6, 6), (593, 393), 20, 2)  # a print's frame, 1 % of the size inside
+    cv2.rectangle(
+        image, (6, 6), (593, 393), 20, 2
+    )  # a print's frame, 1 % of the size inside
     cv2.line(image, (10, 60), (590, 340), 20, 3)
     segments = segments_of(image)
     assert len(segments) >= 2

@@ -21,7 +21,9 @@ AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 NAMES = ("a.jpg", "b.png", "side/c.tif", "d.bmp")
 
 
-def write_turned(path: Path, seed: int, number: int = 6, *, has_exif: bool = True) -> None:
+def write_turned(
+    path: Path, seed: int, number: int = 6, *, has_exif: bool = True
+) -> None:
     """Write a photograph that says it lies on its side; what cannot say so is upright."""
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
@@ -37,7 +39,9 @@ def write_turned(path: Path, seed: int, number: int = 6, *, has_exif: bool = Tru
 @pytest.mark.parametrize("form", ["undistorted", "nerfstudio"])
 def test_exported_pictures_stand_upright(tmp_path: Path, form: str) -> None:
     model = write_model(tmp_path / "model")
-    for seed, (number, name) in enumerate(zip(sorted(model.images), NAMES, strict=True)):
+    for seed, (number, name) in enumerate(
+        zip(sorted(model.images), NAMES, strict=True)
+    ):
         model.images[number].name = name
         write_turned(tmp_path / "photos" / name, seed)
     model.write(tmp_path / "model")
@@ -56,7 +60,9 @@ def test_exported_pictures_stand_upright(tmp_path: Path, form: str) -> None:
 
 @pytest.mark.parametrize("number", range(2, 9))
 @pytest.mark.parametrize("name", ["a.jpg", "b.png", "c.tif"])
-def test_only_what_says_how_it_lies_is_changed(tmp_path: Path, name: str, number: int) -> None:
+def test_only_what_says_how_it_lies_is_changed(
+    tmp_path: Path, name: str, number: int
+) -> None:
     path = tmp_path / name
     write_turned(path, 1, number)
     before = cv2.imread(str(path), AS_STORED)
@@ -76,7 +82,9 @@ def test_only_what_says_how_it_lies_is_changed(tmp_path: Path, name: str, number
 def test_xmp_alone_is_changed_too(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     write_turned(path, 1, has_exif=False)
-    said = re.compile(rb"tiff:Orientation\D+(\d)")  # old versions of Pillow do not look there
+    said = re.compile(
+        rb"tiff:Orientation\D+(\d)"
+    )  # old versions of Pillow do not look there
     assert said.findall(path.read_bytes()) == [b"8"]
     forget_orientation(path)
     assert said.findall(path.read_bytes()) == [b"1"]

@@ -19,7 +19,12 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError, OptionError
-from colmap_affrect.images.photographs import MaskOptions, Photographs, left_out, list_images
+from colmap_affrect.images.photographs import (
+    MaskOptions,
+    Photographs,
+    left_out,
+    list_images,
+)
 from colmap_affrect.images.reading import read_mask, shrink_mask
 from colmap_affrect.project.stores import FeatureStore
 
@@ -61,7 +66,9 @@ def test_shrunk_mask_keeps_its_place() -> None:
 @pytest.mark.parametrize("white", [1, 255])
 def test_only_black_is_left_out(tmp_path: Path, white: int) -> None:
     write_mask(tmp_path / "m.png", diagonal_mask((40, 90)), white)
-    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), diagonal_mask((40, 90)))
+    np.testing.assert_array_equal(
+        read_mask(tmp_path / "m.png"), diagonal_mask((40, 90))
+    )
 
 
 @pytest.mark.parametrize("mask_name", ["wing/a b.jpg.png", "wing/a b.png"])
@@ -72,9 +79,9 @@ def test_masks_are_found_as_colmap_finds_them(tmp_path: Path, mask_name: str) ->
     write_image(tmp_path / "images/wing/a b.jpg", image)
     mask = diagonal_mask((200, 160))
     write_mask(tmp_path / "masks" / mask_name, mask)
-    found = Photographs(tmp_path / "images", MaskOptions(path=str(tmp_path / "masks"))).mask(
-        "wing/a b.jpg"
-    )
+    found = Photographs(
+        tmp_path / "images", MaskOptions(path=str(tmp_path / "masks"))
+    ).mask("wing/a b.jpg")
     np.testing.assert_array_equal(found, mask)
     pycolmap.extract_features(
         tmp_path / "colmap.db",
@@ -92,11 +99,15 @@ def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
     other = diagonal_mask((60, 50))[:, ::-1]
     write_mask(tmp_path / "masks" / "x.png", one)
     write_mask(tmp_path / "camera.png", other)
-    masks = MaskOptions(path=str(tmp_path / "masks"), camera_path=str(tmp_path / "camera.png"))
+    masks = MaskOptions(
+        path=str(tmp_path / "masks"), camera_path=str(tmp_path / "camera.png")
+    )
     both = Photographs(tmp_path, masks).mask("x.jpg")
     np.testing.assert_array_equal(both, one & other)
     write_mask(tmp_path / "camera.png", other[:40])
-    with pytest.raises(ImageError, match=r"60 x 50 px and its mask 60 x 40 px .*camera\.png"):
+    with pytest.raises(
+        ImageError, match=r"60 x 50 px and its mask 60 x 40 px .*camera\.png"
+    ):
         Photographs(tmp_path, masks).mask("x.jpg")
 
 
@@ -119,7 +130,9 @@ def test_image_with_a_wrong_mask_is_reported_and_the_others_go_on(
     write_mask(tmp_path / "masks/good.png", np.ones((70, 90), bool))
     prepare_mask(tmp_path / "masks/a b.png.png")
     arguments = ["--image-path", photo_path.parent, "--output-path", tmp_path / "out"]
-    code = main(["extract", *map(str, arguments), "--mask-path", str(tmp_path / "masks"), "-q"])
+    code = main(
+        ["extract", *map(str, arguments), "--mask-path", str(tmp_path / "masks"), "-q"]
+    )
     assert code == 1
     assert "could not read 1 of the images: a b.png" in capfd.readouterr().err
     store = FeatureStore(tmp_path / "out" / "features.h5")
@@ -132,7 +145,13 @@ def test_photographs_without_a_mask_are_used_whole_and_named(
     photo_path: Path, tmp_path: Path, call: Call
 ) -> None:
     write_image(photo_path.with_name("good.png"), texture((90, 70), 1))
-    arguments = ["extract", "--image-path", photo_path.parent, "--output-path", tmp_path / "out"]
+    arguments = [
+        "extract",
+        "--image-path",
+        photo_path.parent,
+        "--output-path",
+        tmp_path / "out",
+    ]
     arguments += ["--mask-path", tmp_path / "masks"]
     write_mask(tmp_path / "masks" / "other.png", np.zeros((70, 90), bool))
     done = call(*arguments)
@@ -141,7 +160,10 @@ def test_photographs_without_a_mask_are_used_whole_and_named(
     write_mask(tmp_path / "masks" / "good.png", np.zeros((70, 90), bool))
     done = call(*arguments)
     assert done.code == 0
-    assert "WARNING: masks: 1 images have none and are used whole, as a b.png is" in done.stderr
+    assert (
+        "WARNING: masks: 1 images have none and are used whole, as a b.png is"
+        in done.stderr
+    )
     store = FeatureStore(tmp_path / "out" / "features.h5")
     assert len(store.read("a b.png")) > 100
     assert len(store.read("good.png")) == 0
@@ -173,10 +195,14 @@ def test_gps_position_and_focal_length_of_exif_are_taken_over(tmp_path: Path) ->
             (camera,) = database.read_all_cameras()
             assert camera.has_prior_focal_length
             # 35 mm film has a diagonal of 43.27 mm.
-            assert camera.focal_length == pytest.approx(50 / 43.27 * np.hypot(240, 160), rel=1e-3)
+            assert camera.focal_length == pytest.approx(
+                50 / 43.27 * np.hypot(240, 160), rel=1e-3
+            )
 
 
-def test_list_images_finds_images_in_folders_and_passes_over_the_rest(tmp_path: Path) -> None:
+def test_list_images_finds_images_in_folders_and_passes_over_the_rest(
+    tmp_path: Path,
+) -> None:
     taken = ["a b.png", "deep/er/č.tif", "folder.png/inside.bmp", "z.JPG"]
     touch(tmp_path, *taken, ".hidden.png", ".git/x.png", "notes.txt", "a.webp")
     assert list_images(tmp_path) == taken
@@ -191,7 +217,9 @@ def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", ["d.png", "../photos/a.png", ""])
-def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: str) -> None:
+def test_list_images_refuses_a_list_of_what_is_not_there(
+    tmp_path: Path, line: str
+) -> None:
     folder = tmp_path / "photos"
     touch(folder, "a.png")
     listed = tmp_path / "list.txt"
@@ -204,10 +232,14 @@ def test_videos_are_named_with_what_to_do(photo_path: Path) -> None:
     touch(photo_path.parent, "film.MP4", "side.mov")
     found = left_out(photo_path.parent)
     assert set(found) == {"*.mp4", "*.mov"}
-    assert found["*.mp4"].startswith("1 left out, such as film.MP4: it is a video; take")
+    assert found["*.mp4"].startswith(
+        "1 left out, such as film.MP4: it is a video; take"
+    )
 
 
-def test_linked_folders_are_followed_and_each_folder_is_taken_once(tmp_path: Path) -> None:
+def test_linked_folders_are_followed_and_each_folder_is_taken_once(
+    tmp_path: Path,
+) -> None:
     photos = tmp_path / "photos"
     other = tmp_path / "other"
     touch(photos, "a.png", "side/b.png")
@@ -219,14 +251,26 @@ def test_linked_folders_are_followed_and_each_folder_is_taken_once(tmp_path: Pat
     (photos / "side" / "round").symlink_to(photos)
     (other / "back").symlink_to(photos)
     (photos / "gone").symlink_to(tmp_path / "nowhere")
-    assert list_images(photos) == ["a.png", "linked/c.png", "linked/deep/d.png", "side/b.png"]
+    assert list_images(photos) == [
+        "a.png",
+        "linked/c.png",
+        "linked/deep/d.png",
+        "side/b.png",
+    ]
     (note,) = left_out(photos).items()
     assert "0 side again/" in note[0]
-    assert note[1].startswith("left out: a link to a folder that is looked through anyway")
+    assert note[1].startswith(
+        "left out: a link to a folder that is looked through anyway"
+    )
 
 
 def test_folders_of_systems_are_left_out_and_named(tmp_path: Path) -> None:
-    touch(tmp_path, "a.jpg", "@eaDir/a.jpg/SYNOPHOTO_THUMB_XL.jpg", "in/@eaDir/b.jpg/x.jpg")
+    touch(
+        tmp_path,
+        "a.jpg",
+        "@eaDir/a.jpg/SYNOPHOTO_THUMB_XL.jpg",
+        "in/@eaDir/b.jpg/x.jpg",
+    )
     touch(tmp_path, "#recycle/old.jpg")
     assert list_images(tmp_path) == ["a.jpg"]
     found = left_out(tmp_path)
@@ -250,7 +294,9 @@ def test_the_alpha_channel_is_the_mask_where_there_is_no_file_of_one(
 ) -> None:
     mask = diagonal_mask((120, 90))
     write_transparent(tmp_path / "photos" / name, mask, mode)
-    photographs = Photographs(tmp_path / "photos", MaskOptions(path=str(tmp_path / "masks")))
+    photographs = Photographs(
+        tmp_path / "photos", MaskOptions(path=str(tmp_path / "masks"))
+    )
     np.testing.assert_array_equal(photographs.mask(name), mask)
     write_mask(tmp_path / "masks" / "a.png", ~mask)
     np.testing.assert_array_equal(photographs.mask(name), ~mask)
@@ -270,7 +316,9 @@ def test_masks_that_are_white_all_over_are_named_in_one_line(
     done = call("extract", *arguments, "--output-path", tmp_path / "out")
     assert done.code == 0
     (line,) = [line for line in done.stderr if "white" in line]
-    assert line.startswith("WARNING: white masks: 1 masks are white all over, such as that of a b")
+    assert line.startswith(
+        "WARNING: white masks: 1 masks are white all over, such as that of a b"
+    )
 
 
 @pytest.mark.parametrize("place", ["photos", "photos/masks"])
@@ -284,4 +332,6 @@ def test_masks_that_are_photographs_are_refused(tmp_path: Path, place: str) -> N
         with pytest.raises(OptionError, match="is one of the photographs in"):
             Photographs(tmp_path / "photos", masks).without_mask(names)
     beside = MaskOptions(path=str(tmp_path / "photos" / "masks"))
-    assert Photographs(tmp_path / "photos", beside).without_mask(["a.png", "b.jpg"]) == ["b.jpg"]
+    assert Photographs(tmp_path / "photos", beside).without_mask(
+        ["a.png", "b.jpg"]
+    ) == ["b.jpg"]

@@ -49,7 +49,9 @@ def test_read_gray_weighs_colours_as_itu_601(tmp_path: Path, suffix: str) -> Non
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_read_gray_scales_sixteen_bits_to_eight(tmp_path: Path, suffix: str) -> None:
-    values = np.array([[0, 257, 128 * 257, 65535], [256, 1000, 30000, 65000]], np.uint16)
+    values = np.array(
+        [[0, 257, 128 * 257, 65535], [256, 1000, 30000, 65000]], np.uint16
+    )
     read = read_gray(write_image(tmp_path / f"deep{suffix}", values))
     assert read.dtype == np.uint8
     assert read.tolist() == [[0, 1, 128, 255], [0, 3, 116, 252]]
@@ -62,7 +64,9 @@ def test_read_gray_reads_floats_from_zero_to_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", None])
-def test_read_gray_names_the_file_that_is_no_image(tmp_path: Path, content: bytes | None) -> None:
+def test_read_gray_names_the_file_that_is_no_image(
+    tmp_path: Path, content: bytes | None
+) -> None:
     path = tmp_path / "broken name.jpg"
     if content is not None:
         path.write_bytes(content)
@@ -97,7 +101,9 @@ def test_low_contrast_is_stretched_alike_in_gray_and_colour(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("value_range", [(40, 220), (100, 108)])
-def test_tones_stay_where_contrast_is_good_or_nothing_is_seen(value_range: tuple[int, int]) -> None:
+def test_tones_stay_where_contrast_is_good_or_nothing_is_seen(
+    value_range: tuple[int, int],
+) -> None:
     image = np.tile(np.linspace(*value_range, 100), (50, 1)).astype(np.uint8)
     assert tones(image) is None
 
@@ -122,7 +128,9 @@ def test_header_and_pixels_are_those_that_are_stored(
     assert_allclose(read_color(path, 50)[:, :, 1], values, atol=40)
 
 
-def test_size_of_a_photograph_of_four_hundred_megapixels_is_known(tmp_path: Path) -> None:
+def test_size_of_a_photograph_of_four_hundred_megapixels_is_known(
+    tmp_path: Path,
+) -> None:
     """Pillow opens no more than 179 megapixels; cameras that shift their sensor have more."""
     path = tmp_path / "a.png"
     path.write_bytes(png_of_size(23_200, 17_400))
@@ -140,7 +148,9 @@ def test_threads_that_read_headers_leave_filters_of_warnings(tmp_path: Path) -> 
     assert warnings.filters == before
 
 
-@pytest.mark.parametrize(("low", "high"), [(0.0, 255.0), (-1.0, 1.0), (-9.0, -5.0), (0.0, 1e6)])
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 255.0), (-1.0, 1.0), (-9.0, -5.0), (0.0, 1e6)]
+)
 def test_floats_of_any_range_are_seen(tmp_path: Path, low: float, high: float) -> None:
     ramp = np.linspace(low, high, 4000, dtype=np.float32).reshape(50, 80)
     path = write_image(tmp_path / "x.tif", ramp)
@@ -150,7 +160,9 @@ def test_floats_of_any_range_are_seen(tmp_path: Path, low: float, high: float) -
     assert_allclose(read_color(path, 80)[:, :, 0].astype(float), expected, atol=40)
 
 
-@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="only Linux has such a file")
+@pytest.mark.skipif(
+    not Path("/proc/self/mem").exists(), reason="only Linux has such a file"
+)
 def test_a_file_whose_content_cannot_be_read_is_an_image_that_cannot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,7 +175,9 @@ def test_a_file_whose_content_cannot_be_read_is_an_image_that_cannot(
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr("colmap_affrect.images.reading.open_regular", fail)
-    with pytest.raises(ImageError, match=r"y\.jpg: cannot be read \(Input/output error\)"):
+    with pytest.raises(
+        ImageError, match=r"y\.jpg: cannot be read \(Input/output error\)"
+    ):
         decode(tmp_path / "y.jpg")
 
 
@@ -188,10 +202,14 @@ def test_white_of_pnm_is_any_number(tmp_path: Path, kind: int, white: int) -> No
 def test_numbers_that_are_no_tones_stay(tmp_path: Path) -> None:
     path = tmp_path / "depth.pgm"
     path.write_bytes(b"P5 2 1 5000\n" + np.array([1200, 5000], ">u2").tobytes())
-    assert decode(path, cv2.IMREAD_UNCHANGED, keeps_numbers=True).tolist() == [[1200, 5000]]
+    assert decode(path, cv2.IMREAD_UNCHANGED, keeps_numbers=True).tolist() == [
+        [1200, 5000]
+    ]
 
 
-@pytest.mark.parametrize("header", [b"P5 2 2 0\n", b"P5 2 2 70000\n", b"P4 16 2\n", b"P5 2 2"])
+@pytest.mark.parametrize(
+    "header", [b"P5 2 2 0\n", b"P5 2 2 70000\n", b"P4 16 2\n", b"P5 2 2"]
+)
 def test_header_without_a_possible_white_changes_nothing(header: bytes) -> None:
     assert pnm_header(np.frombuffer(header + bytes(8), np.uint8)) is None
 
@@ -212,4 +230,7 @@ def test_limit_of_the_environment_is_named(tmp_path: Path) -> None:
         text=True,
         check=True,
     )
-    assert "is larger than OpenCV may read here, by OPENCV_IO_MAX_IMAGE_PIXELS=100" in done.stdout
+    assert (
+        "is larger than OpenCV may read here, by OPENCV_IO_MAX_IMAGE_PIXELS=100"
+        in done.stdout
+    )

@@ -14,7 +14,12 @@ from strategies import IMAGE_SIZE, Array, homographies, tilt_angles
 from synthetic import texture
 
 from colmap_affrect.data import GrayImage, Rectification
-from colmap_affrect.geometry.affine import fit_canvas, image_corners, project, rectifying_affine
+from colmap_affrect.geometry.affine import (
+    fit_canvas,
+    image_corners,
+    project,
+    rectifying_affine,
+)
 from colmap_affrect.images.warping import halved, warp, warp_mask
 
 RAMP_ERROR_PX = 0.05
@@ -44,7 +49,9 @@ def rectification(tilt: float, angle_rad: float) -> Rectification:
 def canvas_points(plan: Rectification) -> Array:
     """(H, W, 2) pixel-centre coordinates of all pixels of the canvas."""
     width, height = plan.canvas_size
-    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(
+        float
+    )
 
 
 def coordinate_ramp(size: tuple[int, int], axis: int) -> tuple[GrayImage, float]:
@@ -81,7 +88,10 @@ def test_warp_of_a_coordinate_ramp_shows_image_from_rectified(
     aligned = abs(np.sin(2 * angle_rad)) < 0.1
     assert np.abs(errors).max() < (ALIGNED_RAMP_ERROR_PX if aligned else RAMP_ERROR_PX)
     # Single pixels: the dither, and the rounding of input, intermediate result and output.
-    assert np.abs(values.ravel()[inside] - sources[inside, axis]).max() < (DITHER + 1.5) / slope
+    assert (
+        np.abs(values.ravel()[inside] - sources[inside, axis]).max()
+        < (DITHER + 1.5) / slope
+    )
 
 
 def grating(direction: Array, period_px: float) -> GrayImage:
@@ -113,7 +123,9 @@ def test_warp_suppresses_what_the_compressed_axis_cannot_show(
     assert amplitude(coarse, plan) > 80.0
 
 
-def perspective(homography: Array, scale: float, size: tuple[int, int]) -> Rectification:
+def perspective(
+    homography: Array, scale: float, size: tuple[int, int]
+) -> Rectification:
     """Warp of a whole image of (width, height) by a scaled homography."""
     corners = project(homography, image_corners(size))
     matrix, canvas = fit_canvas(scale * np.eye(2), corners, margin_px=4.0)
@@ -174,7 +186,9 @@ def test_warp_by_a_homography_of_a_coordinate_ramp_shows_image_from_rectified(
 
 
 @pytest.mark.parametrize("is_affine", [True, False])
-def test_warp_mask_marks_the_pixels_whose_source_is_in_the_region(is_affine: bool) -> None:
+def test_warp_mask_marks_the_pixels_whose_source_is_in_the_region(
+    is_affine: bool,
+) -> None:
     region = np.zeros((45, 90), bool)
     region[5:, 10:] = True
     bent = perspective(turned_camera(35.0, 120.0, SIZE), 1.6, SIZE)
@@ -204,7 +218,9 @@ def test_warp_mask_is_zero_behind_the_camera() -> None:
     points = canvas_points(plan).reshape(-1, 2)
     third = points @ plan.image_from_rectified[2, :2] + plan.image_from_rectified[2, 2]
     sources = project(plan.image_from_rectified, points)
-    mirrored = (third < 0) & ((sources > 0) & (sources < np.array(SIZE) - 1)).all(axis=1)
+    mirrored = (third < 0) & ((sources > 0) & (sources < np.array(SIZE) - 1)).all(
+        axis=1
+    )
     assert mirrored.any(), "the canvas of this test shows no mirror image"
     mask = warp_mask(plan, SIZE).ravel()
     assert (mask[third <= 0] == 0).all()

@@ -38,7 +38,11 @@ def true_centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
 def marks(model: pycolmap.Reconstruction) -> list[str]:
     """Rows of three control points, each marked in two photographs of its own choice."""
     rows = ["point,image,px,py,x,y,z"]
-    for name, point_id, pair in (("p", 1, (0, 1)), ("q", 20, (1, 2)), ("r", 40, (3, 0))):
+    for name, point_id, pair in (
+        ("p", 1, (0, 1)),
+        ("q", 20, (1, 2)),
+        ("r", 40, (3, 0)),
+    ):
         place = model.points3D[point_id].xyz
         true = ",".join(map(str, TRUE_FROM_OLD * place))
         for index, cells in zip(pair, (true, ",,"), strict=True):
@@ -95,7 +99,9 @@ def test_positions_of_a_database_are_taken_from_its_priors(tmp_path: Path) -> No
                 )
             )
     reference = Reference(gps_database=tmp_path / "gps.db")
-    assert align(tmp_path / "model", tmp_path / "new", reference).scale == pytest.approx(2.5)
+    assert align(
+        tmp_path / "model", tmp_path / "new", reference
+    ).scale == pytest.approx(2.5)
 
 
 WRONG = {
@@ -150,13 +156,18 @@ def test_positions_that_are_wrong_are_left_out_and_named(
 ) -> None:
     places = ring(tmp_path / "model")
     wrong = dict(zip(places, kinds, strict=False))
-    write_gps(tmp_path / "gps.db", places | {name: WRONG[kind] for name, kind in wrong.items()})
+    write_gps(
+        tmp_path / "gps.db",
+        places | {name: WRONG[kind] for name, kind in wrong.items()},
+    )
     given = ["--model-path", tmp_path / "model", "--output-path", tmp_path / "new"]
     done = call("align", *given, "--gps", tmp_path / "gps.db")
     assert (done.code, done.stderr) == (0, [])
     lines = done.stdout.splitlines()
     assert float(lines[0].split()[1]) == pytest.approx(50.0, rel=0.1)
-    left_out = {line.split()[2].rstrip(":") for line in lines if line.startswith("left out")}
+    left_out = {
+        line.split()[2].rstrip(":") for line in lines if line.startswith("left out")
+    }
     assert left_out == wrong.keys()
     new = centers(pycolmap.Reconstruction(tmp_path / "new"))
     assert max(np.linalg.norm(center) for center in new.values()) < 300
@@ -171,7 +182,11 @@ def test_honest_positions_all_count(count: int) -> None:
         after = before * 3.0 + rng.normal(0.0, 3.0, (count, 3))
         assert agreeing(before, after, 10.0).all()
         after[1] = [1e6, 0.0, 0.0]
-        assert agreeing(before, after, 10.0).tolist() == [True, False, *[True] * (count - 2)]
+        assert agreeing(before, after, 10.0).tolist() == [
+            True,
+            False,
+            *[True] * (count - 2),
+        ]
 
 
 def test_distances_of_photographs_and_marked_points_give_the_scale(
@@ -216,11 +231,15 @@ def test_positions_that_leave_the_model_open_are_refused(
 
 
 @pytest.mark.parametrize("cells", ["164,5", "5,-4", "1e308,5", "nan,5"])
-def test_marks_outside_of_their_photograph_are_refused(tmp_path: Path, cells: str) -> None:
+def test_marks_outside_of_their_photograph_are_refused(
+    tmp_path: Path, cells: str
+) -> None:
     write_model(tmp_path / "model")
     table = tmp_path / "points.csv"
     table.write_text(f"point,image,px,py,x,y,z\np,a.png,{cells},1,2,3\n")
-    with pytest.raises(OptionError, match=r"line 2: (.* is outside of a\.png|px is not finite)"):
+    with pytest.raises(
+        OptionError, match=r"line 2: (.* is outside of a\.png|px is not finite)"
+    ):
         align(tmp_path / "model", tmp_path / "new", Reference(points_path=table))
 
 
@@ -236,7 +255,9 @@ def test_nothing_is_overwritten_and_no_model_is_said(tmp_path: Path) -> None:
         align(tmp_path / "model", tmp_path / "new", wrong)
 
 
-def test_names_may_begin_with_a_hyphen_and_hold_commas(tmp_path: Path, call: Call) -> None:
+def test_names_may_begin_with_a_hyphen_and_hold_commas(
+    tmp_path: Path, call: Call
+) -> None:
     model = write_model(tmp_path / "model")
     model.find_image_with_name("a.png").name = "-rf.png"
     model.find_image_with_name("b.png").name = "b,c.png"
@@ -247,4 +268,7 @@ def test_names_may_begin_with_a_hyphen_and_hold_commas(tmp_path: Path, call: Cal
         assert (done.code, done.stderr) == (0, [])
     refused = call(*known, tmp_path / "new", "--distance", "-rf.png,b,c.png,2")
     assert refused.code == 2
-    assert "give A,B,METRES, a name that holds a comma in double quotes" in refused.errors[0]
+    assert (
+        "give A,B,METRES, a name that holds a comma in double quotes"
+        in refused.errors[0]
+    )

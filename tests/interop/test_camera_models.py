@@ -28,12 +28,22 @@ def camera_of(name: str, *params: float) -> pycolmap.Camera:
         (camera_of("SIMPLE_RADIAL", 500, 310, 250, 0.07), "RADIAL", 1e-4),
         (camera_of("SIMPLE_RADIAL", 500, 310, 250, -0.1), "FULL_OPENCV", 1e-4),
         (camera_of("PINHOLE", 500, 520, 310, 250), "OPENCV", 1e-4),
-        (camera_of("OPENCV_FISHEYE", 300, 301, 320, 240, 0.01, 0, 0, 0), "RADIAL_FISHEYE", 1.0),
+        (
+            camera_of("OPENCV_FISHEYE", 300, 301, 320, 240, 0.01, 0, 0, 0),
+            "RADIAL_FISHEYE",
+            1.0,
+        ),
     ],
 )
-def test_fitted_camera_does_the_same(camera: pycolmap.Camera, name: str, most_px: float) -> None:
+def test_fitted_camera_does_the_same(
+    camera: pycolmap.Camera, name: str, most_px: float
+) -> None:
     fitted, difference_px = fitted_camera(camera, name)
-    assert (fitted.model_name, fitted.camera_id, fitted.width, fitted.height) == (name, 3, *SIZE)
+    assert (fitted.model_name, fitted.camera_id, fitted.width, fitted.height) == (
+        name,
+        3,
+        *SIZE,
+    )
     assert difference_px < most_px
     random = np.random.default_rng(0)
     pixels = random.uniform((0, 0), SIZE, (50, 2))
@@ -57,7 +67,11 @@ def test_exported_text_has_the_camera_model_and_the_same_points(tmp_path: Path) 
     notes: list[str] = []
     before = pycolmap.Reconstruction(tmp_path / "model")
     written = export(
-        tmp_path / "model", tmp_path / "out", ["text"], camera_model="RADIAL", note=notes.append
+        tmp_path / "model",
+        tmp_path / "out",
+        ["text"],
+        camera_model="RADIAL",
+        note=notes.append,
     )
     after = pycolmap.Reconstruction(written["text"])
     assert {camera.model_name for camera in after.cameras.values()} == {"RADIAL"}
@@ -65,7 +79,10 @@ def test_exported_text_has_the_camera_model_and_the_same_points(tmp_path: Path) 
     (note,) = notes
     assert note.startswith("cameras: RADIAL in the place of ")
     assert note.endswith(" px apart")
-    assert after.compute_mean_reprojection_error() == before.compute_mean_reprojection_error()
+    assert (
+        after.compute_mean_reprojection_error()
+        == before.compute_mean_reprojection_error()
+    )
 
 
 @pytest.mark.parametrize(

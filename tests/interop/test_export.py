@@ -26,7 +26,9 @@ def model(tmp_path: Path) -> pycolmap.Reconstruction:
     return write_model(tmp_path / "model")
 
 
-def projected(model: pycolmap.Reconstruction, name: str, point: np.ndarray) -> np.ndarray:
+def projected(
+    model: pycolmap.Reconstruction, name: str, point: np.ndarray
+) -> np.ndarray:
     image = model.find_image_with_name(name)
     return model.cameras[image.camera_id].img_from_cam(image.cam_from_world() * point)
 
@@ -42,10 +44,14 @@ def test_points_and_text_hold_the_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("model")
-def test_transforms_are_of_cameras_that_look_along_minus_z_with_y_up(tmp_path: Path) -> None:
+def test_transforms_are_of_cameras_that_look_along_minus_z_with_y_up(
+    tmp_path: Path,
+) -> None:
     write_photographs(tmp_path / "photos")
     formats = ["undistorted", "nerfstudio"]
-    written = export(tmp_path / "model", tmp_path / "out", formats, image_path=tmp_path / "photos")
+    written = export(
+        tmp_path / "model", tmp_path / "out", formats, image_path=tmp_path / "photos"
+    )
     dense = written["undistorted"]
     flat = pycolmap.Reconstruction(dense / "sparse")
     content = json.loads(written["nerfstudio"].read_text())
@@ -75,8 +81,12 @@ def test_table_has_harmless_cells(tmp_path: Path) -> None:
     model.add_camera_with_trivial_rig(
         pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 160, 120)
     )
-    east = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float)  # right is south, down is down
-    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(east), -east @ np.array([1000.0, 20.0, 5.0]))
+    east = np.array(
+        [[0, -1, 0], [0, 0, -1], [1, 0, 0]], float
+    )  # right is south, down is down
+    pose = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(east), -east @ np.array([1000.0, 20.0, 5.0])
+    )
     image = pycolmap.Image(name="=1+1.png", camera_id=1, image_id=1)
     model.add_image_with_trivial_frame(image, pose)
     (tmp_path / "model").mkdir()
@@ -92,8 +102,12 @@ def test_table_has_harmless_cells(tmp_path: Path) -> None:
     }
     center = np.array([values[key] for key in "xyz"])
     np.testing.assert_allclose(center, [1000.0, 20.0, 5.0])
-    turned = pycolmap.Rotation3d(np.array([values[f"q{key}"] for key in "xyzw"]))  # world_from_cam
-    np.testing.assert_allclose(turned * np.array([0.0, 0.0, 1.0]), [1.0, 0.0, 0.0], atol=1e-12)
+    turned = pycolmap.Rotation3d(
+        np.array([values[f"q{key}"] for key in "xyzw"])
+    )  # world_from_cam
+    np.testing.assert_allclose(
+        turned * np.array([0.0, 0.0, 1.0]), [1.0, 0.0, 0.0], atol=1e-12
+    )
     seen = np.array([5.0, 6.0, 7.0])  # in the camera: right, down, forward
     np.testing.assert_allclose(turned * seen + center, [1007.0, 15.0, -1.0])
 
@@ -107,7 +121,10 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     with pytest.raises(ImageError, match=r"a\.png: no such photograph"):
         export(
-            tmp_path / "model", tmp_path / "out", ["undistorted"], image_path=tmp_path / "photos"
+            tmp_path / "model",
+            tmp_path / "out",
+            ["undistorted"],
+            image_path=tmp_path / "photos",
         )
     export(tmp_path / "model", tmp_path / "out", ["cameras"])
     with pytest.raises(OptionError, match="exists, and is left as it is"):
@@ -116,9 +133,15 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
 
 def test_command_names_what_it_wrote(tmp_path: Path, call: Call) -> None:
     write_model(tmp_path / "model")
-    done = call("export", "--model-path", tmp_path / "model", "--output-path", tmp_path / "out")
+    done = call(
+        "export", "--model-path", tmp_path / "model", "--output-path", tmp_path / "out"
+    )
     assert (done.code, done.stderr) == (0, [])
-    assert [line.split()[0] for line in done.stdout.splitlines()] == ["ply", "text", "cameras"]
+    assert [line.split()[0] for line in done.stdout.splitlines()] == [
+        "ply",
+        "text",
+        "cameras",
+    ]
     assert all(Path(line.split()[1]).exists() for line in done.stdout.splitlines())
     help_text = call("export", "--help").stdout
     assert all(name in help_text for name in FORMATS)
@@ -135,7 +158,9 @@ def test_native_writers_that_fail_are_one_line_and_leave_nothing(
     for form, method in (("ply", "export_PLY"), ("text", "write_text")):
         with monkeypatch.context() as patch:
             patch.setattr(pycolmap.Reconstruction, method, fail)
-            with pytest.raises(WorkspaceError, match=r"out.*: cannot be written \(\[ply\.cc:382\]"):
+            with pytest.raises(
+                WorkspaceError, match=r"out.*: cannot be written \(\[ply\.cc:382\]"
+            ):
                 export(tmp_path / "model", tmp_path / "out", [form])
         assert not (tmp_path / "out").exists()
 
@@ -154,12 +179,16 @@ def test_undistortion_that_ends_its_process_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_model_that_a_run_is_about_to_replace_is_not_called_damaged(tmp_path: Path) -> None:
+def test_a_model_that_a_run_is_about_to_replace_is_not_called_damaged(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "out" / "sparse").mkdir(parents=True)
     model = tmp_path / "out" / "sparse" / "0"
     with FileLock(tmp_path / "out" / ".lock"):
         for given in (model, tmp_path / "out" / "sparse", tmp_path / "out"):
-            with pytest.raises(WorkspaceError, match="another colmap-affrect is writing this"):
+            with pytest.raises(
+                WorkspaceError, match="another colmap-affrect is writing this"
+            ):
                 export(given, tmp_path / "new", ["ply"])
         write_model(model)
         export(model, tmp_path / "new", ["ply"])
@@ -170,7 +199,9 @@ def test_a_model_that_a_run_is_about_to_replace_is_not_called_damaged(tmp_path: 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
 @pytest.mark.parametrize("name", ["images.bin", "frames.bin", "points3D.txt"])
-def test_pipes_among_the_files_of_a_model_are_refused(tmp_path: Path, name: str) -> None:
+def test_pipes_among_the_files_of_a_model_are_refused(
+    tmp_path: Path, name: str
+) -> None:
     write_model(tmp_path / "model")
     (tmp_path / "model" / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / "model" / name)
@@ -179,10 +210,18 @@ def test_pipes_among_the_files_of_a_model_are_refused(tmp_path: Path, name: str)
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid(), reason="only root mounts disks")
-@pytest.mark.parametrize("limit", ["size=64k", "size=300k", "nr_inodes=4", "nr_inodes=15"])
-@pytest.mark.parametrize("form", ["ply", "text", "undistorted", "nerfstudio", "cameras"])
-def test_small_disks_are_one_line(tmp_path: Path, call: Call, limit: str, form: str) -> None:
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid(), reason="only root mounts disks"
+)
+@pytest.mark.parametrize(
+    "limit", ["size=64k", "size=300k", "nr_inodes=4", "nr_inodes=15"]
+)
+@pytest.mark.parametrize(
+    "form", ["ply", "text", "undistorted", "nerfstudio", "cameras"]
+)
+def test_small_disks_are_one_line(
+    tmp_path: Path, call: Call, limit: str, form: str
+) -> None:
     write_model(tmp_path / "model")
     write_photographs(tmp_path / "photos")
     disk = tmp_path / "disk"
@@ -191,7 +230,12 @@ def test_small_disks_are_one_line(tmp_path: Path, call: Call, limit: str, form: 
     if subprocess.run(mount, capture_output=True, check=False).returncode:
         pytest.skip("no disk can be mounted here")
     try:
-        given = ["--model-path", tmp_path / "model", "--image-path", tmp_path / "photos"]
+        given = [
+            "--model-path",
+            tmp_path / "model",
+            "--image-path",
+            tmp_path / "photos",
+        ]
         done = call("export", *given, "--output-path", disk / "new", "--format", form)
         assert done.code in (0, 1)
         assert len(done.stderr) == done.code
@@ -213,7 +257,9 @@ def test_text_is_refused_where_colmap_could_not_read_the_names(
     model = write_model(tmp_path / "model")
     model.images[1].name = name
     model.write(tmp_path / "model")
-    with pytest.raises(OptionError, match=f"text: COLMAP could not read back the names .*{why}"):
+    with pytest.raises(
+        OptionError, match=f"text: COLMAP could not read back the names .*{why}"
+    ):
         export(tmp_path / "model", tmp_path / "out", ["text", "ply"])
     assert not (tmp_path / "out").exists()
     assert [*export(tmp_path / "model", tmp_path / "out")] == ["ply", "cameras"]
@@ -228,6 +274,9 @@ def test_output_folder_of_a_run_is_taken_for_its_model(tmp_path: Path) -> None:
     (out / "sparse").mkdir()
     (tmp_path / "model").rename(out / "sparse" / "0")
     written = export(
-        out, tmp_path / "new", ["cameras", "undistorted"], image_path=tmp_path / "photos"
+        out,
+        tmp_path / "new",
+        ["cameras", "undistorted"],
+        image_path=tmp_path / "photos",
     )
     assert (written["undistorted"] / "images" / "a.png").exists()

@@ -47,8 +47,15 @@ def test_older_pair_name_that_stands_for_two_pairs_is_refused(tmp_path: Path) ->
     write_photos(tmp_path / "photos", names)
     write_h5(tmp_path / "f.h5", {name: hloc_group(3) for name in names})
     write_h5(tmp_path / "m.h5", {"a.png_a.png_a.png": match_group([0, 1, 2])})
-    with pytest.raises(StoreError, match=r"may stand for a\.png, a\.png_a\.png and a\.png_a\.png"):
-        import_h5(tmp_path / "photos", tmp_path / "f.h5", tmp_path / "m.h5", tmp_path / "new.db")
+    with pytest.raises(
+        StoreError, match=r"may stand for a\.png, a\.png_a\.png and a\.png_a\.png"
+    ):
+        import_h5(
+            tmp_path / "photos",
+            tmp_path / "f.h5",
+            tmp_path / "m.h5",
+            tmp_path / "new.db",
+        )
 
 
 def test_files_of_deep_image_matching_are_read(files: Files) -> None:
@@ -56,7 +63,8 @@ def test_files_of_deep_image_matching_are_read(files: Files) -> None:
         (files.photos / old).unlink()
     group = {"tile_idx": np.zeros(3), "image_size": np.array([48, 64])}  # height, width
     write_h5(
-        files.features, {"a.png": {**hloc_group(3), **group}, "b c.png": {**hloc_group(4), **group}}
+        files.features,
+        {"a.png": {**hloc_group(3), **group}, "b c.png": {**hloc_group(4), **group}},
     )
     write_h5(files.matches, {"a.png": {"b c.png": np.array([[0, 3], [2, 1]])}})
     report = files.import_all()
@@ -85,7 +93,10 @@ def test_lists_of_matches_importer_are_read(files: Files, match_type: str) -> No
     files.matches.write_text(LIST, encoding="utf-8")
     report = files.import_all(match_type=match_type)
     assert (report.num_pairs, report.num_matches) == (2, 3)
-    assert files.pairs() == {PAIR: [[0, 3], [2, 1]], ("sub/č.png", "sub_x/d.png"): [[0, 5]]}
+    assert files.pairs() == {
+        PAIR: [[0, 3], [2, 1]],
+        ("sub/č.png", "sub_x/d.png"): [[0, 5]],
+    }
     with open_database(files.database) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
         geometry = database.read_two_view_geometry(ids[PAIR[0]], ids[PAIR[1]])
@@ -161,26 +172,39 @@ def test_listed_pairs_alone_are_matched(files: Files) -> None:
 
 
 def test_features_without_descriptors_and_matches_are_refused(files: Files) -> None:
-    write_h5(files.features, {"a.png": {"keypoints": [[1.0, 2.0]]}, "sub/b c.png": hloc_group(3)})
+    write_h5(
+        files.features,
+        {"a.png": {"keypoints": [[1.0, 2.0]]}, "sub/b c.png": hloc_group(3)},
+    )
     files.matches = None
     with pytest.raises(StoreError, match=r"no descriptors to match by .*: a\.png$"):
         files.import_all()
     write_h5(files.features, {"a.png": hloc_group(3), "sub/b c.png": hloc_group(3)})
-    write_h5(files.features, {"a.png": {**hloc_group(3), "descriptors": np.zeros((8, 2))}})
-    with pytest.raises(StoreError, match=r"descriptors has shape \(8, 2\), expected \(D, 3\)"):
+    write_h5(
+        files.features, {"a.png": {**hloc_group(3), "descriptors": np.zeros((8, 2))}}
+    )
+    with pytest.raises(
+        StoreError, match=r"descriptors has shape \(8, 2\), expected \(D, 3\)"
+    ):
         files.import_all()
 
 
-def test_descriptors_that_are_not_finite_are_named_with_their_file(files: Files) -> None:
+def test_descriptors_that_are_not_finite_are_named_with_their_file(
+    files: Files,
+) -> None:
     described(files, 64)
     with h5py.File(files.features, "a") as file:
         file["sub/b c.png/descriptors"][0, 0] = np.nan
     files.matches = None
-    with pytest.raises(StoreError, match=r"features\.h5: sub/b c\.png: .* are not finite"):
+    with pytest.raises(
+        StoreError, match=r"features\.h5: sub/b c\.png: .* are not finite"
+    ):
         files.import_all()
 
 
-def arrays_of(order: np.ndarray, things: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def arrays_of(
+    order: np.ndarray, things: np.ndarray, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     random = np.random.default_rng(seed)
     points = random.uniform(0.0, 500.0, (len(order), 2))
     return points, things[order] + 0.01 * random.random((len(order), things.shape[1]))
@@ -190,7 +214,9 @@ def test_arrays_of_two_images_and_of_a_set_are_matched() -> None:
     random = np.random.default_rng(3)
     things = random.gamma(0.4, size=(40, 32))
     orders = {name: random.permutation(40)[:30] for name in "cab"}
-    features = {name: arrays_of(o, things, n) for n, (name, o) in enumerate(orders.items())}
+    features = {
+        name: arrays_of(o, things, n) for n, (name, o) in enumerate(orders.items())
+    }
     found = colmap_affrect.match_feature_sets(features)
     assert set(found) == {("a", "b"), ("a", "c"), ("b", "c")}
     for (first, second), matches in found.items():

@@ -112,7 +112,9 @@ def test_of_pairs_given_twice_one_counts_and_an_image_is_not_matched_with_itself
     assert files.pairs() == {("a.png", "sub/b c.png"): [[0, 1]]}
 
 
-def test_images_without_features_are_imported_and_named_and_not_exported(files: Files) -> None:
+def test_images_without_features_are_imported_and_named_and_not_exported(
+    files: Files,
+) -> None:
     write_h5(files.features, {"a.png": hloc_group(3), "sub/b c.png": hloc_group(0)})
     write_h5(files.matches, {"a.png/sub-b c.png": match_group([-1, -1, -1])})
     report = files.import_all()
@@ -142,7 +144,10 @@ def test_keypoints_of_smaller_pictures_are_noted(files: Files) -> None:
     notes = files.import_all().summary().splitlines()[1:]
     assert len(notes) == 2
     assert "descriptors are not kept" in notes[1]
-    assert "all keypoints in the upper left part, found in smaller pictures perhaps" in notes[0]
+    assert (
+        "all keypoints in the upper left part, found in smaller pictures perhaps"
+        in notes[0]
+    )
 
 
 def change_features(**datasets: Any) -> Callable[[Files], object]:

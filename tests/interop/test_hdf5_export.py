@@ -35,7 +35,9 @@ def targets(tmp_path: Path) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def finished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def finished(
+    photos: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
     """Photographs of the small scene and the output folder of a run."""
     out = tmp_path_factory.mktemp("run") / "out"
     colmap_affrect.run(photos, out, RunOptions(cameras=PINHOLE), page=False)
@@ -84,7 +86,9 @@ def test_files_of_a_run_and_of_its_database_give_the_same_database(
     folder = out
     if source == "database":
         folder = tmp_path
-        exported = export_h5(out / "database.db", folder / "features.h5", folder / "matches.h5")
+        exported = export_h5(
+            out / "database.db", folder / "features.h5", folder / "matches.h5"
+        )
     imported = import_h5(
         photos,
         folder / "features.h5",
@@ -113,7 +117,9 @@ def test_descriptors_of_a_database_become_real_ones(
     database = make_database(tmp_path / "x.db", columns, {})
     bytes128 = np.arange(256, dtype=np.uint8).reshape(2, 128)
     reals = np.linspace(-1, 1, 128).reshape(2, 64).astype(np.float32)
-    sift, aliked = (getattr(pycolmap.FeatureExtractorType, n) for n in ("SIFT", "ALIKED_N32"))
+    sift, aliked = (
+        getattr(pycolmap.FeatureExtractorType, n) for n in ("SIFT", "ALIKED_N32")
+    )
     database.write_descriptors(1, pycolmap.FeatureDescriptors(type=sift, data=bytes128))
     database.write_descriptors(
         2, pycolmap.FeatureDescriptors(type=aliked, data=reals.view(np.uint8))
@@ -126,7 +132,9 @@ def test_descriptors_of_a_database_become_real_ones(
         assert "descriptors" not in file["c.png"]
 
 
-def test_second_match_of_a_keypoint_is_left_out(tmp_path: Path, targets: tuple[Path, Path]) -> None:
+def test_second_match_of_a_keypoint_is_left_out(
+    tmp_path: Path, targets: tuple[Path, Path]
+) -> None:
     columns = {name: points(3) for name in ("a.png", "b.png")}
     pairs = {("a.png", "b.png"): [[1, 2], [0, 1], [1, 0]]}
     make_database(tmp_path / "x.db", columns, pairs).close()
@@ -158,22 +166,30 @@ def test_wrong_database_is_refused_and_no_half_file_stays(
     tmp_path: Path, targets: tuple[Path, Path]
 ) -> None:
     columns = {"a.png": points(2), "b.png": points(2)}
-    make_database(tmp_path / "range.db", columns, {("a.png", "b.png"): [[1, 2]]}).close()
-    with pytest.raises(DatabaseError, match=r"range\.db: pairs with matches of keypoints that do"):
+    make_database(
+        tmp_path / "range.db", columns, {("a.png", "b.png"): [[1, 2]]}
+    ).close()
+    with pytest.raises(
+        DatabaseError, match=r"range\.db: pairs with matches of keypoints that do"
+    ):
         export_h5(tmp_path / "range.db", *targets)
     database = make_database(tmp_path / "rows.db", {"a.png": points(2)}, {})
     data = np.zeros((3, 128), np.uint8)
     sift = pycolmap.FeatureExtractorType.SIFT
     database.write_descriptors(1, pycolmap.FeatureDescriptors(type=sift, data=data))
     database.close()
-    with pytest.raises(DatabaseError, match=r"a\.png has 2 keypoints and 3 descriptors"):
+    with pytest.raises(
+        DatabaseError, match=r"a\.png has 2 keypoints and 3 descriptors"
+    ):
         export_h5(tmp_path / "rows.db", *targets)
     with pytest.raises(OptionError, match="no such file"):
         export_h5(tmp_path / "none.db", *targets)
     assert {path.suffix for path in tmp_path.iterdir()} == {".db"}
 
 
-def test_export_overwrites_nothing(finished: tuple[Path, Path], targets: tuple[Path, Path]) -> None:
+def test_export_overwrites_nothing(
+    finished: tuple[Path, Path], targets: tuple[Path, Path]
+) -> None:
     features, matches = targets
     database = finished[1] / "database.db"
     matches.write_bytes(b"mine")
@@ -213,7 +229,9 @@ def test_full_disk_is_one_line_and_leaves_nothing(
         *map(str, targets),
         str(finished[1] / "database.db"),
     ]
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        arguments, capture_output=True, text=True, timeout=60, check=False
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"{targets[0]}: cannot be written (")
     assert done.stdout.count("\n") == 1

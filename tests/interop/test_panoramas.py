@@ -25,8 +25,14 @@ def write_size(path: Path, width: int, height: int) -> None:
     ("sizes", "message"),
     [
         ([(64, 32)], r"has 1 pictures; give two panoramas or more"),
-        ([(64, 32), (64, 48)], r"1\.png: is 64 x 48 px, and a panorama .* is twice as wide"),
-        ([(64, 32), (80, 40)], r"1\.png: is 80 x 40 px, and 0\.png is 64 x 32 px; .* one size"),
+        (
+            [(64, 32), (64, 48)],
+            r"1\.png: is 64 x 48 px, and a panorama .* is twice as wide",
+        ),
+        (
+            [(64, 32), (80, 40)],
+            r"1\.png: is 80 x 40 px, and 0\.png is 64 x 32 px; .* one size",
+        ),
     ],
 )
 def test_pictures_that_are_no_panoramas_are_refused_before_anything_is_made(
@@ -70,8 +76,12 @@ def test_all_stages_show_progress_and_no_model_is_said(
 
         monkeypatch.setattr(panoramas.ours, name, call)
     monkeypatch.setattr(panoramas.pycolmap, "apply_rig_config", lambda *_: None)
-    with pytest.raises(NoModelError, match="no two of the 2 panoramas can be registered"):
-        reconstruct_panoramas(tmp_path / "panoramas", tmp_path / "out", order="exhaustive")
+    with pytest.raises(
+        NoModelError, match="no two of the 2 panoramas can be registered"
+    ):
+        reconstruct_panoramas(
+            tmp_path / "panoramas", tmp_path / "out", order="exhaustive"
+        )
     assert called == [
         "extract_features True", "match_exhaustive True", "incremental_mapping True"
     ]  # fmt: skip

@@ -36,13 +36,16 @@ TAKING_PATHS: dict[str, Callable[[Any, Any], object]] = {
 
 
 @pytest.mark.parametrize("name", TAKING_PATHS)
-def test_paths_are_text_too_and_bytes_are_refused_in_words(name: str, tmp_path: Path) -> None:
+def test_paths_are_text_too_and_bytes_are_refused_in_words(
+    name: str, tmp_path: Path
+) -> None:
     missing = str(tmp_path / "missing")
     out = str(tmp_path / "out")
     with pytest.raises(AffrectError, match="missing"):
         TAKING_PATHS[name](missing, out)
     with pytest.raises(
-        OptionError, match=r"^\w+(=|: )b'.*': give a path as str or os\.PathLike, not bytes$"
+        OptionError,
+        match=r"^\w+(=|: )b'.*': give a path as str or os\.PathLike, not bytes$",
     ):
         TAKING_PATHS[name](missing.encode(), out.encode())
 
@@ -64,10 +67,12 @@ def test_errors_of_functions_name_arguments(
     monkeypatch.setattr(AffrectError, "names_flags", False)
     with pytest.raises(OptionError, match=r"^image_path \S+none: no such folder$"):
         export(tmp_path, tmp_path / "out", ["ply"], image_path=tmp_path / "none")
-    assert str(AffrectError("--mask-path x: use 'colmap-affrect run --set a=1' or --extend")) == (
-        "masks.path x: use 'colmap-affrect run --set a=1' or extend"
-    )
-    with pytest.raises(OptionError, match=r"call extract_features first, or move this folder"):
+    assert str(
+        AffrectError("--mask-path x: use 'colmap-affrect run --set a=1' or --extend")
+    ) == ("masks.path x: use 'colmap-affrect run --set a=1' or extend")
+    with pytest.raises(
+        OptionError, match=r"call extract_features first, or move this folder"
+    ):
         colmap_affrect.match_exhaustive(tmp_path / "a.db")
 
 

@@ -30,7 +30,9 @@ def synthesize(path: Path, num_columns: int = 6, *, verified: bool = True) -> li
             points = np.asarray(database.read_keypoints(image.image_id))[:, :2]
             shapes = np.tile(np.float32([3.0, 0.2, 0.1, 2.0]), (len(points), 1))
             keypoints = np.concatenate([points, shapes], axis=1)[:, :num_columns]
-            database.update_keypoints(image.image_id, np.ascontiguousarray(keypoints, np.float32))
+            database.update_keypoints(
+                image.image_id, np.ascontiguousarray(keypoints, np.float32)
+            )
         if not verified:
             database.clear_two_view_geometries()
     return sorted(image.name for image in images)
@@ -66,25 +68,39 @@ def test_models_are_written_as_by_pycolmap_and_callbacks_called(
     other = tmp_path / "other"
     with pytest.raises(InterruptedError):
         colmap_affrect.incremental_mapping(
-            database, "", other, next_image_callback=token.cancel, cancellation_token=token
+            database,
+            "",
+            other,
+            next_image_callback=token.cancel,
+            cancellation_token=token,
         )
     assert not other.exists()
 
 
-def test_model_of_input_path_is_extended_into_output_path(database: Path, tmp_path: Path) -> None:
+def test_model_of_input_path_is_extended_into_output_path(
+    database: Path, tmp_path: Path
+) -> None:
     with open_database(database) as opened:
         names = sorted(image.name for image in opened.read_all_images())
-    native = pycolmap.IncrementalPipelineOptions(image_names=names[:4], min_model_size=2)
+    native = pycolmap.IncrementalPipelineOptions(
+        image_names=names[:4], min_model_size=2
+    )
     (tmp_path / "first").mkdir()
     pycolmap.incremental_mapping(database, tmp_path, tmp_path / "first", options=native)
     old = pycolmap.Reconstruction(tmp_path / "first" / "0")
     models = colmap_affrect.incremental_mapping(
-        database, tmp_path, tmp_path / "out", {"fix_existing_frames": True}, tmp_path / "first/0"
+        database,
+        tmp_path,
+        tmp_path / "out",
+        {"fix_existing_frames": True},
+        tmp_path / "first/0",
     )
     new = pycolmap.Reconstruction(tmp_path / "out")
     assert registered(new) == registered(models[0]) == names
     for image_id in old.reg_image_ids():
-        assert new.image(image_id).cam_from_world() == old.image(image_id).cam_from_world()
+        assert (
+            new.image(image_id).cam_from_world() == old.image(image_id).cam_from_world()
+        )
 
 
 def test_options_that_differ_from_the_defaults_of_pycolmap_are_carried_over() -> None:
@@ -93,7 +109,10 @@ def test_options_that_differ_from_the_defaults_of_pycolmap_are_carried_over() ->
     )
     ours = pycolmap_options.mapper_options(native)
     assert ours.random_seed == 7
-    assert ours.mapper_options == {"min_model_size": 4, "mapper.init_min_num_inliers": 44}
+    assert ours.mapper_options == {
+        "min_model_size": 4,
+        "mapper.init_min_num_inliers": 44,
+    }
     usual = pycolmap_options.mapper_options(pycolmap.IncrementalPipelineOptions())
     assert (usual.mapper_options, usual.random_seed) == ({}, 0)
     assert usual.preset_name == "sparse"
@@ -106,7 +125,10 @@ def test_options_that_differ_from_the_defaults_of_pycolmap_are_carried_over() ->
     [
         ({"min_model_siz": 3}, "^options: .*min_model_siz"),
         (3, "^options: int does not apply"),
-        (pycolmap.IncrementalPipelineOptions(image_names=["a"]), "image_names=.*carried over"),
+        (
+            pycolmap.IncrementalPipelineOptions(image_names=["a"]),
+            "image_names=.*carried over",
+        ),
     ],
 )
 def test_wrong_options_are_one_clear_line(
@@ -119,7 +141,9 @@ def test_wrong_options_are_one_clear_line(
 
 
 @pytest.mark.parametrize("num_columns", [2, 4])
-def test_verify_and_mapping_take_keypoints_of_any_columns(tmp_path: Path, num_columns: int) -> None:
+def test_verify_and_mapping_take_keypoints_of_any_columns(
+    tmp_path: Path, num_columns: int
+) -> None:
     path = tmp_path / "database.db"
     names = synthesize(path, num_columns, verified=False)
     with open_database(path) as database:
@@ -140,14 +164,19 @@ def test_verify_takes_a_list_of_pairs(tmp_path: Path) -> None:
         assert database.num_matched_image_pairs() == NUM_IMAGES * (NUM_IMAGES - 1) / 2
     assert len(pair_ids) == 2
     assert min(counts) > 100
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["database.db", "pairs.txt"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == [
+        "database.db",
+        "pairs.txt",
+    ]
     colmap_affrect.verify_matches(path)
     with open_database(path) as database:
         assert len(database.read_two_view_geometry_num_inliers()[0]) == 15
     listed.write_text("a b\n")
     with pytest.raises(AffrectError):
         colmap_affrect.verify_matches(path, listed)
-    with open_database(path) as database:  # at which the process would end inside COLMAP
+    with open_database(
+        path
+    ) as database:  # at which the process would end inside COLMAP
         database.delete_matches(1, 2)
         database.write_matches(1, 2, np.array([[0, 0], [1, 10_000]], np.uint32))
     with pytest.raises(DatabaseError, match="matches of keypoints that do not exist"):
@@ -169,7 +198,11 @@ def test_database_of_any_program_is_mapped_in_a_copy(
     before = content(source)
     report = colmap_affrect.map_database(source / "any.db", out)
     assert report.registered_names == tuple(names)
-    assert (report.status, report.num_pairs, report.num_verified_pairs) == ("ok", 15, 15)
+    assert (report.status, report.num_pairs, report.num_verified_pairs) == (
+        "ok",
+        15,
+        15,
+    )
     assert "verified now" not in caplog.text
     assert content(source) == before
     assert (out / "report.json").exists()
@@ -189,10 +222,14 @@ def test_databases_that_cannot_be_mapped_are_one_clear_line(tmp_path: Path) -> N
         database.clear_two_view_geometries()
         database.clear_matches()
         database.clear_descriptors()
-    with pytest.raises(DatabaseError, match=r"any\.db: has no matches, nor descriptors to match"):
+    with pytest.raises(
+        DatabaseError, match=r"any\.db: has no matches, nor descriptors to match"
+    ):
         colmap_affrect.map_database(path, tmp_path / "out")
     with pytest.raises(OptionError, match="no such file"):
         colmap_affrect.map_database(tmp_path / "no.db", tmp_path / "none")
     assert not (tmp_path / "none").exists()
     with pytest.raises(OptionError, match="nowhere: no such folder"):
-        colmap_affrect.map_database(path, tmp_path / "x", image_path=tmp_path / "nowhere")
+        colmap_affrect.map_database(
+            path, tmp_path / "x", image_path=tmp_path / "nowhere"
+        )

@@ -48,11 +48,15 @@ def extracted(once_extracted: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("matcher", ["sequential", "exhaustive"])
-def test_panorama_script_of_pycolmap_registers_all_images(tmp_path: Path, matcher: str) -> None:
+def test_panorama_script_of_pycolmap_registers_all_images(
+    tmp_path: Path, matcher: str
+) -> None:
     (tmp_path / "panoramas").mkdir()
     write_panoramas(tmp_path / "panoramas", 3)
     options = panorama.PanoramaReconstructionOptions(matcher=panorama.Matcher(matcher))
-    models = panorama.reconstruct(str(tmp_path / "panoramas"), str(tmp_path / "out"), options)
+    models = panorama.reconstruct(
+        str(tmp_path / "panoramas"), str(tmp_path / "out"), options
+    )
     assert models[0].num_reg_images() == 3 * 12
     assert models[0].num_reg_frames() == 3
     with open_database(tmp_path / "out" / "database.db") as database:
@@ -97,17 +101,30 @@ def test_arguments_are_those_of_pycolmap_in_order(name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", HONOURED)
-def test_default_options_ask_for_nothing_and_every_field_is_honoured_or_named(kind: type) -> None:
-    assert changes(kind(), kind, "x") == changes({}, kind, "x") == changes(None, kind, "x") == {}
+def test_default_options_ask_for_nothing_and_every_field_is_honoured_or_named(
+    kind: type,
+) -> None:
+    assert (
+        changes(kind(), kind, "x")
+        == changes({}, kind, "x")
+        == changes(None, kind, "x")
+        == {}
+    )
     for key, value in kind().todict().items():
-        other = {**value, next(iter(value)): 77} if isinstance(value, dict) else _other(value)
+        other = (
+            {**value, next(iter(value)): 77}
+            if isinstance(value, dict)
+            else _other(value)
+        )
         given = kind()
         given.mergedict({key: other})
         if key in HONOURED[kind]:
             assert changes({key: other}, kind, "x") == changes(given, kind, "x")
             assert list(changes(given, kind, "x")) == [key]
         elif not isinstance(value, dict):
-            with pytest.raises(OptionError, match=rf"^x: {key}=\S+ cannot be carried over$"):
+            with pytest.raises(
+                OptionError, match=rf"^x: {key}=\S+ cannot be carried over$"
+            ):
                 changes(given, kind, "x")
     with pytest.raises(OptionError, match=r"^x: no_such: pycolmap has no such option"):
         changes({"no_such": 1}, kind, "x")
@@ -132,21 +149,36 @@ def test_options_are_translated() -> None:
     assert matching_options({"sift": {"max_ratio": 0.8}, "num_threads": 3}) == (
         None, {"num_threads": 3},
     )  # fmt: skip
-    assert matching_options(NearestOptions(max_ratio=0.7)) == (NearestOptions(max_ratio=0.7), {})
-    with pytest.raises(OptionError, match=r"sift\.max_ratio=0\.7 cannot be carried over"):
+    assert matching_options(NearestOptions(max_ratio=0.7)) == (
+        NearestOptions(max_ratio=0.7),
+        {},
+    )
+    with pytest.raises(
+        OptionError, match=r"sift\.max_ratio=0\.7 cannot be carried over"
+    ):
         matching_options({"sift": {"max_ratio": 0.7}})
     usual = colmap_affrect.VerificationOptions()
     assert verification_options(pycolmap.TwoViewGeometryOptions(), None) == usual
-    nested = verification_options({"ransac": {"random_seed": 7, "max_error": 2.5}}, None)
-    assert nested == usual.changed(random_seed=7, max_error_px=2.5, scale_max_error=False)
-    named = verification_options({"ransac": {"max_error": 4.0, "random_seed": -1}}, None)
+    nested = verification_options(
+        {"ransac": {"random_seed": 7, "max_error": 2.5}}, None
+    )
+    assert nested == usual.changed(
+        random_seed=7, max_error_px=2.5, scale_max_error=False
+    )
+    named = verification_options(
+        {"ransac": {"max_error": 4.0, "random_seed": -1}}, None
+    )
     assert named == usual.changed(max_error_px=4.0, scale_max_error=False)
-    with pytest.raises(OptionError, match=r"ransac\.max_eror: .*did you mean 'ransac\.max_error'"):
+    with pytest.raises(
+        OptionError, match=r"ransac\.max_eror: .*did you mean 'ransac\.max_error'"
+    ):
         verification_options({"ransac": {"max_eror": 2}}, None)
 
 
 def test_what_matching_options_ask_for_is_done(extracted: Path) -> None:
-    asked = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True, num_threads=1)
+    asked = pycolmap.FeatureMatchingOptions(
+        skip_geometric_verification=True, num_threads=1
+    )
     (match,) = replaced.match_exhaustive(extracted, asked)
     assert match.num_done == 6
     with open_database(extracted) as database:
@@ -190,14 +222,19 @@ def test_pairs_of_a_list_are_verified(extracted: Path, tmp_path: Path) -> None:
     ids = image_ids(extracted)
     with open_database(extracted) as database:
         (pair_id,), _ = database.read_two_view_geometries()
-    assert set(pycolmap.pair_id_to_image_pair(pair_id)) == {ids[NAMES[2]], ids[NAMES[3]]}
+    assert set(pycolmap.pair_id_to_image_pair(pair_id)) == {
+        ids[NAMES[2]],
+        ids[NAMES[3]],
+    }
     token.cancel()
     with pytest.raises(InterruptedError):
         replaced.verify_matches(extracted, listed, None, token)
 
 
 @pytest.mark.long
-def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: Path) -> None:
+def test_cancelled_token_stops_and_what_is_done_is_kept(
+    photos: Path, tmp_path: Path
+) -> None:
     class Cancelling(Progress):
         """Cancels after the first image."""
 

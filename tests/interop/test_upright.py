@@ -22,7 +22,9 @@ from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.scene import read_view
 
-UP = turn(2, 5.0) @ turn(0, 10.0) @ np.array([0.0, -1.0, 0.0])  # in the frame of the model
+UP = (
+    turn(2, 5.0) @ turn(0, 10.0) @ np.array([0.0, -1.0, 0.0])
+)  # in the frame of the model
 
 
 def lines_that_say(up_in_camera: np.ndarray, evidence: float = 20.0) -> Lines:
@@ -31,11 +33,15 @@ def lines_that_say(up_in_camera: np.ndarray, evidence: float = 20.0) -> Lines:
     first /= np.linalg.norm(first)
     rotation = np.stack([first, up_in_camera, np.cross(first, up_in_camera)])
     grid = (len(FOCALS), len(SHIFTS))
-    likelihood = LineLikelihood(np.full(grid, evidence), np.tile(rotation, (*grid, 1, 1)))
+    likelihood = LineLikelihood(
+        np.full(grid, evidence), np.tile(rotation, (*grid, 1, 1))
+    )
     return Lines(Segments(np.zeros((0, 2)), np.zeros((0, 2))), likelihood)
 
 
-def write_run(folder: Path, evidence: float = 20.0, *, wrong: int = 1) -> pycolmap.Reconstruction:
+def write_run(
+    folder: Path, evidence: float = 20.0, *, wrong: int = 1
+) -> pycolmap.Reconstruction:
     """An output folder with a model, and with lines of which the first ones are wrong."""
     workspace = Workspace(folder)
     workspace.begin()
@@ -54,7 +60,9 @@ def exported(folder: Path) -> pycolmap.Reconstruction:
     return pycolmap.Reconstruction(folder / "text")
 
 
-def up_of(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> np.ndarray:
+def up_of(
+    before: pycolmap.Reconstruction, after: pycolmap.Reconstruction
+) -> np.ndarray:
     """Where what was up in one model is in the other."""
     old = before.images[1].cam_from_world().rotation.matrix()
     new = after.images[1].cam_from_world().rotation.matrix()
@@ -64,20 +72,28 @@ def up_of(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> np
 def test_exports_of_a_run_have_z_up_and_say_so(tmp_path: Path) -> None:
     before = write_run(tmp_path / "run")
     said = list[str]()
-    export(tmp_path / "run" / "sparse" / "0", tmp_path / "out", "text", note=said.append)
+    export(
+        tmp_path / "run" / "sparse" / "0", tmp_path / "out", "text", note=said.append
+    )
     after = exported(tmp_path / "out")
     assert_allclose(up_of(before, after), [0.0, 0.0, 1.0], atol=1e-6)
     assert said == ["upright     by the lines of 3 of 4 photographs: z is up"]
-    ahead = np.mean([image.viewing_direction() for image in after.images.values()], axis=0)
+    ahead = np.mean(
+        [image.viewing_direction() for image in after.images.values()], axis=0
+    )
     assert ahead[1] > 0.5
     assert abs(ahead[0]) < 1e-6
     for name, old in before.points3D.items():
-        assert np.linalg.norm(old.xyz) == pytest.approx(np.linalg.norm(after.points3D[name].xyz))
+        assert np.linalg.norm(old.xyz) == pytest.approx(
+            np.linalg.norm(after.points3D[name].xyz)
+        )
     kept = pycolmap.Reconstruction(tmp_path / "run" / "sparse" / "0")  # is as it was
     assert_allclose(up_of(before, kept), UP, atol=1e-9)
 
 
-@pytest.mark.parametrize("case", ["contradiction", "by chance", "extends", "no run", "at work"])
+@pytest.mark.parametrize(
+    "case", ["contradiction", "by chance", "extends", "no run", "at work"]
+)
 def test_nothing_is_turned_where_nobody_knows(tmp_path: Path, case: str) -> None:
     folder = tmp_path / "run"
     before = write_run(folder, evidence=2.0 if case == "by chance" else 20.0,
@@ -94,7 +110,9 @@ def test_nothing_is_turned_where_nobody_knows(tmp_path: Path, case: str) -> None
     assert_allclose(up_of(before, exported(tmp_path / "out")), UP, atol=1e-6)
 
 
-def test_a_damaged_store_of_features_keeps_no_model_from_being_exported(tmp_path: Path) -> None:
+def test_a_damaged_store_of_features_keeps_no_model_from_being_exported(
+    tmp_path: Path,
+) -> None:
     before = write_run(tmp_path / "run")
     (tmp_path / "run" / "features.h5").write_bytes(b"no store")
     export(tmp_path / "run" / "sparse" / "0", tmp_path / "out", "text")
@@ -116,9 +134,15 @@ def test_the_page_and_instant_ngp_have_the_same_upright(tmp_path: Path) -> None:
     before = write_run(tmp_path / "run", wrong=0)
     view = read_view(tmp_path / "run" / "sparse" / "0", {})
     drawn = np.array([corners[0] for _, corners in view.cameras])
-    centers = np.array([before.images[n].projection_center() for n in sorted(before.images)])
-    scale = np.linalg.norm(drawn[3] - drawn[0]) / np.linalg.norm(centers[3] - centers[0])
-    assert_allclose((drawn - drawn[0])[:, 2] / scale, (centers - centers[0]) @ UP, atol=1e-6)
+    centers = np.array(
+        [before.images[n].projection_center() for n in sorted(before.images)]
+    )
+    scale = np.linalg.norm(drawn[3] - drawn[0]) / np.linalg.norm(
+        centers[3] - centers[0]
+    )
+    assert_allclose(
+        (drawn - drawn[0])[:, 2] / scale, (centers - centers[0]) @ UP, atol=1e-6
+    )
     write_photographs(tmp_path / "photos")
     export(tmp_path / "run" / "sparse" / "0", tmp_path / "out", "nerfstudio",
            image_path=tmp_path / "photos")  # fmt: skip

@@ -47,8 +47,12 @@ def test_distortion_is_found_by_exact_keypoints_and_stays_near_zero_by_noisy_one
 
 def cost_of(factor: float, **known: str) -> float:
     """What a focal length costs that is so many times the expected one."""
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE)
-    prior = camera_prior(camera, CameraRecord(("a",), size=SIZE, focal_px=TRUE_FOCAL, **known))
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE
+    )
+    prior = camera_prior(
+        camera, CameraRecord(("a",), size=SIZE, focal_px=TRUE_FOCAL, **known)
+    )
     return prior.cost(factor * prior.focal_px)
 
 
@@ -63,7 +67,9 @@ def test_a_focal_length_by_exif_may_be_off_by_a_tenth_and_not_by_half() -> None:
     assert cost_of(1.5, source="exif") > 4.0
 
 
-def deviations(model: pycolmap.Reconstruction, prior: CameraPrior) -> pycolmap.Reconstruction:
+def deviations(
+    model: pycolmap.Reconstruction, prior: CameraPrior
+) -> pycolmap.Reconstruction:
     """Adjust a copy of a model, whose cameras all have one prior."""
     trial = pycolmap.Reconstruction(model)
     priors = dict.fromkeys(model.cameras, prior)
@@ -72,7 +78,9 @@ def deviations(model: pycolmap.Reconstruction, prior: CameraPrior) -> pycolmap.R
 
 
 def test_cost_of_an_adjustment_and_of_a_score_have_the_same_prior() -> None:
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE)
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE
+    )
     for factor in (0.4, 0.8, 1.0, 2.5):
         prior = CameraPrior(TRUE_FOCAL / factor, 0.3, usual_principal_point(camera))
         camera.params = [TRUE_FOCAL, SIZE[0] / 2 + 9.0, SIZE[1] / 2 - 5.0, 0.0]
@@ -80,14 +88,18 @@ def test_cost_of_an_adjustment_and_of_a_score_have_the_same_prior() -> None:
         residuals = np.zeros(4)
         jacobian = np.zeros(16)
         assert cost.Evaluate([camera.params], residuals, [jacobian])
-        assert 0.5 * (residuals @ residuals) / 0.5**2 == pytest.approx(prior.cost_of(camera))
+        assert 0.5 * (residuals @ residuals) / 0.5**2 == pytest.approx(
+            prior.cost_of(camera)
+        )
         for index, step in enumerate([1e-3, 1e-3, 1e-3, 1e-6]):
             moved = camera.params.copy()
             moved[index] += step
             changed = np.zeros(4)
             cost.Evaluate([moved], changed, None)
             slopes = (changed - residuals) / step
-            assert jacobian.reshape(4, 4)[:, index] == pytest.approx(slopes, rel=1e-4, abs=1e-6)
+            assert jacobian.reshape(4, 4)[:, index] == pytest.approx(
+                slopes, rel=1e-4, abs=1e-6
+            )
 
 
 def test_focal_lengths_without_information_go_to_their_prior_also_from_far_away(
@@ -102,10 +114,16 @@ def test_focal_lengths_without_information_go_to_their_prior_also_from_far_away(
         assert camera.params[0] == pytest.approx(TRUE_FOCAL, rel=1e-3)
 
 
-def test_principal_points_move_only_where_they_are_unknown(model: pycolmap.Reconstruction) -> None:
+def test_principal_points_move_only_where_they_are_unknown(
+    model: pycolmap.Reconstruction,
+) -> None:
     shifted = pycolmap.Reconstruction(model)
     for camera in shifted.cameras.values():
-        camera.params = [*camera.params[:2], camera.params[2] - 40.0, *camera.params[3:]]
+        camera.params = [
+            *camera.params[:2],
+            camera.params[2] - 40.0,
+            *camera.params[3:],
+        ]
     known = CameraPrior(TRUE_FOCAL, 0.05)
     for camera in deviations(shifted, known).cameras.values():
         assert camera.params[2] == SIZE[1] / 2 - 40.0
@@ -116,7 +134,9 @@ def test_principal_points_move_only_where_they_are_unknown(model: pycolmap.Recon
     assert np.mean([camera.params[2] for camera in found]) > SIZE[1] / 2 - 20.0
 
 
-def test_distortion_that_images_cannot_tell_stays_as_it_is(model: pycolmap.Reconstruction) -> None:
+def test_distortion_that_images_cannot_tell_stays_as_it_is(
+    model: pycolmap.Reconstruction,
+) -> None:
     straight = pycolmap.Reconstruction(model)
     for camera in straight.cameras.values():
         camera.params = [*camera.params[:3], 0.0]

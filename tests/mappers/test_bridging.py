@@ -64,7 +64,9 @@ def test_bridge_begins_at_the_first_or_at_the_second_image_of_a_pair(
     poses = {**poses_of(middle), image_id: best.pose}
     for other in MIDDLE:
         estimated = relative_pose(poses[other], poses[image_id])
-        errors_deg = pose_errors(estimated, relative_pose(TRUTH[other], TRUTH[image_id]))
+        errors_deg = pose_errors(
+            estimated, relative_pose(TRUTH[other], TRUTH[image_id])
+        )
         assert max(errors_deg) < 1.0
     scale = scale_of(poses, neighbor, image_id) / scale_of(poses, *MIDDLE)
     assert scale == pytest.approx(1.0, abs=0.03)
@@ -92,13 +94,17 @@ def test_depths_far_from_the_features_of_a_pair_tell_no_scale(
     (pair,) = [pair for pair in grower.graph.pairs if pair.ids == (3, 4)]
     left_px = grower.graph.keypoints[3][pair.matches[:, 0], 0].min()
     near = keep_points(middle, 3, left_px + 150)
-    far = keep_points(middle, 3, left_px - 125)  # depths 120 px away may be on the same plane
+    far = keep_points(
+        middle, 3, left_px - 125
+    )  # depths 120 px away may be on the same plane
     assert far.num_points3D() > 20
     assert 4 in bridged(grower, near)
     assert 4 not in bridged(grower, far)
 
 
-def test_few_depths_tell_no_scale(grower: Grower, middle: pycolmap.Reconstruction) -> None:
+def test_few_depths_tell_no_scale(
+    grower: Grower, middle: pycolmap.Reconstruction
+) -> None:
     ids = sorted(middle.point3D_ids())
     few = pycolmap.Reconstruction(middle)
     for point_id in ids[3:]:
@@ -115,7 +121,8 @@ class Trials:
         camera = next(iter(model.cameras.values()))
         bridge = Bridge("2.jpg", 10, 10, 0.01)
         self.hypotheses = [
-            BridgeHypothesis(bridge, image_id, pose, camera, 1.0) for image_id in range(number)
+            BridgeHypothesis(bridge, image_id, pose, camera, 1.0)
+            for image_id in range(number)
         ]
         self.num_tried = 0
 

@@ -38,16 +38,23 @@ def camera(focal_px: float = 1200.0) -> pycolmap.Camera:
 
 
 def by_lines(
-    focal: float, sigma: float = 0.06, shift: float = 0.0, shift_sigma: float = SHIFTED_SIGMA
+    focal: float,
+    sigma: float = 0.06,
+    shift: float = 0.0,
+    shift_sigma: float = SHIFTED_SIGMA,
 ) -> LineCamera:
-    return LineCamera(focal, sigma, shift, shift_sigma, np.eye(3), np.array([0.0, -1.0, 0.0]))
+    return LineCamera(
+        focal, sigma, shift, shift_sigma, np.eye(3), np.array([0.0, -1.0, 0.0])
+    )
 
 
 def test_log_normals_multiply_by_their_precisions() -> None:
     measured = Measurement(LogNormal(2.0, 0.2), 1e-12)
     found = product(USUAL, [measured])
     precision = USUAL_SIGMA**-2 + 0.2**-2
-    mean = (math.log(USUAL_FOCAL) * USUAL_SIGMA**-2 + math.log(2.0) * 0.2**-2) / precision
+    mean = (
+        math.log(USUAL_FOCAL) * USUAL_SIGMA**-2 + math.log(2.0) * 0.2**-2
+    ) / precision
     assert found.focal == pytest.approx(math.exp(mean), rel=1e-3)
     assert found.sigma == pytest.approx(precision**-0.5, rel=1e-2)
 
@@ -89,8 +96,12 @@ def test_lines_tell_an_unknown_focal_length_and_leave_a_known_one_as_it_is() -> 
 def test_without_lines_models_begin_with_lenses_from_wide_to_long() -> None:
     prior = camera_prior(camera(), NOTHING)
     assert (prior.focal_px, prior.sigma) == (USUAL_FOCAL * 1000, USUAL_SIGMA)
-    assert prior.starts_px == pytest.approx([zoom * USUAL_FOCAL * 1000 for zoom in ZOOMS])
-    absurd = camera_prior(camera(), NOTHING, [by_lines(4.0)])  # lines lie more often than that
+    assert prior.starts_px == pytest.approx(
+        [zoom * USUAL_FOCAL * 1000 for zoom in ZOOMS]
+    )
+    absurd = camera_prior(
+        camera(), NOTHING, [by_lines(4.0)]
+    )  # lines lie more often than that
     assert absurd.focal_px < 1600.0
     vague = camera_prior(camera(), NOTHING, [by_lines(1.6, 0.3)])
     assert len(vague.starts_px) == len(ZOOMS)
@@ -101,7 +112,9 @@ def test_models_of_crops_begin_with_the_focal_length_of_the_whole_photograph() -
     crop = replace(NOTHING, uncropped_px=2400.0)
     prior = camera_prior(camera(), crop)
     assert prior.starts_px[0] == pytest.approx(2400.0)
-    assert prior.cost(1.5 * 2400.0) == pytest.approx(2.05, abs=0.1)  # it may have been scaled, too
+    assert prior.cost(1.5 * 2400.0) == pytest.approx(
+        2.05, abs=0.1
+    )  # it may have been scaled, too
     by_lines_too = camera_prior(camera(), crop, [by_lines(2.3)])
     assert by_lines_too.focal_px == pytest.approx(2320.0, rel=0.02)
     assert prior.principal_point
@@ -112,7 +125,9 @@ def test_a_shift_that_lines_tell_frees_the_principal_point_and_others_do_not() -
     shifted = camera_prior(camera(), NOTHING, [by_lines(1.2, 0.1, 0.18, 0.04)])
     assert shifted.principal_point
     assert shifted.principal_point.center_px == pytest.approx((500.0, 350.0 + 180.0))
-    assert shifted.principal_point.sigmas_px == pytest.approx([1000 * MIDDLE_SIGMA, 40.0])
+    assert shifted.principal_point.sigmas_px == pytest.approx(
+        [1000 * MIDDLE_SIGMA, 40.0]
+    )
     for unclear in (by_lines(1.2, 0.1, 0.05, 0.09), by_lines(1.2, 0.1, 0.01, 0.02)):
         assert camera_prior(camera(), NOTHING, [unclear]).principal_point is None
     twice = [by_lines(1.2, 0.1, 0.08, 0.04)] * 3  # of one camera
@@ -123,7 +138,9 @@ def test_a_shift_that_lines_tell_frees_the_principal_point_and_others_do_not() -
 
 def test_a_principal_point_costs_by_its_deviation() -> None:
     moved = camera(1150.0)
-    prior = replace(camera_prior(moved, NOTHING), principal_point=usual_principal_point(moved))
+    prior = replace(
+        camera_prior(moved, NOTHING), principal_point=usual_principal_point(moved)
+    )
     assert prior.cost_of(moved) == pytest.approx(0.0)
     assert usual_principal_point(moved).sigmas_px == (20.0, 20.0)
     moved.principal_point_y += 2.0 * MIDDLE_SIGMA * 1000

@@ -19,7 +19,9 @@ NEAR = ((0.0, 0.0, 0.0), (0.05, 0.02, 0.1), (-0.04, 0.06, 0.05), (4.0, 0.5, 0.3)
 
 
 def model_of(
-    centers: tuple[tuple[float, float, float], ...], noise_px: float = 0.0, seed: int = 0
+    centers: tuple[tuple[float, float, float], ...],
+    noise_px: float = 0.0,
+    seed: int = 0,
 ) -> pycolmap.Reconstruction:
     """Points that all images see, with noise on their keypoints; no camera is turned."""
     random = np.random.default_rng(5)
@@ -50,7 +52,9 @@ def adjuster(focal_sigma: float) -> Adjuster:
     return Adjuster(priors, NOISE_PX, pycolmap.BundleAdjustmentOptions())
 
 
-def direction(model: pycolmap.Reconstruction, first: int, second: int) -> NDArray[np.float64]:
+def direction(
+    model: pycolmap.Reconstruction, first: int, second: int
+) -> NDArray[np.float64]:
     poses = [model.images[i].cam_from_world() for i in (first, second)]
     translation = (poses[1] * poses[0].inverse()).translation
     return translation / np.linalg.norm(translation)
@@ -104,7 +108,9 @@ def test_it_does_not_depend_on_the_frame_of_the_model() -> None:
     assert direction_sigmas_deg(model, adjuster(0.3)) == pytest.approx(before, rel=1e-3)
 
 
-def test_two_images_and_very_many_are_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_images_and_very_many_are_not_looked_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert not direction_sigmas_deg(model_of(FAR[:2]), adjuster(0.3))
     monkeypatch.setattr(direction_uncertainty, "MAX_NUM_IMAGES", 3)
     assert not direction_sigmas_deg(model_of(FAR), adjuster(0.3))

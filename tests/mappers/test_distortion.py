@@ -31,11 +31,17 @@ def test_several_images_of_a_camera_tell_its_distortion_and_two_do_not(
         num_points3D=200,
         camera_params=PARAMS,
     )
-    assert cameras_that_tell_distortion(PairGraph.read(path)) == ({1} if is_told else set())
+    assert cameras_that_tell_distortion(PairGraph.read(path)) == (
+        {1} if is_told else set()
+    )
 
 
-def test_an_image_full_of_points_of_many_others_tells_it_and_one_of_pairs_does_not() -> None:
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1000.0, 800, 800)
+def test_an_image_full_of_points_of_many_others_tells_it_and_one_of_pairs_does_not() -> (
+    None
+):
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_RADIAL", 1000.0, 800, 800
+    )
     middles = 100.0 * np.arange(8) + 50.0
     keypoints = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
     pairs = redundancy_of(camera, keypoints, np.ones(64, np.int64))

@@ -9,7 +9,13 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from mapping_tasks import NOTHING_KNOWN, SEED, mapper_of, synthesize, task_with_given_cameras
+from mapping_tasks import (
+    NOTHING_KNOWN,
+    SEED,
+    mapper_of,
+    synthesize,
+    task_with_given_cameras,
+)
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
@@ -41,14 +47,18 @@ def old(database: Path) -> pycolmap.Reconstruction:
     native.extract_colors = False
     output = database.parent / "old"
     output.mkdir()
-    model = pycolmap.incremental_mapping(database, database.parent, output, options=native)[0]
+    model = pycolmap.incremental_mapping(
+        database, database.parent, output, options=native
+    )[0]
     assert model.num_reg_images() == NUM_OLD
     turn = pycolmap.Rotation3d(np.array([0.1, 0.7, -0.2]))
     model.transform(pycolmap.Sim3d(3.0, turn, np.array([50.0, -20.0, 7.0])))
     return with_other_ids(model)
 
 
-def with_other_ids(model: pycolmap.Reconstruction, pixels: float = 0.0) -> pycolmap.Reconstruction:
+def with_other_ids(
+    model: pycolmap.Reconstruction, pixels: float = 0.0
+) -> pycolmap.Reconstruction:
     """The same model, every image with a camera and ids of its own, keypoints moved by pixels."""
     new = pycolmap.Reconstruction()
     ids = {}
@@ -63,7 +73,8 @@ def with_other_ids(model: pycolmap.Reconstruction, pixels: float = 0.0) -> pycol
         new.add_image_with_trivial_frame(other, image.cam_from_world())
     for point in model.points3D.values():
         track = [
-            pycolmap.TrackElement(ids[e.image_id], e.point2D_idx) for e in point.track.elements
+            pycolmap.TrackElement(ids[e.image_id], e.point2D_idx)
+            for e in point.track.elements
         ]
         new.add_point3D(point.xyz, pycolmap.Track(track), np.array([1, 2, 3], np.uint8))
     return new
@@ -86,17 +97,27 @@ def center(pose: np.ndarray) -> np.ndarray:
 
 def cameras(model: pycolmap.Reconstruction) -> dict[str, list[float]]:
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
-    return {image.name: model.camera(image.camera_id).params.tolist() for image in images}
+    return {
+        image.name: model.camera(image.camera_id).params.tolist() for image in images
+    }
 
 
 def extended(
-    database: Path, old: pycolmap.Reconstruction, folder: Path, at: str = "old", **options: bool
+    database: Path,
+    old: pycolmap.Reconstruction,
+    folder: Path,
+    at: str = "old",
+    **options: bool,
 ) -> tuple[pycolmap.Reconstruction, list[int]]:
     """Write a model into a folder and extend it; return the result and what progress showed."""
     shown: list[int] = []
-    existing = read_existing(Extension(model_path=written(old, folder / at), **options), database)
+    existing = read_existing(
+        Extension(model_path=written(old, folder / at), **options), database
+    )
     task = MappingTask(database, None, extend=existing)
-    (model,) = map_database(mapper_of("incremental"), task, folder / "sparse", shown.append)
+    (model,) = map_database(
+        mapper_of("incremental"), task, folder / "sparse", shown.append
+    )
     assert len(model.registered_names) == NUM_IMAGES
     return pycolmap.Reconstruction(folder / "sparse" / "0"), shown
 
@@ -117,22 +138,32 @@ def test_old_poses_and_cameras_stay_to_the_bit(
 
 
 def test_the_model_that_is_extended_stays_until_all_images_are_scored(
-    database: Path, old: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    database: Path,
+    old: pycolmap.Reconstruction,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (tmp_path / "sparse").mkdir()
     monkeypatch.setattr(mapping, "score_images", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         extended(database, old, tmp_path, "sparse/0")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]
-    assert poses(pycolmap.Reconstruction(tmp_path / "sparse" / "0")).keys() == poses(old).keys()
+    assert (
+        poses(pycolmap.Reconstruction(tmp_path / "sparse" / "0")).keys()
+        == poses(old).keys()
+    )
 
 
 def test_old_poses_may_move_and_stay_in_their_frame(
     database: Path, old: pycolmap.Reconstruction, tmp_path: Path
 ) -> None:
     model, _ = extended(database, old, tmp_path, refine_existing=True)
-    moved = [np.abs(poses(model)[name] - pose).max() for name, pose in poses(old).items()]
-    assert 1e-6 < max(moved) < 0.3  # the cameras are some 20 units apart, 50 from the origin
+    moved = [
+        np.abs(poses(model)[name] - pose).max() for name, pose in poses(old).items()
+    ]
+    assert (
+        1e-6 < max(moved) < 0.3
+    )  # the cameras are some 20 units apart, 50 from the origin
     assert cameras(model) != {**cameras(model), **cameras(old)}
 
 
@@ -146,7 +177,9 @@ def test_new_images_are_where_they_were_taken(
     native = mapper_of("incremental").native(NOTHING_KNOWN, SEED)
     native.extract_colors = False
     (tmp_path / "all").mkdir()
-    whole = pycolmap.incremental_mapping(database, tmp_path, tmp_path / "all", options=native)[0]
+    whole = pycolmap.incremental_mapping(
+        database, tmp_path, tmp_path / "all", options=native
+    )[0]
     one = poses(model)
     other = poses(whole)
     first, *others = sorted(one)
@@ -154,7 +187,9 @@ def test_new_images_are_where_they_were_taken(
     for name in others:
         rotations = [p[name][:, :3] @ p[first][:, :3].T for p in (one, other)]
         assert np.trace(rotations[0] @ rotations[1].T) > 3 - 1e-4
-        steps = [np.linalg.norm(center(p[name]) - center(p[first])) for p in (one, other)]
+        steps = [
+            np.linalg.norm(center(p[name]) - center(p[first])) for p in (one, other)
+        ]
         ratios.append(float(steps[0] / steps[1]))
     assert max(ratios) < 1.01 * min(ratios)
 
@@ -178,7 +213,9 @@ def test_rigs_get_the_poses_of_their_cameras(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     truth = synthesize(path, **SCENE | {"num_rigs": 1, "num_cameras_per_rig": 2})
     single = with_other_ids(truth)
-    existing = read_existing(Extension(model_path=written(single, tmp_path / "old")), path)
+    existing = read_existing(
+        Extension(model_path=written(single, tmp_path / "old")), path
+    )
     for name, pose in poses(existing.reconstruction).items():
         np.testing.assert_allclose(pose, poses(truth)[name], atol=1e-9)
     assert existing.reconstruction.num_reg_frames() == 5
@@ -213,7 +250,10 @@ def broken(old: pycolmap.Reconstruction, kind: str, folder: Path) -> Path:
     elif kind == "size":
         model.camera(first.camera_id).width += 7
     elif kind == "camera":
-        model.camera(first.camera_id).params = [*model.camera(first.camera_id).params[:-1], 0.3]
+        model.camera(first.camera_id).params = [
+            *model.camera(first.camera_id).params[:-1],
+            0.3,
+        ]
     elif kind == "empty":
         model = pycolmap.Reconstruction()
     path = written(model, folder)
@@ -230,7 +270,11 @@ def broken(old: pycolmap.Reconstruction, kind: str, folder: Path) -> Path:
     ("damaged", r"damaged \(it ends within a record"),
 ])  # fmt: skip
 def test_model_that_does_not_fit_is_one_clear_line(
-    database: Path, old: pycolmap.Reconstruction, tmp_path: Path, kind: str, message: str
+    database: Path,
+    old: pycolmap.Reconstruction,
+    tmp_path: Path,
+    kind: str,
+    message: str,
 ) -> None:
     path = broken(old, kind, tmp_path / "old")
     with pytest.raises(AffrectError, match=message) as error:
@@ -262,18 +306,26 @@ def test_mapping_that_was_stopped_goes_on_from_its_snapshot(
     token = pycolmap.CancellationToken()
     task = MappingTask(path, None, cancellation=token)
     with pytest.raises(KeyboardInterrupt):
-        map_database(mapper_of("incremental"), task, tmp_path / "sparse", stop_after(8, token))
+        map_database(
+            mapper_of("incremental"), task, tmp_path / "sparse", stop_after(8, token)
+        )
     (folder,) = (tmp_path / "sparse.snapshots").iterdir()
     left = snapshots.largest_snapshot(folder)
     names = set(snapshots.registered_names(left))
     assert 4 <= len(names) < NUM_IMAGES
-    assert len([found for found in folder.iterdir() if found.is_dir()]) <= snapshots.NUM_KEPT + 1
+    assert (
+        len([found for found in folder.iterdir() if found.is_dir()])
+        <= snapshots.NUM_KEPT + 1
+    )
     half = folder / "9999999999999"  # as a kill leaves the one that was being written
     half.mkdir()
     (half / "images.bin").write_bytes((left / "images.bin").read_bytes()[:-5])
     shown: list[int] = []
     (model,) = map_database(
-        mapper_of("incremental"), MappingTask(path, None), tmp_path / "sparse", shown.append
+        mapper_of("incremental"),
+        MappingTask(path, None),
+        tmp_path / "sparse",
+        shown.append,
     )
     assert shown[0] == len(names)
     assert sum(shown) == len(model.registered_names) == NUM_IMAGES
@@ -302,7 +354,9 @@ def test_snapshots_of_other_options_are_dropped(
         assert not folder.exists()
         with pytest.raises(OSError, match="full"):
             fail(num_images)
-    with snapshots.with_snapshots(task, mapper_of("incremental").options, folder, 10) as it:
+    with snapshots.with_snapshots(
+        task, mapper_of("incremental").options, folder, 10
+    ) as it:
         assert (it.snapshot_path / "1").exists()
     assert not folder.exists()
     with pytest.raises(OSError, match="full"):
@@ -325,7 +379,10 @@ def test_snapshots_of_other_cameras_are_dropped(
 
     def is_gone_on_with(task: MappingTask) -> bool:
         found = []
-        with suppress(OSError), snapshots.with_snapshots(task, options, folder, 10) as it:
+        with (
+            suppress(OSError),
+            snapshots.with_snapshots(task, options, folder, 10) as it,
+        ):
             found.append((it.snapshot_path / "1").exists())
             (it.snapshot_path / "1").mkdir(exist_ok=True)
             raise OSError("full")

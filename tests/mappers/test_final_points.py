@@ -31,7 +31,9 @@ def placed(path: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def complete(model: pycolmap.Reconstruction, path: Path, tie_points: TiePoints = NONE) -> None:
+def complete(
+    model: pycolmap.Reconstruction, path: Path, tie_points: TiePoints = NONE
+) -> None:
     native = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     native.triangulation.ignore_two_view_tracks = False
     complete_points(model, PairGraph.read(path), native, NOISE_PX, tie_points)
@@ -39,7 +41,9 @@ def complete(model: pycolmap.Reconstruction, path: Path, tie_points: TiePoints =
 
 def bits(model: pycolmap.Reconstruction) -> list[bytes]:
     """Poses, and parameters of cameras."""
-    frames = [model.frames[key].rig_from_world.params for key in sorted(model.reg_frame_ids())]
+    frames = [
+        model.frames[key].rig_from_world.params for key in sorted(model.reg_frame_ids())
+    ]
     cameras = [model.cameras[key].params for key in sorted(model.cameras)]
     return [np.asarray(values).tobytes() for values in (*frames, *cameras)]
 
@@ -53,7 +57,9 @@ def test_all_tracks_become_points_and_poses_stay_to_the_bit(tmp_path: Path) -> N
     assert bits(model) == before
     assert model.num_points3D() >= 195
     # Of 5 observations with 10 coordinates, a point takes up three.
-    assert model.compute_mean_reprojection_error() < 1.05 * NOISE_PX * np.sqrt(np.pi / 2 * 0.7)
+    assert model.compute_mean_reprojection_error() < 1.05 * NOISE_PX * np.sqrt(
+        np.pi / 2 * 0.7
+    )
 
 
 def test_no_fewer_points_than_by_colmap_and_no_larger_errors(tmp_path: Path) -> None:
@@ -62,7 +68,12 @@ def test_no_fewer_points_than_by_colmap_and_no_larger_errors(tmp_path: Path) -> 
     native = pycolmap.IncrementalPipelineOptions(random_seed=SEED, num_threads=1)
     native.triangulation.ignore_two_view_tracks = False
     theirs = pycolmap.triangulate_points(
-        copy.deepcopy(truth), path, tmp_path, tmp_path, clear_points=True, options=native
+        copy.deepcopy(truth),
+        path,
+        tmp_path,
+        tmp_path,
+        clear_points=True,
+        options=native,
     )
     model = copy.deepcopy(truth)
     for key in list(model.point3D_ids()):
@@ -70,7 +81,10 @@ def test_no_fewer_points_than_by_colmap_and_no_larger_errors(tmp_path: Path) -> 
     complete(model, path)
     theirs.update_point_3d_errors()
     assert model.num_points3D() >= theirs.num_points3D() > 200
-    assert model.compute_mean_reprojection_error() <= theirs.compute_mean_reprojection_error()
+    assert (
+        model.compute_mean_reprojection_error()
+        <= theirs.compute_mean_reprojection_error()
+    )
 
 
 def test_points_that_stood_badly_are_moved(tmp_path: Path) -> None:
@@ -126,16 +140,24 @@ def write_many_short_tracks(path: Path) -> None:
     with closing(pycolmap.Database.open(path)) as database:
         pairs, geometries = database.read_two_view_geometries()
         database.clear_two_view_geometries()
-        for number, (pair_id, geometry) in enumerate(zip(pairs, geometries, strict=True)):
+        for number, (pair_id, geometry) in enumerate(
+            zip(pairs, geometries, strict=True)
+        ):
             ids = pycolmap.pair_id_to_image_pair(pair_id)
             matches = np.array(geometry.inlier_matches)
-            seen = np.array([truth.images[ids[0]].points2D[k].point3D_id for k in matches[:, 0]])
-            geometry.inlier_matches = matches[(seen <= 150) | (seen % len(pairs) == number)]
+            seen = np.array(
+                [truth.images[ids[0]].points2D[k].point3D_id for k in matches[:, 0]]
+            )
+            geometry.inlier_matches = matches[
+                (seen <= 150) | (seen % len(pairs) == number)
+            ]
             database.write_two_view_geometry(*ids, geometry)
 
 
 def mean_error_of_two_views(model: pycolmap.Reconstruction) -> float:
-    return float(np.mean([p.error for p in model.points3D.values() if p.track.length() == 2]))
+    return float(
+        np.mean([p.error for p in model.points3D.values() if p.track.length() == 2])
+    )
 
 
 def test_tracks_of_two_images_are_refined_where_those_of_three_make_the_model(
@@ -149,7 +171,9 @@ def test_tracks_of_two_images_are_refined_where_those_of_three_make_the_model(
     assert mapped.finish is not None
     mapped.finish()
     assert bits(model) == before[0]
-    assert mean_error_of_two_views(model) < 0.95 * before[1]  # they stood where poses were at first
+    assert (
+        mean_error_of_two_views(model) < 0.95 * before[1]
+    )  # they stood where poses were at first
     assert model.num_points3D() >= 0.99 * before[2] > 700
 
 

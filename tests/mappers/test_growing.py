@@ -24,7 +24,11 @@ class Recorder(Adjuster):
     calls: list[tuple[int, bool]] = []  # noqa: RUF012 - one list for all tests, cleared by each
 
     def adjust(
-        self, model: pycolmap.Reconstruction, max_iterations: int, *given: Any, **more: Any
+        self,
+        model: pycolmap.Reconstruction,
+        max_iterations: int,
+        *given: Any,
+        **more: Any,
     ) -> float:
         is_global = not given or given[0] is None
         if max_iterations == FAST:
@@ -58,7 +62,9 @@ def test_all_is_adjusted_after_each_of_ten_images_and_then_as_the_model_grows(
     assert [size for size, is_global in Recorder.calls if not is_global] == [11, 13, 15]
 
 
-@pytest.mark.parametrize(("num_points", "makes_a_model"), [(40, True), (16, True), (8, False)])
+@pytest.mark.parametrize(
+    ("num_points", "makes_a_model"), [(40, True), (16, True), (8, False)]
+)
 def test_a_first_pair_needs_ten_points(
     tmp_path: Path, num_points: int, *, makes_a_model: bool
 ) -> None:

@@ -23,7 +23,12 @@ from verified import verified
 import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.model_files import model_poses, pose_errors, read_poses, relative_pose
+from colmap_affrect.colmap.model_files import (
+    model_poses,
+    pose_errors,
+    read_poses,
+    relative_pose,
+)
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
@@ -44,7 +49,11 @@ from colmap_affrect.stages.guide import guide
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_mapper_options_win_over_the_preset(preset: str) -> None:
-    given = {"min_model_size": "4", "init_min_num_inliers": "33", "ignore_two_view_tracks": "1"}
+    given = {
+        "min_model_size": "4",
+        "init_min_num_inliers": "33",
+        "ignore_two_view_tracks": "1",
+    }
     mapper = IncrementalMapper(IncrementalOptions.preset(preset, mapper_options=given))
     native = mapper.native(NOTHING_KNOWN, SEED)
     assert (native.min_model_size, native.mapper.init_min_num_inliers) == (4, 33)
@@ -55,7 +64,9 @@ def test_mapper_options_win_over_the_preset(preset: str) -> None:
 
 def test_values_that_colmap_does_not_accept_are_named() -> None:
     given = {"init_min_num_inliers": -4, "min_num_matches": 16}
-    with pytest.raises(OptionError, match=r"mapper\.init_min_num_inliers=-4 .*does not accept"):
+    with pytest.raises(
+        OptionError, match=r"mapper\.init_min_num_inliers=-4 .*does not accept"
+    ):
         mapper_of("incremental", mapper_options=given)
 
 
@@ -79,13 +90,17 @@ def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=3, num_points3D=150)
     wrong = mapper_of(name, mapper_options={key: -1})
-    with pytest.raises(AffrectError, match=rf"{name} mapper failed: .*tolerance") as error:
+    with pytest.raises(
+        AffrectError, match=rf"{name} mapper failed: .*tolerance"
+    ) as error:
         reconstruct(path, wrong)
     assert "\n" not in str(error.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
 
 
-def test_global_mapper_registers_all_images_in_place_and_repeatably(tmp_path: Path) -> None:
+def test_global_mapper_registers_all_images_in_place_and_repeatably(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "database.db"
     truth = synthesize(path, num_rigs=5, num_points3D=60)
     files = []
@@ -103,7 +118,9 @@ def test_global_mapper_registers_all_images_in_place_and_repeatably(tmp_path: Pa
         assert max(errors_deg) < 0.1
 
 
-def test_global_mapper_counts_tracks_of_two_images_by_our_preset_only(tmp_path: Path) -> None:
+def test_global_mapper_counts_tracks_of_two_images_by_our_preset_only(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=2, num_points3D=120)
     (model,), num_shown = reconstruct(path, mapper_of("global"))
@@ -123,17 +140,23 @@ def test_global_mapper_keeps_one_given_camera_among_others(tmp_path: Path) -> No
         camera.params = params
         database.update_camera(camera)
     task = MappingTask(path, None, cameras={2: given})
-    (model,) = map_database(mapper_of("global"), task, tmp_path / "sparse", lambda _: None)
+    (model,) = map_database(
+        mapper_of("global"), task, tmp_path / "sparse", lambda _: None
+    )
     assert len(model.registered_names) == 4
     cameras = pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras
     assert cameras[2].params.tolist() == params.tolist()
     assert abs(cameras[1].params[0] - 1280.0) < 10.0
 
 
-def test_mapper_that_cannot_extend_says_so_before_anything_is_made(tmp_path: Path) -> None:
+def test_mapper_that_cannot_extend_says_so_before_anything_is_made(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=2, num_points3D=60)
-    with pytest.raises(OptionError, match=r"the global mapper cannot; use .*mapper sparse"):
+    with pytest.raises(
+        OptionError, match=r"the global mapper cannot; use .*mapper sparse"
+    ):
         colmap_affrect.map_database(
             path,
             tmp_path / "out",
@@ -172,7 +195,8 @@ def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
     def scored(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
         names = sorted(image.name for image in mapped.reconstruction.images.values())
         return {
-            n: Confidence(p, (Doubt("few_matches"),)) for n, p in zip(names, given, strict=True)
+            n: Confidence(p, (Doubt("few_matches"),))
+            for n, p in zip(names, given, strict=True)
         }
 
     path = tmp_path / "database.db"
@@ -221,9 +245,14 @@ def two_places(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 
 @pytest.mark.parametrize(
     "mapper",
-    [pytest.param(n, marks=[pytest.mark.long] * (n != MAPPERS.default)) for n in MAPPERS.names()],
+    [
+        pytest.param(n, marks=[pytest.mark.long] * (n != MAPPERS.default))
+        for n in MAPPERS.names()
+    ],
 )
-def test_two_places_make_two_models_the_largest_first(two_places: Workspace, mapper: str) -> None:
+def test_two_places_make_two_models_the_largest_first(
+    two_places: Workspace, mapper: str
+) -> None:
     report = map_and_report(Context(two_places), mapper_of(mapper), overwrite=True)
     large = tuple(sorted(f"there/{name}" for name in NAMES[:3]))
     small = tuple(sorted(f"here/{name}" for name in NAMES[:2]))
@@ -236,7 +265,9 @@ def test_two_places_make_two_models_the_largest_first(two_places: Workspace, map
     assert [folder.name for folder in folders] == ["0", "1"]
     for folder, names in zip(folders, (large, small), strict=True):
         model = pycolmap.Reconstruction(folder)
-        assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(names)
+        assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(
+            names
+        )
 
 
 @pytest.mark.parametrize(("min_model_size", "num_models"), [(3, 1), (4, 0), (2, 2)])
@@ -249,10 +280,14 @@ def test_models_of_fewer_images_than_wanted_are_dropped(
 
 
 @pytest.mark.parametrize("min_model_size", [4, 10])
-def test_a_model_of_a_small_set_is_large_enough(tmp_path: Path, min_model_size: int) -> None:
+def test_a_model_of_a_small_set_is_large_enough(
+    tmp_path: Path, min_model_size: int
+) -> None:
     path = tmp_path / "database.db"
     synthesize(path, num_rigs=3, num_points3D=150)
-    (model,), _ = reconstruct(path, mapper_of(MAPPERS.default, min_model_size=min_model_size))
+    (model,), _ = reconstruct(
+        path, mapper_of(MAPPERS.default, min_model_size=min_model_size)
+    )
     assert len(model.registered_names) == 3
 
 

@@ -10,12 +10,18 @@ import pytest
 from mapping_tasks import synthesize
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers.model_score import ModelScorer, num_occupied_cells, pair_log_ratio
+from colmap_affrect.mappers.model_score import (
+    ModelScorer,
+    num_occupied_cells,
+    pair_log_ratio,
+)
 from colmap_affrect.mappers.pair_graph import PairGraph
 
 
 def test_an_image_has_sixty_four_cells() -> None:
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_PINHOLE", 500.0, 640, 480
+    )
     points = np.random.default_rng(0).uniform(0, (640, 480), (5000, 2))
     assert num_occupied_cells(camera, points) == 64
     assert num_occupied_cells(camera, points[(points < (80, 60)).all(axis=1)]) == 1

@@ -30,7 +30,9 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_thinned_graph_has_some_tracks_whole_and_enough_of_each_image(path: Path) -> None:
+def test_a_thinned_graph_has_some_tracks_whole_and_enough_of_each_image(
+    path: Path,
+) -> None:
     graph = PairGraph.read(path)
     thin = graph.thinned()
     assert [pair.ids for pair in thin.pairs] == [pair.ids for pair in graph.pairs]
@@ -42,13 +44,17 @@ def test_a_thinned_graph_has_some_tracks_whole_and_enough_of_each_image(path: Pa
             kept[image_id].update(features.tolist())
     assert all(len(features) >= NUM_TRACKS for features in kept.values())
     for pair, whole in zip(thin.pairs, graph.pairs, strict=True):
-        inside = [np.isin(whole.matches[:, i], list(kept[whole.ids[i]])) for i in (0, 1)]
+        inside = [
+            np.isin(whole.matches[:, i], list(kept[whole.ids[i]])) for i in (0, 1)
+        ]
         assert (inside[0] == inside[1]).all()
         assert inside[0].sum() == len(pair.matches)
     assert thin.thinned() is thin
 
 
-def test_a_model_of_some_tracks_gets_the_points_of_all(path: Path, tmp_path: Path) -> None:
+def test_a_model_of_some_tracks_gets_the_points_of_all(
+    path: Path, tmp_path: Path
+) -> None:
     (model,) = SparseMapper(SparseOptions()).map(
         task_with_given_cameras(path), tmp_path, 0, lambda _: None
     )
@@ -64,9 +70,9 @@ def test_pairs_leave_a_graph_and_what_the_mappers_see(path: Path) -> None:
     assert [pair.ids for pair in less.pairs] == [second, *others]
     assert (less.pairs[0].matches == graph.pairs[1].matches).all()
     counts = less.cache.correspondence_graph.num_matches_between_all_images()
-    assert {pycolmap.pair_id_to_image_pair(key): count for key, count in counts.items()} == {
-        pair.ids: len(pair.matches) for pair in less.pairs
-    }
+    assert {
+        pycolmap.pair_id_to_image_pair(key): count for key, count in counts.items()
+    } == {pair.ids: len(pair.matches) for pair in less.pairs}
 
 
 def test_images_get_the_cameras_of_records(path: Path) -> None:
@@ -93,7 +99,9 @@ def test_most_connected_is_the_largest_part(path: Path) -> None:
     graph = PairGraph.read(path)
     assert graph.most_connected == set(graph.keypoints)
     part = set(sorted(graph.keypoints)[:2])
-    apart = graph.without([p.ids for p in graph.pairs if len(part.intersection(p.ids)) == 1])
+    apart = graph.without(
+        [p.ids for p in graph.pairs if len(part.intersection(p.ids)) == 1]
+    )
     assert apart.most_connected == set(graph.keypoints) - part
     assert not graph.without([pair.ids for pair in graph.pairs]).most_connected
 
@@ -152,7 +160,9 @@ def lowest_agreement(graph: PairGraph, model: pycolmap.Reconstruction) -> float:
     return min(graph.agreement(pair, poses, cameras) for pair in graph.pairs)
 
 
-def test_matches_agree_that_are_a_few_pixels_off_their_epipolar_lines(tmp_path: Path) -> None:
+def test_matches_agree_that_are_a_few_pixels_off_their_epipolar_lines(
+    tmp_path: Path,
+) -> None:
     model = synthesize(tmp_path / "database.db", num_rigs=3, num_points3D=300)
     graph = PairGraph.read(tmp_path / "database.db")
     assert lowest_agreement(shifted(graph, 3.0), model) > 0.9

@@ -28,7 +28,9 @@ def scene(tmp_path: Path, num_images: int = 5) -> tuple[MappedModel, MappingTask
     path = tmp_path / "database.db"
     model = synthesize(path, seed=5, num_rigs=num_images, num_points3D=250)
     records = {
-        image.camera_id: CameraRecord((image.name,), "exif", image.camera.mean_focal_length())
+        image.camera_id: CameraRecord(
+            (image.name,), "exif", image.camera.mean_focal_length()
+        )
         for image in model.images.values()
     }
     return MappedModel(model), MappingTask(path, tmp_path, cameras=records)
@@ -45,13 +47,19 @@ def test_right_models_are_sure(tmp_path: Path, num_images: int) -> None:
     assert min(one.probability for one in found.values()) >= SURE
 
 
-def test_image_that_contradicts_its_pairs_is_doubted_and_the_others_are_not(tmp_path: Path) -> None:
+def test_image_that_contradicts_its_pairs_is_doubted_and_the_others_are_not(
+    tmp_path: Path,
+) -> None:
     mapped, task = scene(tmp_path)
     image = last(mapped)
-    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.05])), np.array([1.0, 2, 3]))
+    turn = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([0.1, 0.2, 0.05])), np.array([1.0, 2, 3])
+    )
     image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
     found = score_images(mapped, task)
-    assert [name for name, one in found.items() if one.probability < DOUBTFUL] == [image.name]
+    assert [name for name, one in found.items() if one.probability < DOUBTFUL] == [
+        image.name
+    ]
     features = features_of(mapped, task)[image.name]
     assert features.agreement < 0.2
     assert features.log_likelihood_ratio < 0.0
@@ -70,7 +78,10 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
             replace(good, num_three_view_points=0),
             "none of its points is seen by two other",
         ),
-        "focal observability": (replace(good, focal_growth=0.001), "any focal length fits"),
+        "focal observability": (
+            replace(good, focal_growth=0.001),
+            "any focal length fits",
+        ),
         "given focal length": (
             replace(good, focal_px=720.4, fitting_focal_px=910.2),
             "the given focal length does not fit, 720 px: 910 px does",
@@ -79,8 +90,14 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
             replace(good, pure_rotation_ratio=1.0),
             "only turned explains 100% of the matches",
         ),
-        "mirrored copy": (replace(good, mirrored_original="c.jpg"), "mirrored copy of c.jpg"),
-        "focal spread": (replace(good, focal_spread=1.65), "are up to 1.65 times apart"),
+        "mirrored copy": (
+            replace(good, mirrored_original="c.jpg"),
+            "mirrored copy of c.jpg",
+        ),
+        "focal spread": (
+            replace(good, focal_spread=1.65),
+            "are up to 1.65 times apart",
+        ),
     }
     assert bad.keys() == TERMS.keys()
     for name, (features, text) in bad.items():
@@ -126,34 +143,49 @@ def test_terms_are_those_that_the_weights_were_fitted_to(
 
 
 def test_two_reasons_are_said_and_no_small_ones() -> None:
-    doubted = replace(GOOD, log_likelihood_ratio=-20.0, agreement=0.2, mirrored_original="c.jpg")
+    doubted = replace(
+        GOOD, log_likelihood_ratio=-20.0, agreement=0.2, mirrored_original="c.jpg"
+    )
     assert len(confidence(doubted).reasons) == 2
     small = replace(GOOD, log_likelihood_ratio=-20.0, num_three_view_points=60)
     assert [doubt.code for doubt in confidence(small).reasons] == ["matches_disagree"]
     both = confidence(replace(small, num_three_view_points=3)).reasons
-    assert [doubt.code for doubt in both] == ["matches_disagree", "few_three_view_points"]
+    assert [doubt.code for doubt in both] == [
+        "matches_disagree",
+        "few_three_view_points",
+    ]
 
 
 def test_a_bridge_edge_counts_by_its_inliers() -> None:
     probabilities = []
     for num_inliers in (15, 35, 55, 100):
-        features = replace(GOOD, bridge_edge="a.jpg - b.jpg", num_bridge_inliers=num_inliers)
-        probabilities.append(confidence(features).probability / confidence(GOOD).probability)
+        features = replace(
+            GOOD, bridge_edge="a.jpg - b.jpg", num_bridge_inliers=num_inliers
+        )
+        probabilities.append(
+            confidence(features).probability / confidence(GOOD).probability
+        )
     assert probabilities == pytest.approx([0.12, 0.5, 0.88, 1.0], abs=0.01)
 
 
-def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses() -> None:
+def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses() -> (
+    None
+):
     probabilities = []
     for sigma_deg in (0.0, 1.0, 3.0, 6.0, 60.0):
         features = replace(GOOD, direction_sigma_deg=sigma_deg)
-        probabilities.append(confidence(features).probability / confidence(GOOD).probability)
+        probabilities.append(
+            confidence(features).probability / confidence(GOOD).probability
+        )
     assert probabilities == pytest.approx([1.0, 1.0, 0.94, 0.5, 0.007], abs=0.005)
     at_one_place = confidence(replace(GOOD, direction_sigma_deg=6.0))
     assert at_one_place.reasons == (Doubt("near_others", {"sigma_deg": 6.0}),)
     assert at_one_place.gain < 0.1  # more matches do not help
 
 
-def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(tmp_path: Path) -> None:
+def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(
+    tmp_path: Path,
+) -> None:
     mapped, task = scene(tmp_path, 5)
     ids = sorted(mapped.reconstruction.reg_image_ids())
     with open_database(task.database_path) as database:
@@ -167,7 +199,10 @@ def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(tmp_path: Pa
     assert [bool(found[name].bridge_edge) for name in names] == [False] * 3 + [True] * 2
     assert found[names[3]].bridge_edge == f"{names[1]} - {names[4]}"
     assert found[names[3]].num_bridge_inliers == num
-    alone, few = (confidence(replace(found[names[3]], num_bridge_inliers=num)) for num in (200, 29))
+    alone, few = (
+        confidence(replace(found[names[3]], num_bridge_inliers=num))
+        for num in (200, 29)
+    )
     assert few.probability < DOUBTFUL < alone.probability - 0.3
     edge = {"num_inliers": 29, "pair": f"{names[1]} - {names[4]}"}
     assert Doubt("bridge_edge", edge) in few.reasons
@@ -186,15 +221,25 @@ def test_camera_that_only_turned(tmp_path: Path) -> None:
         points = np.array([point.xy for point in image.points2D], np.float64)
         for index, point in enumerate(image.points2D):
             if point.has_point3D():
-                ray = matrix @ (pose * mapped.reconstruction.point3D(point.point3D_id).xyz)
+                ray = matrix @ (
+                    pose * mapped.reconstruction.point3D(point.point3D_id).xyz
+                )
                 points[index] = 0.9 * size.max() * ray[:2] / ray[2] + size / 2
         return points
 
-    assert max(one.pure_rotation_ratio for one in features_of(mapped, task).values()) < 0.3
+    assert (
+        max(one.pure_rotation_ratio for one in features_of(mapped, task).values()) < 0.3
+    )
     with open_database(task.database_path) as database:
         for image_id, image in mapped.reconstruction.images.items():
             database.update_keypoints(image_id, turned(image).astype(np.float32))
-    assert min(one.pure_rotation_ratio for one in features_of(mapped, replace(task)).values()) > 0.9
+    assert (
+        min(
+            one.pure_rotation_ratio
+            for one in features_of(mapped, replace(task)).values()
+        )
+        > 0.9
+    )
 
 
 def test_only_focal_lengths_that_the_model_tells_are_compared(tmp_path: Path) -> None:
@@ -207,7 +252,9 @@ def test_only_focal_lengths_that_the_model_tells_are_compared(tmp_path: Path) ->
         assert [one.focal_spread for one in found.values()] == pytest.approx([zoom] * 5)
 
 
-def add_mirrored_copy(mapped: MappedModel, task: MappingTask, ids: tuple[int, int]) -> None:
+def add_mirrored_copy(
+    mapped: MappedModel, task: MappingTask, ids: tuple[int, int]
+) -> None:
     """Let image ``ids[1]`` have the keypoints of a smaller mirrored copy of the other, too.
 
     Of its own only half stay right.
@@ -216,7 +263,10 @@ def add_mirrored_copy(mapped: MappedModel, task: MappingTask, ids: tuple[int, in
     camera = copy.camera
     with open_database(task.database_path) as database:
         points = 0.75 * database.read_keypoints(image.image_id)[:, :2]
-        camera.width, camera.height = int(0.75 * camera.width), int(0.75 * camera.height)
+        camera.width, camera.height = (
+            int(0.75 * camera.width),
+            int(0.75 * camera.height),
+        )
         database.update_camera(camera)
         points[:, 0] = camera.width - points[:, 0]
         old = database.read_keypoints(copy.image_id)[:, :2]
@@ -229,7 +279,9 @@ def test_mirrored_copy_is_told_from_the_photograph(tmp_path: Path) -> None:
     add_mirrored_copy(mapped, task, (4, 1))
     images = mapped.reconstruction.images
     features = features_of(mapped, task)
-    originals = {name: of_image.mirrored_original for name, of_image in features.items()}
+    originals = {
+        name: of_image.mirrored_original for name, of_image in features.items()
+    }
     assert originals.pop(images[1].name) == images[4].name
     assert set(originals.values()) == {""}
 
@@ -238,7 +290,9 @@ def test_dense_keypoints_are_no_mirrored_copies() -> None:
     rng = np.random.default_rng(2)
     size = (320, 240)
     smaller = (256, 192)
-    few, many, others = (rng.uniform(0, size, (number, 2)) for number in (900, 12000, 12000))
+    few, many, others = (
+        rng.uniform(0, size, (number, 2)) for number in (900, 12000, 12000)
+    )
     assert mirrored_share(many, others, (size, size)) < 0.3
     assert mirrored_share(many, many, (size, size)) < 0.3
     for axis in (0, 1):
@@ -265,9 +319,15 @@ def ring(folder: Path, views_per_point: int) -> tuple[MappedModel, MappingTask]:
     """
     random = np.random.default_rng(4)
     camera = pycolmap.Camera(
-        camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=[1500, 320, 240, 0]
+        camera_id=1,
+        model="SIMPLE_RADIAL",
+        width=640,
+        height=480,
+        params=[1500, 320, 240, 0],
     )
-    record = CameraRecord(tuple(f"{number}.jpg" for number in range(NUM_IMAGES)), "guess", 1500.0)
+    record = CameraRecord(
+        tuple(f"{number}.jpg" for number in range(NUM_IMAGES)), "guess", 1500.0
+    )
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
     places = random.uniform(-0.7, 0.7, (600, 3))
@@ -276,21 +336,31 @@ def ring(folder: Path, views_per_point: int) -> tuple[MappedModel, MappingTask]:
     with open_database(folder / "database.db") as database:
         write_images(database, camera, record.names)
         for number in range(NUM_IMAGES):
-            turn = pycolmap.Rotation3d(np.array([0.0, np.deg2rad(STEP_DEG * number), 0.0]))
+            turn = pycolmap.Rotation3d(
+                np.array([0.0, np.deg2rad(STEP_DEG * number), 0.0])
+            )
             pose = pycolmap.Rigid3d(turn, np.array([0.0, 0.0, DISTANCE]))
-            rows = np.flatnonzero((first <= number) & (number < first + views_per_point))
+            rows = np.flatnonzero(
+                (first <= number) & (number < first + views_per_point)
+            )
             pixels = np.array([camera.img_from_cam(pose * places[row]) for row in rows])
             pixels += random.normal(0.0, NOISE_PX, pixels.shape)
-            image = pycolmap.Image(f"{number}.jpg", pixels, camera_id=1, image_id=number + 1)
+            image = pycolmap.Image(
+                f"{number}.jpg", pixels, camera_id=1, image_id=number + 1
+            )
             model.add_image_with_trivial_frame(image, pose)
             for index, row in enumerate(rows):
                 tracks[row].add_element(number + 1, index)
     for place, track in zip(places, tracks, strict=True):
         model.add_point3D(place, track)
-    return MappedModel(model), MappingTask(folder / "database.db", None, cameras={1: record})
+    return MappedModel(model), MappingTask(
+        folder / "database.db", None, cameras={1: record}
+    )
 
 
-def test_points_of_many_images_tell_focal_lengths_that_nobody_knows(tmp_path: Path) -> None:
+def test_points_of_many_images_tell_focal_lengths_that_nobody_knows(
+    tmp_path: Path,
+) -> None:
     growths = {}
     for views_per_point in (2, 4):
         folder = tmp_path / str(views_per_point)
@@ -310,12 +380,19 @@ def test_given_focal_lengths_are_doubted_where_the_points_say_others(
     camera = mapped.reconstruction.cameras[1]
     camera.params = [factor * 1500.0, 320, 240, 0]
     record = replace(
-        task.cameras[1], source="given", focal_px=factor * 1500.0, given=("focal", "distortion")
+        task.cameras[1],
+        source="given",
+        focal_px=factor * 1500.0,
+        given=("focal", "distortion"),
     )
     found = features_of(mapped, replace(task, cameras={1: record}))
     fitting = {one.fitting_focal_px for one in found.values()}
     assert len(fitting) == 1
-    assert fitting == {0.0} if factor == 1.0 else min(fitting) == pytest.approx(1500.0, rel=0.05)
+    assert (
+        fitting == {0.0}
+        if factor == 1.0
+        else min(fitting) == pytest.approx(1500.0, rel=0.05)
+    )
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])
@@ -326,7 +403,13 @@ def test_distortion_does_not_hide_that_a_given_focal_length_is_wrong(
     focal_px = factor * 1500.0
     mapped.reconstruction.cameras[1].params = [focal_px, 320, 240, 0]
     refining = pycolmap.BundleAdjustmentOptions()
-    Adjuster({1: CameraPrior(focal_px, 0.0)}, 0.7, refining).adjust(mapped.reconstruction, 300)
-    record = replace(task.cameras[1], source="given", focal_px=focal_px, given=("focal",))
-    found = features_of(mapped, replace(task, cameras={1: record}))["2.jpg"].fitting_focal_px
+    Adjuster({1: CameraPrior(focal_px, 0.0)}, 0.7, refining).adjust(
+        mapped.reconstruction, 300
+    )
+    record = replace(
+        task.cameras[1], source="given", focal_px=focal_px, given=("focal",)
+    )
+    found = features_of(mapped, replace(task, cameras={1: record}))[
+        "2.jpg"
+    ].fitting_focal_px
     assert found == 0.0 if factor == 1.0 else found == pytest.approx(1500.0, rel=0.05)

@@ -18,7 +18,10 @@ from colmap_affrect.colmap.model_files import all_see_long_tracks, num_long_trac
 from colmap_affrect.mappers import reliability_features
 from colmap_affrect.mappers.adjustment import EarlyStop
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.focal_observability import MAX_NUM_OBSERVATIONS, with_fewer_points
+from colmap_affrect.mappers.focal_observability import (
+    MAX_NUM_OBSERVATIONS,
+    with_fewer_points,
+)
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.search import first_pairs
@@ -28,7 +31,12 @@ SIZE = (1024, 768)
 
 def synthesize_rig(path: Path, **options: Any) -> pycolmap.Reconstruction:
     """Make a verified database of one rig of three cameras and four frames."""
-    given = {"num_rigs": 1, "num_cameras_per_rig": 3, "num_frames_per_rig": 4, **options}
+    given = {
+        "num_rigs": 1,
+        "num_cameras_per_rig": 3,
+        "num_frames_per_rig": 4,
+        **options,
+    }
     return synthesize(path, num_points3D=100, **given)
 
 
@@ -52,11 +60,17 @@ def test_pairs_of_a_rig_with_itself_tell_no_rotation(
         return 0.25
 
     monkeypatch.setattr(reliability_features, "pure_rotation_ratio", share)
-    found = reliability_features.features_of(MappedModel(model), MappingTask(path, None))
+    found = reliability_features.features_of(
+        MappedModel(model), MappingTask(path, None)
+    )
     assert len(found) == 12
     assert {features.pure_rotation_ratio for features in found.values()} == {0.25}
     num_frames = 4
-    assert num_frames <= len(measured) <= reliability_features.NUM_ROTATION_PAIRS * num_frames
+    assert (
+        num_frames
+        <= len(measured)
+        <= reliability_features.NUM_ROTATION_PAIRS * num_frames
+    )
 
 
 def test_models_with_enough_long_tracks_are_told_from_others(tmp_path: Path) -> None:
@@ -87,13 +101,17 @@ def test_rig_is_mapped_and_judged_with_few_evaluations(
 
     monkeypatch.setattr(pyceres, "solve", counting)
     task = MappingTask(path, None, cameras=unknown_cameras(path))
-    (model,) = map_database(mapper_of(mapper), task, tmp_path / "sparse", lambda _: None)
+    (model,) = map_database(
+        mapper_of(mapper), task, tmp_path / "sparse", lambda _: None
+    )
     assert len(model.registered_names) == 12
     assert min(model.probabilities.values()) > 0.9
     assert 0 < evaluated < most
 
 
-def test_image_of_a_rig_that_sees_next_to_nothing_is_as_sure_as_the_others(tmp_path: Path) -> None:
+def test_image_of_a_rig_that_sees_next_to_nothing_is_as_sure_as_the_others(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "database.db"
     synthesize_rig(path)
     with open_database(path) as database:
@@ -103,7 +121,9 @@ def test_image_of_a_rig_that_sees_next_to_nothing_is_as_sure_as_the_others(tmp_p
             if blind.intersection(ids):
                 database.delete_two_view_geometry(*ids)
     task = MappingTask(path, None)
-    (model,) = map_database(mapper_of("incremental"), task, tmp_path / "sparse", lambda _: None)
+    (model,) = map_database(
+        mapper_of("incremental"), task, tmp_path / "sparse", lambda _: None
+    )
     assert len(model.registered_names) == 12
     assert min(model.probabilities.values()) > 0.9
     assert not model.taken_out
@@ -113,7 +133,9 @@ def test_first_pairs_are_of_two_frames_as_long_as_there_are_any(tmp_path: Path) 
     synthesize_rig(tmp_path / "database.db")
     graph = PairGraph.read(tmp_path / "database.db")
     images = graph.cache.images
-    frames = [{images[i].frame_id for i in p.ids} for p in first_pairs(graph.pairs, graph)]
+    frames = [
+        {images[i].frame_id for i in p.ids} for p in first_pairs(graph.pairs, graph)
+    ]
     sizes = [len(frame) for frame in frames]
     assert len(sizes) == len(graph.pairs)
     assert sizes == sorted(sizes, reverse=True)
@@ -124,7 +146,9 @@ def test_one_frame_of_a_wide_rig_is_a_model(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     synthesize_rig(path, num_frames_per_rig=1, sensor_from_rig_translation_stddev=1.0)
     task = MappingTask(path, None)
-    (model,) = map_database(mapper_of("sparse"), task, tmp_path / "sparse", lambda _: None)
+    (model,) = map_database(
+        mapper_of("sparse"), task, tmp_path / "sparse", lambda _: None
+    )
     assert len(model.registered_names) == 3
 
 
@@ -176,13 +200,21 @@ class Step:
 @pytest.mark.parametrize(
     ("changes", "num_steps"),
     [
-        ([500.0, 100.0, 1.0, 1.0], 3),  # nothing that is left brings it near to the other cost
+        (
+            [500.0, 100.0, 1.0, 1.0],
+            3,
+        ),  # nothing that is left brings it near to the other cost
         ([500.0, 400.0, 30.0, 0.01, 0.01, 0.01], 6),  # it hardly gets nearer any more
         ([500.0, 400.0, 30.0, 0.01, 0.5, 0.01], 6),  # only some steps bring little
-        ([500.0, 400.0, 30.0, 0.1, 0.1, 0.1, 0.1, 0.1], 8),  # they still bring it nearer
+        (
+            [500.0, 400.0, 30.0, 0.1, 0.1, 0.1, 0.1, 0.1],
+            8,
+        ),  # they still bring it nearer
     ],
 )
-def test_trial_ends_once_its_cost_tells_enough(changes: list[float], num_steps: int) -> None:
+def test_trial_ends_once_its_cost_tells_enough(
+    changes: list[float], num_steps: int
+) -> None:
     early_stop = EarlyStop(other_cost=100.0, enough=2.0, max_iterations=100)
     cost = 1100.0 if num_steps == 3 else 1050.0
     taken = 0

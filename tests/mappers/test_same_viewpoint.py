@@ -24,7 +24,9 @@ TURNED = np.array([[0.9, 0.05, 10.0], [-0.02, 0.95, 8.0], [5e-4, 0.0, 1.0]])
 
 def texture(seed: int) -> np.ndarray:
     noise = np.random.default_rng(seed).normal(0, 40, (HEIGHT // 4, WIDTH // 4))
-    return np.asarray(cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) + 128)
+    return np.asarray(
+        cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) + 128
+    )
 
 
 def printed(photograph: np.ndarray, homography: np.ndarray = PRINT) -> np.ndarray:
@@ -32,17 +34,27 @@ def printed(photograph: np.ndarray, homography: np.ndarray = PRINT) -> np.ndarra
     centres = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
     moved = centres @ homography @ np.linalg.inv(centres)
     faded = 0.5 * photograph + 60
-    return np.asarray(cv2.warpPerspective(faded, moved, (WIDTH, HEIGHT), borderValue=250.0))
+    return np.asarray(
+        cv2.warpPerspective(faded, moved, (WIDTH, HEIGHT), borderValue=250.0)
+    )
 
 
 def test_prints_of_one_negative_are_one_view(tmp_path: Path) -> None:
-    photographs = {"a.png": texture(1), "b.png": printed(texture(1)), "c.png": printed(texture(2))}
+    photographs = {
+        "a.png": texture(1),
+        "b.png": printed(texture(1)),
+        "c.png": printed(texture(2)),
+    }
     photographs["d.png"] = printed(texture(1), TURNED)
     photographs["e.png"] = printed(0.5 * texture(1) + 0.6 * texture(3))
     for name, content in photographs.items():
         cv2.imwrite(str(tmp_path / name), np.clip(content, 0, 255).astype(np.uint8))
-    points = np.random.default_rng(3).uniform((20, 20), (WIDTH - 20, HEIGHT - 20), (60, 2))
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500, WIDTH, HEIGHT)
+    points = np.random.default_rng(3).uniform(
+        (20, 20), (WIDTH - 20, HEIGHT - 20), (60, 2)
+    )
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_PINHOLE", 500, WIDTH, HEIGHT
+    )
     moved = project(PRINT, points)
     moved[:8] += 30.0  # wrong ones
     geometry = pycolmap.TwoViewGeometry()
@@ -62,11 +74,15 @@ def test_prints_of_one_negative_are_one_view(tmp_path: Path) -> None:
 
 
 def test_points_that_one_view_sees_twice_are_of_two_views() -> None:
-    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=30))
+    model = pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(num_points3D=30)
+    )
     images = sorted(model.reg_image_ids())
     for point_id in sorted(model.point3D_ids()):
         model.delete_point3D(point_id)
-    track = pycolmap.Track([pycolmap.TrackElement(image_id, 0) for image_id in images[:3]])
+    track = pycolmap.Track(
+        [pycolmap.TrackElement(image_id, 0) for image_id in images[:3]]
+    )
     model.add_point3D(np.zeros(3), track)
     assert num_long_tracks(model, {}) == dict.fromkeys(images[:3], 1)
     assert not num_long_tracks(model, {images[2]: images[0]})

@@ -32,7 +32,11 @@ from colmap_affrect.mappers.camera_priors import (
     camera_priors,
 )
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer, pair_log_ratio
+from colmap_affrect.mappers.model_score import (
+    MIN_SCORE_GAIN,
+    ModelScorer,
+    pair_log_ratio,
+)
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.sparse import COLMAP_MODEL, OWN_CAMERAS
@@ -49,7 +53,9 @@ Scene = tuple[Path, pycolmap.Reconstruction]
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """A verified database of images with a camera each, and the truth."""
     path = tmp_path_factory.mktemp("scene") / "database.db"
-    return path, synthesize(path, num_rigs=NUM_IMAGES, num_points3D=150, noise_px=NOISE_PX)
+    return path, synthesize(
+        path, num_rigs=NUM_IMAGES, num_points3D=150, noise_px=NOISE_PX
+    )
 
 
 @pytest.fixture
@@ -88,7 +94,9 @@ def adjuster(
 def test_what_is_known_of_a_focal_length(
     record: CameraRecord | None, focal_px: float, sigma: float
 ) -> None:
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE)
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE
+    )
     assert camera_prior(camera, record) == CameraPrior(focal_px, sigma)
 
 
@@ -100,9 +108,13 @@ def test_a_prior_costs_by_its_deviation_and_nothing_where_it_is_held() -> None:
     assert CameraPrior(1000.0, 0.0).cost(2000.0) == 0.0
 
 
-def test_adjustment_finds_focal_lengths_that_points_know(model: pycolmap.Reconstruction) -> None:
+def test_adjustment_finds_focal_lengths_that_points_know(
+    model: pycolmap.Reconstruction,
+) -> None:
     widen(model, 1.1)
-    adjuster(model, CameraPrior(USUAL_FOCAL * SIZE[0], USUAL_SIGMA)).adjust(model, FINAL)
+    adjuster(model, CameraPrior(USUAL_FOCAL * SIZE[0], USUAL_SIGMA)).adjust(
+        model, FINAL
+    )
     assert focals(model) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.02)
 
 
@@ -151,7 +163,9 @@ def test_a_wrong_pose_and_an_unlikely_lens_have_a_lower_score(
     unlikely = dict.fromkeys(model.cameras, CameraPrior(2 * TRUE_FOCAL, EXIF_SIGMA))
     assert ModelScorer(graph, unlikely).score(model) < right - 3.0
     image = model.images[max(model.reg_image_ids())]
-    turned = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.5, 0.0])), np.zeros(3))
+    turned = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([0.0, 0.5, 0.0])), np.zeros(3)
+    )
     image.frame.rig_from_world = turned * image.frame.rig_from_world
     assert ModelScorer(graph, prior).score(model) < right - 3.0
 
@@ -160,7 +174,10 @@ def test_a_wrong_pose_and_an_unlikely_lens_have_a_lower_score(
 def found(scene: Scene, tmp_path: Path) -> list[Any]:
     """Summaries of the models of cameras that nobody knows."""
     return map_database(
-        mapper_of("sparse"), task_of(scene, UNKNOWN), tmp_path / "sparse", lambda _: None
+        mapper_of("sparse"),
+        task_of(scene, UNKNOWN),
+        tmp_path / "sparse",
+        lambda _: None,
     )
 
 
@@ -168,7 +185,9 @@ def test_cameras_that_nobody_knows_come_out_right_and_the_same_each_time(
     scene: Scene, found: list[Any], tmp_path: Path
 ) -> None:
     assert [len(model.registered_names) for model in found] == [NUM_IMAGES]
-    assert list(found[0].focals_px.values()) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.05)
+    assert list(found[0].focals_px.values()) == pytest.approx(
+        [TRUE_FOCAL] * NUM_IMAGES, rel=0.05
+    )
     again = map_database(
         mapper_of("sparse"), task_of(scene, UNKNOWN), tmp_path / "again", lambda _: None
     )
@@ -194,7 +213,9 @@ def test_given_focal_lengths_are_refined_where_that_is_asked_for(
     assert (set(focals(found.reconstruction)) == {TRUE_FOCAL}) is keep
 
 
-def test_an_adjustment_of_some_images_holds_cameras_that_others_share(tmp_path: Path) -> None:
+def test_an_adjustment_of_some_images_holds_cameras_that_others_share(
+    tmp_path: Path,
+) -> None:
     model = write_shared(tmp_path / "database.db", TRUE_FOCAL, 150)
     (camera,) = model.cameras.values()
     widen(model, 1.05)
@@ -204,7 +225,9 @@ def test_an_adjustment_of_some_images_holds_cameras_that_others_share(tmp_path: 
     assert camera.params.tolist() == before
 
 
-def write_shared(path: Path, focal_px: float, num_points: int) -> pycolmap.Reconstruction:
+def write_shared(
+    path: Path, focal_px: float, num_points: int
+) -> pycolmap.Reconstruction:
     """Write verified pairs of four images that share a camera; return the truth."""
     params = [focal_px, SIZE[0] / 2, SIZE[1] / 2, 0.0]
     return synthesize(
@@ -220,21 +243,29 @@ def test_a_camera_that_images_share_is_found_from_wide_to_long(
     truth = write_shared(tmp_path / "database.db", focal_px, 600)
     (camera,) = truth.cameras
     task = MappingTask(tmp_path / "database.db", None, cameras={camera: UNKNOWN})
-    model, *_ = map_database(mapper_of("sparse"), task, tmp_path / "sparse", lambda _: None)
+    model, *_ = map_database(
+        mapper_of("sparse"), task, tmp_path / "sparse", lambda _: None
+    )
     assert len(model.registered_names) == 4
     assert list(model.focals_px.values()) == pytest.approx([focal_px] * 4, rel=0.03)
 
 
-@pytest.mark.parametrize(("options", "num_images"), [({}, 2), ({"max_focal_length_ratio": 10}, 0)])
+@pytest.mark.parametrize(
+    ("options", "num_images"), [({}, 2), ({"max_focal_length_ratio": 10}, 0)]
+)
 def test_a_narrow_lens_makes_a_model_unless_that_is_forbidden(
     tmp_path: Path, options: dict[str, Any], num_images: int
 ) -> None:
     focal_px = 12.0 * SIZE[0]
-    write_shared(tmp_path / "database.db", focal_px, 20_000)  # two images see the same of them
+    write_shared(
+        tmp_path / "database.db", focal_px, 20_000
+    )  # two images see the same of them
     task = MappingTask(
         tmp_path / "database.db", None, cameras={1: replace(WHOLE, focal_px=focal_px)}
     )
-    found = map_database(mapper_of("sparse", **options), task, tmp_path / "sparse", lambda _: None)
+    found = map_database(
+        mapper_of("sparse", **options), task, tmp_path / "sparse", lambda _: None
+    )
     assert sum(len(model.registered_names) for model in found) == num_images
 
 
@@ -257,12 +288,16 @@ class RecordingSearch(Search):
 
     tried_px: list[float] = field(default_factory=list)
 
-    def with_bridges(self, graph: PairGraph, models: Sequence[MappedModel]) -> list[MappedModel]:
+    def with_bridges(
+        self, graph: PairGraph, models: Sequence[MappedModel]
+    ) -> list[MappedModel]:
         self.tried_px.append(self.adjuster.priors[1].focal_px)
         return super().with_bridges(graph, models)
 
 
-def test_bridges_are_built_anew_with_a_focal_length_that_a_model_has_found(tmp_path: Path) -> None:
+def test_bridges_are_built_anew_with_a_focal_length_that_a_model_has_found(
+    tmp_path: Path,
+) -> None:
     """The first one is off by 15 per cent."""
     path = tmp_path / "database.db"
     matrix = np.array([[977.5, 0.0, 480.0], [0.0, 977.5, 360.0], [0.0, 0.0, 1.0]])
@@ -273,7 +308,9 @@ def test_bridges_are_built_anew_with_a_focal_length_that_a_model_has_found(tmp_p
     graph = PairGraph.read(path)
     priors = camera_priors(graph.cameras.values(), {1: record}, {})
     adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
-    search = RecordingSearch(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
+    search = RecordingSearch(
+        adjuster, ModelScorer(graph, priors), native, 6, lambda _: None
+    )
     (found,) = search.best(graph)
     assert found.reconstruction.num_reg_images() == 4
     assert search.tried_px == pytest.approx([USUAL_FOCAL * 1000, 977.5], rel=0.02)
@@ -295,12 +332,20 @@ def test_cameras_of_one_image_each_begin_at_focal_lengths_from_wide_to_long(
     graph = PairGraph.read(scene[0])
     priors = camera_priors(graph.cameras.values(), task.cameras, {})
     adjuster = Adjuster(priors, NOISE_PX, native.get_global_bundle_adjustment())
-    search = NeverCertain(adjuster, ModelScorer(graph, priors), native, 1, lambda _: None)
+    search = NeverCertain(
+        adjuster, ModelScorer(graph, priors), native, 1, lambda _: None
+    )
     (found,) = search.best(graph)
-    assert focals(found.reconstruction) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.03)
+    assert focals(found.reconstruction) == pytest.approx(
+        [TRUE_FOCAL] * NUM_IMAGES, rel=0.03
+    )
     for zoom in ZOOMS:
         assert (
-            min(abs(tried / (zoom * USUAL_FOCAL * SIZE[0]) - 1) for tried in search.tried_px) < 0.01
+            min(
+                abs(tried / (zoom * USUAL_FOCAL * SIZE[0]) - 1)
+                for tried in search.tried_px
+            )
+            < 0.01
         )
 
 
@@ -308,9 +353,13 @@ def test_colmaps_own_model_is_taken_where_ours_scores_lower(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Search, "best", lambda *_: [])
-    (found,) = mapper_of("sparse").map(task_of(scene, UNKNOWN), tmp_path, 0, lambda _: None)
+    (found,) = mapper_of("sparse").map(
+        task_of(scene, UNKNOWN), tmp_path, 0, lambda _: None
+    )
     assert found.moves == (COLMAP_MODEL,)
-    assert focals(found.reconstruction) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.05)
+    assert focals(found.reconstruction) == pytest.approx(
+        [TRUE_FOCAL] * NUM_IMAGES, rel=0.05
+    )
     assert not mapper_of("sparse").map(
         task_with_given_cameras(scene[0]), tmp_path, 0, lambda _: None
     )
@@ -336,7 +385,9 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
     parts = []
     for seed, count in ((3, 4), (8, 2)):
         parts.append(path.with_name(f"{count}.db"))
-        synthesize(parts[-1], seed=seed, num_rigs=count, num_points3D=200, noise_px=NOISE_PX)
+        synthesize(
+            parts[-1], seed=seed, num_rigs=count, num_points3D=200, noise_px=NOISE_PX
+        )
         with closing(sqlite3.connect(parts[-1])) as connection, connection:
             connection.execute("UPDATE images SET name = ? || name", (f"{count}/",))
     with open_database(path) as both:
@@ -344,7 +395,9 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
             pycolmap.Database.merge(one, other, both)
         images = both.read_all_images()
         middle = np.array(SIZE) / 2
-        enlarged = min(image.image_id for image in images if image.name.startswith("4/"))
+        enlarged = min(
+            image.image_id for image in images if image.name.startswith("4/")
+        )
         keypoints = both.read_keypoints(enlarged)
         keypoints[:, :2] = (keypoints[:, :2] - middle) * 1.7 + middle
         both.update_keypoints(enlarged, keypoints)
@@ -353,15 +406,20 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
     return {i.camera_id: replace(UNKNOWN, names=(i.name,)) for i in images}
 
 
-def test_photographs_get_own_cameras_and_models_of_other_places_stay(tmp_path: Path) -> None:
+def test_photographs_get_own_cameras_and_models_of_other_places_stay(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "database.db"
     task = MappingTask(path, None, cameras=two_places(path), may_share=True)
     large, small = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
     assert (large.moves[-1], small.moves) == (OWN_CAMERAS, ("with all pairs",))
     found = sorted(
-        camera.mean_focal_length() for camera in cameras_of(large.reconstruction).values()
+        camera.mean_focal_length()
+        for camera in cameras_of(large.reconstruction).values()
     )
-    assert found == pytest.approx([TRUE_FOCAL, TRUE_FOCAL, TRUE_FOCAL, 1.7 * TRUE_FOCAL], rel=0.03)
+    assert found == pytest.approx(
+        [TRUE_FOCAL, TRUE_FOCAL, TRUE_FOCAL, 1.7 * TRUE_FOCAL], rel=0.03
+    )
     assert small.reconstruction.num_reg_images() == 2
     known = replace(task, previous_models=[large, small])
     again = mapper_of("sparse").map(known, tmp_path, 0, lambda _: None)

@@ -16,7 +16,12 @@ from wall_scene import is_inside, project, turned, views, wall, write_scene
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
-from colmap_affrect.colmap.model_files import Poses, model_poses, pose_errors, relative_pose
+from colmap_affrect.colmap.model_files import (
+    Poses,
+    model_poses,
+    pose_errors,
+    relative_pose,
+)
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
@@ -46,14 +51,18 @@ def relative_errors(
 ) -> tuple[float, float]:
     """Errors in degrees of rotation and direction between two images."""
     found = model_poses(model.reconstruction)
-    return pose_errors(*(relative_pose(poses[first], poses[second]) for poses in (found, truth)))
+    return pose_errors(
+        *(relative_pose(poses[first], poses[second]) for poses in (found, truth))
+    )
 
 
 def centers(poses: Poses) -> NDArray[np.float64]:
     return np.array([-poses[name][0].T @ poses[name][1] for name in sorted(poses)])
 
 
-def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path) -> None:
+def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(
+    tmp_path: Path,
+) -> None:
     truth = views(6)
     path = tmp_path / "database.db"
     write_scene(path, truth, [(i, i + 1) for i in range(5)])
@@ -62,7 +71,8 @@ def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path
     found = model_poses(model.reconstruction)
     assert sorted(found) == sorted(truth)
     steps, true_steps = (
-        np.linalg.norm(np.diff(centers(poses), axis=0), axis=1) for poses in (found, truth)
+        np.linalg.norm(np.diff(centers(poses), axis=0), axis=1)
+        for poses in (found, truth)
     )
     ratios = (steps / true_steps) / (steps[0] / true_steps[0])
     np.testing.assert_allclose(ratios, 1.0, atol=MAX_SCALE_ERROR)
@@ -83,7 +93,10 @@ def test_wrong_pair_in_a_loop_of_four_is_outvoted(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     write_scene(path, truth, [(0, 1), (1, 2), (2, 3), (0, 2), (1, 3)])
     wrong = dict(truth)
-    wrong["3.jpg"] = turned(0, 25, 40) @ truth["3.jpg"][0], truth["3.jpg"][1] + (0.5, 0, 0)
+    wrong["3.jpg"] = (
+        turned(0, 25, 40) @ truth["3.jpg"][0],
+        truth["3.jpg"][1] + (0.5, 0, 0),
+    )
     other = tmp_path / "other.db"
     write_scene(other, wrong, [(0, 3)])
     right_graph = PairGraph.read(path, 15)
@@ -109,7 +122,9 @@ def test_wrong_pair_in_a_loop_of_four_is_outvoted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_what_incremental_mapping_registers_is_left_as_it_is(tmp_path: Path, count: int) -> None:
+def test_what_incremental_mapping_registers_is_left_as_it_is(
+    tmp_path: Path, count: int
+) -> None:
     path = tmp_path / "database.db"
     write_scene(path, views(count), [(0, 1)])
     (model,) = mapped(path, tmp_path / "models")
@@ -147,7 +162,9 @@ def tied(
         noisy = project(points, truth[name]) + random.normal(0, 2.0, (len(points), 2))
         for number, (x, y) in enumerate(noisy[:count]):
             shift = 100.0 * (moved == (f"p{number}", name))
-            lines.append(f"{name},p{number},{y + 0.8 * shift:.2f},{x + 0.6 * shift:.2f}")
+            lines.append(
+                f"{name},p{number},{y + 0.8 * shift:.2f},{x + 0.6 * shift:.2f}"
+            )
     table.write_text("\n".join(lines) + "\n")
     mapped_path = path.with_name("mapped.db")
     output_path = path.with_name("models")
@@ -159,7 +176,9 @@ def tied(
 
 def test_lost_photograph_comes_back_by_six_points_in_two_others(tmp_path: Path) -> None:
     truth = views(4)
-    (model,), task = tied(tmp_path, truth, TRIANGLE, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6})
+    (model,), task = tied(
+        tmp_path, truth, TRIANGLE, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6}
+    )
     assert model.moves[-1] == BY_HAND
     assert model.reconstruction.num_reg_images() == 4
     assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 2.0
@@ -180,14 +199,21 @@ def test_a_mark_that_is_far_off_is_named_as_the_worst(tmp_path: Path) -> None:
     assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 3.0
 
 
-def test_photograph_in_a_wrong_place_is_placed_by_its_tie_points(tmp_path: Path) -> None:
+def test_photograph_in_a_wrong_place_is_placed_by_its_tie_points(
+    tmp_path: Path,
+) -> None:
     truth = views(4)
-    wrong = {**truth, "3.jpg": (turned(0, 25, 40) @ truth["3.jpg"][0], truth["3.jpg"][1])}
+    wrong = {
+        **truth,
+        "3.jpg": (turned(0, 25, 40) @ truth["3.jpg"][0], truth["3.jpg"][1]),
+    }
     pairs = [*TRIANGLE, (2, 3)]
     write_scene(tmp_path / "before.db", wrong, pairs)
     (before,) = mapped(tmp_path / "before.db", tmp_path / "before")
     assert relative_errors(before, truth, "0.jpg", "3.jpg")[0] > 20.0
-    (model,), _ = tied(tmp_path, truth, pairs, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6}, scene=wrong)
+    (model,), _ = tied(
+        tmp_path, truth, pairs, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6}, scene=wrong
+    )
     assert model.reconstruction.num_reg_images() == 4
     assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 3.0
 
@@ -203,12 +229,18 @@ def test_two_models_are_joined_by_seven_points(tmp_path: Path) -> None:
 
 def test_tie_points_of_too_few_photographs_join_nothing(tmp_path: Path) -> None:
     truth = views(4)
-    (model,), task = tied(tmp_path, truth, TRIANGLE, {"1.jpg": 3, "2.jpg": 3, "3.jpg": 3})
+    (model,), task = tied(
+        tmp_path, truth, TRIANGLE, {"1.jpg": 3, "2.jpg": 3, "3.jpg": 3}
+    )
     assert model.reconstruction.num_reg_images() == 3
-    assert len(tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)) == 6
+    assert (
+        len(tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)) == 6
+    )
 
 
-def marked(points: str, image_ids: Iterable[int], error_px: float) -> list[ImageResidual]:
+def marked(
+    points: str, image_ids: Iterable[int], error_px: float
+) -> list[ImageResidual]:
     """Residuals of points, by the letters of their names, that are the same in all images."""
     found = []
     for point in points:
@@ -223,7 +255,9 @@ def test_log_odds_of_tie_points_grow_with_those_that_agree() -> None:
     assert tie_point_log_odds(agreeing)[1] > 2.0
     one_wrong = [ImageResidual("q", 1, 50.0), *marked("q", (2, 3), 1.0)]
     assert tie_point_log_odds([*agreeing, *one_wrong])[2] > 2.0
-    wrong = marked("qrs", [0], 0.0) + marked("qrs", [1], 20.0) + marked("qrs", [2], 40.0)
+    wrong = (
+        marked("qrs", [0], 0.0) + marked("qrs", [1], 20.0) + marked("qrs", [2], 40.0)
+    )
     assert tie_point_log_odds(wrong)[2] < -5.0 < tie_point_log_odds(wrong)[0]
 
 

@@ -19,7 +19,9 @@ MODEL = ModelSummary(
     num_points3D=120,
     mean_track_length=2.25,
     mean_reprojection_error_px=0.512,
-    doubtful={"č.jpg": (Doubt("few_three_view_points", {"num": 9}), Doubt("few_matches"))},
+    doubtful={
+        "č.jpg": (Doubt("few_three_view_points", {"num": 9}), Doubt("few_matches"))
+    },
     probabilities={"a.jpg": 0.98, "č.jpg": 0.4},
     bridges={"č.jpg": Bridge("a.jpg", 32, 36, 0.031)},
     taken_out={"d.jpg": (Doubt("no_parallax", {"share": 0.9}),)},
@@ -33,7 +35,9 @@ def folder(tmp_path: Path) -> Path:
     pycolmap.set_random_seed(1)
     path = tmp_path / "sparse" / "0"
     path.mkdir(parents=True)
-    pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=20)).write(path)
+    pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(num_points3D=20)
+    ).write(path)
     write_summary(MODEL, path)
     return path
 
@@ -54,7 +58,9 @@ def test_a_model_that_has_changed_is_refused_but_its_copy_is_not(
         ):
             read(folder)
     shutil.copytree(folder, copy := tmp_path / "copy", ignore=lambda *_: [SUMMARY])
-    assert read_given_model(copy).cameras[1].focal_length == model.cameras[1].focal_length
+    assert (
+        read_given_model(copy).cameras[1].focal_length == model.cameras[1].focal_length
+    )
     (folder / "points3D.bin").unlink()
     with pytest.raises(StoreError, match="is not as it was written"):
         read_summary(folder)
@@ -63,6 +69,8 @@ def test_a_model_that_has_changed_is_refused_but_its_copy_is_not(
 @pytest.mark.parametrize("content", ['{"model": [1]}', "", "[]"])
 def test_a_damaged_summary_is_one_clear_line(folder: Path, content: str) -> None:
     (folder / SUMMARY).write_text(content)
-    with pytest.raises(StoreError, match=r"summary\.json: damaged .*; if you have edited"):
+    with pytest.raises(
+        StoreError, match=r"summary\.json: damaged .*; if you have edited"
+    ):
         read_summary(folder)
     assert read_given_model(folder).num_points3D() == 20

@@ -8,7 +8,11 @@ from numpy.testing import assert_array_equal
 
 from colmap_affrect.geometry.affine import project, rotation, transform_lafs
 from colmap_affrect.geometry.epipolar import EpipolarModel, HomographyModel, PairModel
-from colmap_affrect.matchers.guided import GuidedOptions, guided_matches, match_near_geometry
+from colmap_affrect.matchers.guided import (
+    GuidedOptions,
+    guided_matches,
+    match_near_geometry,
+)
 
 HOMOGRAPHY = np.array([[0.7, -0.25, 190.0], [0.2, 0.9, 40.0], [2e-4, -1e-4, 1.0]])
 OPTIONS = GuidedOptions()
@@ -21,7 +25,11 @@ def fundamental(translation: tuple[float, float, float]) -> np.ndarray:
     x, y, z = translation
     angle = np.deg2rad(17)
     rotation = np.array(
-        [[np.cos(angle), 0.1, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        [
+            [np.cos(angle), 0.1, np.sin(angle)],
+            [0, 1, 0],
+            [-np.sin(angle), 0, np.cos(angle)],
+        ]
     )
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
     inverse = np.linalg.inv(CAMERA)
@@ -31,13 +39,17 @@ def fundamental(translation: tuple[float, float, float]) -> np.ndarray:
 Arrays = tuple[np.ndarray, np.ndarray]
 
 
-def random_pair(seed: int, counts: tuple[int, int] = (600, 450)) -> tuple[Arrays, Arrays]:
+def random_pair(
+    seed: int, counts: tuple[int, int] = (600, 450)
+) -> tuple[Arrays, Arrays]:
     """Descriptors and points: few different ones, so that many features are alike; some copies."""
     rng = np.random.default_rng(seed)
     words = rng.normal(size=(40, 8))
     found = []
     for count, size in zip(counts, ((640, 480), (900, 350)), strict=True):
-        descriptors = words[rng.integers(0, 40, count)] + 0.25 * rng.normal(size=(count, 8))
+        descriptors = words[rng.integers(0, 40, count)] + 0.25 * rng.normal(
+            size=(count, 8)
+        )
         descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
         descriptors[1] = descriptors[0]
         found.append((descriptors.astype(np.float32), rng.uniform(0, size, (count, 2))))
@@ -62,7 +74,9 @@ def compared_with_everything(
 
 
 @pytest.mark.parametrize(
-    "translation", [(1, 0.2, 0.1), (0.1, 0.05, 1), (0.3, 1, 0)], ids=["beside", "ahead", "above"]
+    "translation",
+    [(1, 0.2, 0.1), (0.1, 0.05, 1), (0.3, 1, 0)],
+    ids=["beside", "ahead", "above"],
 )
 def test_bands_miss_nothing(translation: tuple[float, float, float]) -> None:
     descriptors, points = random_pair(3)
@@ -80,7 +94,9 @@ def test_positions_of_a_homography_miss_nothing() -> None:
     found = match_near_geometry(descriptors, model, GuidedOptions(band_px=10.0))
     assert len(found) > 20
     errors = np.linalg.norm(project(HOMOGRAPHY, points[0])[:, None] - points[1], axis=2)
-    assert_array_equal(found, compared_with_everything(descriptors, points[1], errors <= 20.0))
+    assert_array_equal(
+        found, compared_with_everything(descriptors, points[1], errors <= 20.0)
+    )
 
 
 def test_points_without_a_position_match_nothing() -> None:
@@ -103,7 +119,9 @@ def plane() -> tuple[Arrays, HomographyModel]:
     points1 = rng.uniform(0, (640, 480), (200, 2))
     descriptors = descriptors / np.linalg.norm(descriptors, axis=1)[:, None]
     same = descriptors.astype(np.float32)
-    return (same, same), HomographyModel(HOMOGRAPHY, (points1, project(HOMOGRAPHY, points1)))
+    return (same, same), HomographyModel(
+        HOMOGRAPHY, (points1, project(HOMOGRAPHY, points1))
+    )
 
 
 def test_inliers_stay_and_matches_are_one_to_one() -> None:
@@ -111,22 +129,32 @@ def test_inliers_stay_and_matches_are_one_to_one() -> None:
     inliers = np.array([[0, 1], [1, 0], [7, 7]])  # older matches say otherwise
     found = guided_matches(descriptors, None, model, inliers, OPTIONS)
     assert {*map(tuple, inliers)} <= {*map(tuple, found)}
-    assert len(found) == 200 == len(np.unique(found[:, 0])) == len(np.unique(found[:, 1]))
+    assert (
+        len(found) == 200 == len(np.unique(found[:, 0])) == len(np.unique(found[:, 1]))
+    )
     assert_array_equal(np.sort(found[:, 0]), found[:, 0])
     nothing = HomographyModel(HOMOGRAPHY, (model.points[0], model.points[1][:0]))
     assert not len(
-        guided_matches((descriptors[0], descriptors[1][:0]), None, nothing, NONE, OPTIONS)
+        guided_matches(
+            (descriptors[0], descriptors[1][:0]), None, nothing, NONE, OPTIONS
+        )
     )
 
 
 @pytest.mark.parametrize("kind", [EpipolarModel, HomographyModel])
-def test_where_as_much_is_found_beside_a_geometry_nothing_is_proven(kind: type[PairModel]) -> None:
+def test_where_as_much_is_found_beside_a_geometry_nothing_is_proven(
+    kind: type[PairModel],
+) -> None:
     descriptors, points = random_pair(4, (2000, 2500))
-    model = kind(HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1)), points)
+    model = kind(
+        HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1)), points
+    )
     options = GuidedOptions(band_px=6.0)
     inliers = np.array([[3, 7], [9, 1]])
     assert len(match_near_geometry(descriptors, model, options)) > 20
-    assert_array_equal(guided_matches(descriptors, None, model, inliers, options), inliers)
+    assert_array_equal(
+        guided_matches(descriptors, None, model, inliers, options), inliers
+    )
 
 
 def test_accidental_matches_are_counted_near_the_geometry() -> None:
@@ -168,7 +196,9 @@ def test_lafs_that_map_epipolar_lines_to_others_match_nothing(sign: float) -> No
 
 
 @pytest.mark.parametrize("kind", [EpipolarModel, HomographyModel])
-def test_models_of_smaller_images_are_those_of_their_points(kind: type[PairModel]) -> None:
+def test_models_of_smaller_images_are_those_of_their_points(
+    kind: type[PairModel],
+) -> None:
     matrix = HOMOGRAPHY if kind is HomographyModel else fundamental((1, 0.2, 0.1))
     _, points = random_pair(3)
     model = kind(matrix, points)
@@ -177,4 +207,6 @@ def test_models_of_smaller_images_are_those_of_their_points(kind: type[PairModel
     assert_array_equal(smaller.points[1], points[1] / 3.0)
     near = model.errors(rows, rows)
     small = smaller.errors(rows, rows)
-    assert np.allclose(small, near / 3.0) or np.all((small > near / 3.1) & (small < near / 1.9))
+    assert np.allclose(small, near / 3.0) or np.all(
+        (small > near / 3.1) & (small < near / 1.9)
+    )

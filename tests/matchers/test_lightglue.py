@@ -40,7 +40,9 @@ def features(
     rows = unit_rows(rows + 0.02 * random.normal(size=rows.shape))
     centers = random.uniform((0.0, 0.0), SIZE, (count, 2))
     lafs = lafs_from_keypoints(centers, np.full(count, 12.0), np.zeros(count))
-    return LocalFeatures(lafs, random.random(count).astype(np.float32) + np.float32(0.1), rows)
+    return LocalFeatures(
+        lafs, random.random(count).astype(np.float32) + np.float32(0.1), rows
+    )
 
 
 def image(found: LocalFeatures, extractor: str = "aliked") -> ImageFeatures:
@@ -55,7 +57,9 @@ def comparing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def matcher(comparing: Path) -> LightGlue:
-    return LightGlue(LightGlueOptions(), MatcherContext({"lightglue-aliked": comparing}, "cpu"))
+    return LightGlue(
+        LightGlueOptions(), MatcherContext({"lightglue-aliked": comparing}, "cpu")
+    )
 
 
 def test_circles_of_a_warp_tell_where_they_were_in_it() -> None:
@@ -72,7 +76,9 @@ def test_circles_of_a_warp_tell_where_they_were_in_it() -> None:
 
 
 def test_positions_are_those_of_pixel_centres_within_width_and_height() -> None:
-    lafs = lafs_from_keypoints(np.array([[-0.4, 7.0], [899.4, 600.0]]), np.ones(2), np.zeros(2))
+    lafs = lafs_from_keypoints(
+        np.array([[-0.4, 7.0], [899.4, 600.0]]), np.ones(2), np.zeros(2)
+    )
     found = replace(features(2, 1), lafs=lafs)
     values = network_inputs(found, SIZE)
     assert set(values) == {"keypoints", "image_size", "descriptors"}
@@ -109,7 +115,9 @@ def test_views_are_matched_one_by_one_and_united(matcher: LightGlue) -> None:
     assert seen == [(40, 60), (30, 60)]  # of views with few features nothing is asked
     shown = np.concatenate([np.arange(40), np.arange(30, 60)])
     assert_array_equal(shown[found.indices[:, 0]], found.indices[:, 1])
-    assert_array_equal(np.unique(found.indices[:, 1]), np.arange(60))  # the ten in both views once
+    assert_array_equal(
+        np.unique(found.indices[:, 1]), np.arange(60)
+    )  # the ten in both views once
     assert (np.diff(found.indices[:, 0]) > 0).all()
 
 
@@ -129,11 +137,16 @@ def test_one_place_seen_in_two_views_is_one_match(matcher: LightGlue) -> None:
     image1 = features(40, 1, things=things[:40])
     warp1 = features(40, 1, things=things[:40])
     image2 = features(80, 2, things=np.concatenate([things, things[::-1]]))
-    second = replace(image2, lafs=np.concatenate([image2.lafs[:40], image2.lafs[39::-1]]))
+    second = replace(
+        image2, lafs=np.concatenate([image2.lafs[:40], image2.lafs[39::-1]])
+    )
     first = union([image1, warp1.with_rectification_id(1)])
     second = second.with_rectification_id(0)
     second = union(
-        [second.select(np.arange(40)), second.select(np.arange(40, 80)).with_rectification_id(1)]
+        [
+            second.select(np.arange(40)),
+            second.select(np.arange(40, 80)).with_rectification_id(1),
+        ]
     )
     found = matcher.match(matcher.prepare(image(first)), matcher.prepare(image(second)))
     places = np.rint(first.keypoints[found.indices[:, 0]])
@@ -152,14 +165,19 @@ def test_threads_find_the_same(matcher: LightGlue) -> None:
         assert_array_equal(one.scores, other.scores)
 
 
-def test_features_of_another_extractor_are_refused_in_one_line(matcher: LightGlue) -> None:
-    with pytest.raises(OptionError, match="lightglue takes features of aliked, not of rootsift"):
+def test_features_of_another_extractor_are_refused_in_one_line(
+    matcher: LightGlue,
+) -> None:
+    with pytest.raises(
+        OptionError, match="lightglue takes features of aliked, not of rootsift"
+    ):
         matcher.prepare(image(features(20, 1), "rootsift"))
     matcher.prepare(image(features(20, 1), ""))
 
 
 @pytest.mark.parametrize(
-    ("shape", "message"), [((32, 4), "(of another size)"), (None, "(no posenc.Wr.weight)")]
+    ("shape", "message"),
+    [((32, 4), "(of another size)"), (None, "(no posenc.Wr.weight)")],
 )
 def test_weights_of_another_network_are_refused(
     comparing: Path, tmp_path: Path, shape: tuple[int, int] | None, message: str

@@ -21,7 +21,12 @@ Features = tuple[NDArray[np.float32], NDArray[np.float64]]
 
 
 def two_views(
-    seed: int, count1: int, count2: int, size_px: float, noise: float, dimension: int = 16
+    seed: int,
+    count1: int,
+    count2: int,
+    size_px: float,
+    noise: float,
+    dimension: int = 16,
 ) -> tuple[Features, Features]:
     """Features of two images, some of which are the same points with noise.
 
@@ -33,7 +38,9 @@ def two_views(
     source = rng.integers(0, count1, count2)
     same = rng.random(count2) < 0.7
     descriptors2 = rng.random((count2, dimension)) + 1e-3
-    near = np.abs(descriptors1[source] + noise * rng.standard_normal((count2, dimension)))
+    near = np.abs(
+        descriptors1[source] + noise * rng.standard_normal((count2, dimension))
+    )
     descriptors2[same] = near[same] + 1e-3
     keypoints2 = rng.uniform(0, size_px, (count2, 2))
     keypoints2[same] = keypoints1[source][same] + rng.normal(0, 1.5, (count2, 2))[same]
@@ -48,7 +55,9 @@ def best_and_ratio(
     Where none is far enough, the largest distance of unit vectors stands in for it.
     """
     descriptors, keypoints = other
-    distances = [float(np.linalg.norm(query - row)) for row in descriptors.astype(np.float64)]
+    distances = [
+        float(np.linalg.norm(query - row)) for row in descriptors.astype(np.float64)
+    ]
     best = min(range(len(distances)), key=distances.__getitem__)
     second = 2.0
     for index, distance in enumerate(distances):
@@ -66,14 +75,17 @@ def slow_matches(
     matches = []
     for row, query in enumerate(first[0].astype(np.float64)):
         target, ratio = best_and_ratio(query, second, radius_px)
-        back, back_ratio = best_and_ratio(second[0][target].astype(np.float64), first, radius_px)
+        back, back_ratio = best_and_ratio(
+            second[0][target].astype(np.float64), first, radius_px
+        )
         if back == row and max(ratio, back_ratio) < options.max_ratio:
             matches.append((row, target, max(ratio, back_ratio)))
     kept: list[tuple[int, int, float]] = []
     for row, target, ratio in sorted(matches, key=lambda match: match[2]):
         duplicate = any(
             np.hypot(*(first[1][row] - first[1][other])) <= options.duplicate_radius_px
-            and np.hypot(*(second[1][target] - second[1][partner])) <= options.duplicate_radius_px
+            and np.hypot(*(second[1][target] - second[1][partner]))
+            <= options.duplicate_radius_px
             for other, partner, _ in kept
         )
         if not duplicate:
@@ -84,14 +96,20 @@ def slow_matches(
 def run(first: Features, second: Features, options: NearestOptions) -> Matches:
     """Match two sets of (descriptors, keypoints)."""
     matcher = NearestNeighbors(options, MatcherContext())
-    return matcher.match(*(matcher.prepare(image_of(*view)) for view in (first, second)))
+    return matcher.match(
+        *(matcher.prepare(image_of(*view)) for view in (first, second))
+    )
 
 
-def image_of(descriptors: NDArray[np.float32], keypoints: NDArray[np.float64]) -> ImageFeatures:
+def image_of(
+    descriptors: NDArray[np.float32], keypoints: NDArray[np.float64]
+) -> ImageFeatures:
     """Circles at (N, 2) px."""
     ones = np.ones(len(keypoints))
     lafs = lafs_from_keypoints(keypoints, ones, ones)
-    return ImageFeatures(LocalFeatures(lafs, ones.astype(np.float32), descriptors), (99, 99), "")
+    return ImageFeatures(
+        LocalFeatures(lafs, ones.astype(np.float32), descriptors), (99, 99), ""
+    )
 
 
 @given(
@@ -123,7 +141,9 @@ def test_match_features_equals_plain_loops(
     expected = slow_matches(first, second, options)
     actual = run(first, second, options)
     assert actual.indices.tolist() == [[row, target] for row, target, _ in expected]
-    assert_allclose(actual.scores, [1 - ratio for *_, ratio in expected], atol=RATIO_ERROR)
+    assert_allclose(
+        actual.scores, [1 - ratio for *_, ratio in expected], atol=RATIO_ERROR
+    )
 
 
 def spread(count: int) -> NDArray[np.float64]:

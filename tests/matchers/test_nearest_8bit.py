@@ -30,7 +30,9 @@ def cosine_codes(
     return np.clip(np.rint(unit / coarse.CODE_STEP * products), 0, 255).astype(np.uint8)
 
 
-def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArray, NDArray]]:
+def crowded_views(
+    seed: int, noise: float, *, signed: bool
+) -> list[tuple[NDArray, NDArray]]:
     """350 and 450 features, of which 250 are the same; some are repeated beside themselves."""
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(550, 128)) if signed else rng.gamma(0.4, size=(550, 128))
@@ -39,8 +41,12 @@ def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArra
     places[150:180] = places[:30] + 1.0
     views = []
     for chosen in (slice(0, 350), slice(100, 550)):
-        seen = rows[chosen] + noise * np.abs(rows).mean() * rng.normal(size=rows[chosen].shape)
-        views.append((unit_rows(seen if signed else np.abs(seen)), places[chosen] * (1.0, 0.8)))
+        seen = rows[chosen] + noise * np.abs(rows).mean() * rng.normal(
+            size=rows[chosen].shape
+        )
+        views.append(
+            (unit_rows(seen if signed else np.abs(seen)), places[chosen] * (1.0, 0.8))
+        )
     return views
 
 
@@ -53,7 +59,9 @@ def require_exact(views: list[tuple[NDArray, NDArray]], options: NearestOptions)
         images.append(ImageFeatures(features, (99, 99), ""))
     matchers = [NearestNeighbors(options, MatcherContext()) for _ in range(2)]
     matchers[0].is_coarse = True
-    found, exact = (matcher.match(*map(matcher.prepare, images)) for matcher in matchers)
+    found, exact = (
+        matcher.match(*map(matcher.prepare, images)) for matcher in matchers
+    )
     np.testing.assert_array_equal(found.indices, exact.indices)
     np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
     return len(exact.indices)
@@ -91,11 +99,16 @@ def test_ambiguous_copies_do_not_hide_a_match() -> None:
 @pytest.mark.parametrize("counts", [(0, 5), (5, 0), (1, 1), (1, 7), (300, 1)])
 def test_few_features(counts: tuple[int, int]) -> None:
     rng = np.random.default_rng(7)
-    views = [(unit_rows(rng.gamma(0.4, size=(n, 128))), rng.uniform(0, 99, (n, 2))) for n in counts]
+    views = [
+        (unit_rows(rng.gamma(0.4, size=(n, 128))), rng.uniform(0, 99, (n, 2)))
+        for n in counts
+    ]
     require_exact(views, NearestOptions())
 
 
-def test_coarse_descriptors_are_made_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_coarse_descriptors_are_made_where_they_pay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(coarse, "available_cores", lambda: 3)
     monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: True)
     assert not coarse_pays(1.7e9)
@@ -104,17 +117,23 @@ def test_coarse_descriptors_are_made_where_they_pay(monkeypatch: pytest.MonkeyPa
     assert not coarse_pays(1e15)
 
 
-def test_torch_without_the_products_matches_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torch_without_the_products_matches_exactly(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Their operators are not part of torch's public interface and may go or change."""
 
     class Namespace:
         def __getattr__(self, name: str) -> object:
-            raise AttributeError(f"'_OpNamespace' 'onednn' object has no attribute '{name}'")
+            raise AttributeError(
+                f"'_OpNamespace' 'onednn' object has no attribute '{name}'"
+            )
 
     monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "AVX512")
     monkeypatch.setattr("torch.ops.onednn", Namespace(), raising=False)
     has_fast_8_bit_products.cache_clear()
-    matcher = NearestNeighbors(NearestOptions(), MatcherContext(device="cpu", num_comparisons=1e15))
+    matcher = NearestNeighbors(
+        NearestOptions(), MatcherContext(device="cpu", num_comparisons=1e15)
+    )
     has_fast_8_bit_products.cache_clear()
     features = LocalFeatures.empty(128)
     assert matcher.prepare(ImageFeatures(features, (32, 32), "rootsift")).coarse is None

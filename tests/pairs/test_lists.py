@@ -116,7 +116,9 @@ def test_an_image_proposes_five_times_as_many_pairs_as_it_gets_on_average() -> N
     ("new wing/b.png new wing/a 1.png\n", [("new wing/a 1.png", "new wing/b.png")]),
     ("a.png, č, d.png\n", [("a.png", "č, d.png")]),
 ])  # fmt: skip
-def test_read_pairs_takes_what_others_write(pair_list: Path, text: str, pairs: list[Pair]) -> None:
+def test_read_pairs_takes_what_others_write(
+    pair_list: Path, text: str, pairs: list[Pair]
+) -> None:
     pair_list.write_bytes(text.encode())
     assert list(read_pairs(pair_list, NAMES)) == pairs
 
@@ -153,13 +155,17 @@ def test_relative_folder_of_photographs_is_found_in_absolute_paths(
 @pytest.mark.parametrize("text", [
     "/elsewhere/a.png /elsewhere/b.png\n", "a.png b.png 0.5 0.7\n", "a.png 0.5\n",
 ])  # fmt: skip
-def test_paths_elsewhere_and_more_columns_are_refused(pair_list: Path, text: str) -> None:
+def test_paths_elsewhere_and_more_columns_are_refused(
+    pair_list: Path, text: str
+) -> None:
     pair_list.write_text(text, encoding="utf-8")
     with pytest.raises(AffrectError, match=r"line 1: .* is not two names of images"):
         read_pairs(pair_list, NAMES, Path(FOLDER))
 
 
-def test_read_pairs_lists_unknown_names_with_line_and_suggestion(pair_list: Path) -> None:
+def test_read_pairs_lists_unknown_names_with_line_and_suggestion(
+    pair_list: Path,
+) -> None:
     pair_list.write_text("a.png b.png\na.png bb.png\n\nzzzz 1234\n")
     with pytest.raises(AffrectError) as error:
         read_pairs(pair_list, NAMES)
@@ -184,13 +190,17 @@ def test_read_pairs_refuses_other_files(
         read_pairs(pair_list, NAMES)
 
 
-def test_write_pairs_of_plain_names_is_what_hloc_and_colmap_read(pair_list: Path) -> None:
+def test_write_pairs_of_plain_names_is_what_hloc_and_colmap_read(
+    pair_list: Path,
+) -> None:
     write_pairs(pair_list, [("a.png", "b.png"), ("a.png", "c/d.png")])
     assert pair_list.read_text() == "a.png b.png\na.png c/d.png\n"
 
 
 IMAGE_NAMES = st.lists(
-    st.text(st.sampled_from("ab. ,#č图/"), min_size=1, max_size=6).map(lambda stem: f"{stem}.png"),
+    st.text(st.sampled_from("ab. ,#č图/"), min_size=1, max_size=6).map(
+        lambda stem: f"{stem}.png"
+    ),
     min_size=2,
     max_size=6,
     unique=True,

@@ -20,7 +20,9 @@ from colmap_affrect.pairs.retrieval import (
 SIZE = 32
 
 
-def images_of_places(counts: list[int], seed: int) -> tuple[list[NDArray[np.float32]], list[int]]:
+def images_of_places(
+    counts: list[int], seed: int
+) -> tuple[list[NDArray[np.float32]], list[int]]:
     """Descriptors of so many images of each place: half of an image is what the place has."""
     random = np.random.default_rng(seed)
     images = []
@@ -28,7 +30,9 @@ def images_of_places(counts: list[int], seed: int) -> tuple[list[NDArray[np.floa
     for place, count in enumerate(counts):
         structure = random.random((200, SIZE))
         for _ in range(count):
-            seen = random.choice(structure, 100, replace=False) + random.normal(0, 0.1, (100, SIZE))
+            seen = random.choice(structure, 100, replace=False) + random.normal(
+                0, 0.1, (100, SIZE)
+            )
             images.append(unit_rows(np.concatenate([seen, random.random((100, SIZE))])))
             places.append(place)
     return images, places
@@ -81,6 +85,12 @@ def test_similarities_are_cosines_about_the_mean_however_many_at_once(
     at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retrieval, "VECTORS_AT_ONCE", at_once)
-    vectors = unit_rows(np.random.default_rng(7).random((7, 24)) + 0.5).astype(np.float16)
-    centered = unit_rows(vectors.astype(np.float64) - vectors.astype(np.float64).mean(axis=0))
-    assert_allclose(np.stack(list(similarities(vectors))), centered @ centered.T, atol=2e-3)
+    vectors = unit_rows(np.random.default_rng(7).random((7, 24)) + 0.5).astype(
+        np.float16
+    )
+    centered = unit_rows(
+        vectors.astype(np.float64) - vectors.astype(np.float64).mean(axis=0)
+    )
+    assert_allclose(
+        np.stack(list(similarities(vectors))), centered @ centered.T, atol=2e-3
+    )

@@ -26,7 +26,12 @@ from verified import CAMERAS
 from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.parallel import cluster as cluster_module
 from colmap_affrect.parallel import cluster_watch
-from colmap_affrect.parallel.cluster import Cluster, connected, environment, require_environment
+from colmap_affrect.parallel.cluster import (
+    Cluster,
+    connected,
+    environment,
+    require_environment,
+)
 from colmap_affrect.parallel.executor import Executor, Threads
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.report import StageReport
@@ -43,15 +48,27 @@ DAMAGED = "damaged.png"
 
 
 @contextmanager
-def started(folder: Path, num_workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+def started(
+    folder: Path, num_workers: int
+) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """Start a scheduler and workers of one thread each; yield its address, and all processes."""
     file = folder / "scheduler.json"
     common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
-    worker = ["worker", *common, "--nthreads", "1", "--no-nanny", "--local-directory", str(folder)]
+    worker = [
+        "worker",
+        *common,
+        "--nthreads",
+        "1",
+        "--no-nanny",
+        "--local-directory",
+        str(folder),
+    ]
     commands = [["scheduler", "--port", "0", *common], *[worker] * num_workers]
     processes = [
         subprocess.Popen(
-            [sys.executable, "-m", "dask", *command], cwd=folder, stderr=subprocess.DEVNULL
+            [sys.executable, "-m", "dask", *command],
+            cwd=folder,
+            stderr=subprocess.DEVNULL,
         )
         for command in commands
     ]
@@ -96,7 +113,9 @@ def run_stages(
 
 
 def hdf5_contents(out: Path) -> list[dict[str, tuple[str, bytes]]]:
-    return [hdf5_content(path) for path in (Workspace(out).features, Workspace(out).matches)]
+    return [
+        hdf5_content(path) for path in (Workspace(out).features, Workspace(out).matches)
+    ]
 
 
 class KillsOneWorker(Progress):
@@ -148,9 +167,17 @@ def test_cluster_that_loses_a_worker_leaves_what_a_local_run_leaves(
     (0, signal.SIGKILL, "the scheduler was lost; start it"),
 ])  # fmt: skip
 def test_cluster_that_is_lost_ends_the_run_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, harm: signal.Signals, said: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    harm: signal.Signals,
+    said: str,
 ) -> None:
-    for name, seconds in (("SILENT_S", 3.0), ("WARN_AFTER_S", 0.5), ("GIVE_UP_AFTER_S", 3.0)):
+    for name, seconds in (
+        ("SILENT_S", 3.0),
+        ("WARN_AFTER_S", 0.5),
+        ("GIVE_UP_AFTER_S", 3.0),
+    ):
         monkeypatch.setattr(cluster_watch, name, seconds)
     with started(tmp_path, 1) as (address, processes):
         start = time.monotonic()
@@ -180,7 +207,9 @@ def test_files_that_workers_do_not_see_are_named(photos: Path, address: str) -> 
             list(cluster.map(len, ["task"], [photos, unseen]))
 
 
-def test_cluster_that_is_no_use_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cluster_that_is_no_use_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(cluster_module, "CONNECT_TIMEOUT_S", 0.2)
     for address, said in (
         ("tcp://127.0.0.1:1", r"tcp://127\.0\.0\.1:1: no scheduler answers"),
@@ -190,11 +219,15 @@ def test_cluster_that_is_no_use_is_refused_in_one_line(monkeypatch: pytest.Monke
         with pytest.raises(AffrectError, match=said):
             connected(address).__enter__()
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(AffrectError, match=r"distributed is not installed; .*\[cluster\]"):
+    with pytest.raises(
+        AffrectError, match=r"distributed is not installed; .*\[cluster\]"
+    ):
         connected("tcp://10.0.0.1:8786").__enter__()
 
 
-@pytest.mark.parametrize("said", [b"", b"SSH-2.0-OpenSSH_9.2\r\n"], ids=["silent", "ssh"])
+@pytest.mark.parametrize(
+    "said", [b"", b"SSH-2.0-OpenSSH_9.2\r\n"], ids=["silent", "ssh"]
+)
 def test_port_of_another_program_is_refused_in_one_line(
     monkeypatch: pytest.MonkeyPatch, said: bytes
 ) -> None:
@@ -203,7 +236,9 @@ def test_port_of_another_program_is_refused_in_one_line(
         accepted = threading.Thread(target=greet, args=(server, said), daemon=True)
         accepted.start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(AffrectError, match=rf"{address}: no scheduler answers \(.+\); give"):
+        with pytest.raises(
+            AffrectError, match=rf"{address}: no scheduler answers \(.+\); give"
+        ):
             connected(address).__enter__()
 
 
@@ -219,10 +254,14 @@ def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None
     (tmp_path / "a.png").write_bytes(b"1")
     here = environment([str(tmp_path / "a.png"), str(tmp_path)])
     require_environment(here)
-    with pytest.raises(AffrectError, match=r"kornia is .*, and 0\.1 on the machine that leads"):
+    with pytest.raises(
+        AffrectError, match=r"kornia is .*, and 0\.1 on the machine that leads"
+    ):
         require_environment({**here, "kornia": "0.1"})
     (tmp_path / "a.png").write_bytes(b"22")
-    with pytest.raises(AffrectError, match=r"a\.png is 2 bytes, and 1 bytes on the machine"):
+    with pytest.raises(
+        AffrectError, match=r"a\.png is 2 bytes, and 1 bytes on the machine"
+    ):
         require_environment(here)
 
 
@@ -238,7 +277,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def extracted(photos: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def extracted(
+    photos: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """An output folder before matching."""
     out = tmp_path_factory.mktemp("out")
     with Workspace(out).locked() as workspace:
@@ -258,7 +299,9 @@ def matched(
     if not out.exists():
         shutil.copytree(extracted, out)
     with Workspace(out).locked() as workspace:
-        match(Context(workspace, Resources(weights_path=weights, device="cpu"), executor))
+        match(
+            Context(workspace, Resources(weights_path=weights, device="cpu"), executor)
+        )
     return hdf5_content(Workspace(out).matches)
 
 
@@ -281,17 +324,24 @@ def test_threads_one_pair_alone_and_a_resumed_run_find_the_same(
 ) -> None:
     expected = matched(tmp_path / "one", extracted, weights, Threads(1))
     assert matched(tmp_path / "two", extracted, weights, Threads(2)) == expected
-    context = Context(Workspace(tmp_path / "one"), Resources(weights_path=weights, device="cpu"))
+    context = Context(
+        Workspace(tmp_path / "one"), Resources(weights_path=weights, device="cpu")
+    )
     pairs = context.listed_pairs()
     assert sum(len(found.scores) for found in context.matches.read(pairs)) > 50
     matching = Matching(
-        context.features, WITH_NETWORK.matching, extractor="aliked", resources=context.resources
+        context.features,
+        WITH_NETWORK.matching,
+        extractor="aliked",
+        resources=context.resources,
     )
     (alone,) = iterate_matches(pairs[3:4], matching, Threads(1))
     (stored,) = context.matches.read(pairs[3:4])
     np.testing.assert_array_equal(alone.indices, stored.indices)
     assert len(np.unique(stored.scores)) > 3
-    with h5py.File(context.workspace.matches, "a") as file:  # as if the run had been killed
+    with h5py.File(
+        context.workspace.matches, "a"
+    ) as file:  # as if the run had been killed
         for key in list(file)[1:]:
             del file[key]
     assert matched(tmp_path / "one", extracted, weights, Threads(2)) == expected

@@ -37,7 +37,9 @@ class Scheduler:
         del ask, callback_timeout
         if self.error:
             raise self.error
-        return {"workers": {name: dict(worker) for name, worker in self.workers.items()}}
+        return {
+            "workers": {name: dict(worker) for name, worker in self.workers.items()}
+        }
 
     def clock(self) -> float:
         return self.now_s

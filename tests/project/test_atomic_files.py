@@ -59,7 +59,10 @@ def apply_step(file: io.RawIOBase | io.BytesIO, step: tuple) -> bytes:
 @example(b"", 0, [("write", 1, b"")])
 @given(st.binary(max_size=2 * PAGE_BYTES), st.integers(0, 2 * PAGE_BYTES), STEPS)
 def test_transaction_is_a_file_and_commits_all_of_it(
-    tmp_path_factory: pytest.TempPathFactory, start: bytes, filled: int, steps: list[tuple]
+    tmp_path_factory: pytest.TempPathFactory,
+    start: bytes,
+    filled: int,
+    steps: list[tuple],
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "transaction"
     start += b"\x05" * filled
@@ -84,7 +87,9 @@ class Killed(BaseException):
 class FailingFiles:
     """Lets the first changes of files pass and then raises: an OSError once, others for ever."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, passing: int, error: BaseException) -> None:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, passing: int, error: BaseException
+    ) -> None:
         self.left = passing
         self.error = error
         for name in ("open", "replace", "unlink"):
@@ -145,7 +150,9 @@ def change_hdf5(changes: FileTransaction) -> None:
         file["new"] = np.arange(3000)
 
 
-@pytest.mark.parametrize("error", [Killed(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))])
+@pytest.mark.parametrize(
+    "error", [Killed(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))]
+)
 def test_commit_that_ends_at_any_write_leaves_all_changes_or_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
@@ -206,7 +213,11 @@ def test_journal_that_is_torn_or_damaged_is_left_out(
     flipped = bytearray(whole)
     flipped[100] ^= 1
     lengths = (0, 1, 7, 8, 20, 31, 32, 33, 64, 4096, len(whole) - 1)
-    for torn in (*(whole[:length] for length in lengths), bytes(flipped), bytes(len(whole))):
+    for torn in (
+        *(whole[:length] for length in lengths),
+        bytes(flipped),
+        bytes(len(whole)),
+    ):
         journal_of(path).write_bytes(torn)
         apply_journal(path)
         assert path.read_bytes() == before
@@ -222,7 +233,9 @@ def test_content_is_on_the_disk_before_its_name_and_the_name_before_the_end(
 ) -> None:
     steps = []
     monkeypatch.setattr(
-        os, "fsync", lambda fd: steps.append(str(Path(f"/proc/self/fd/{fd}").readlink()))
+        os,
+        "fsync",
+        lambda fd: steps.append(str(Path(f"/proc/self/fd/{fd}").readlink())),
     )
     rename = Path.replace
 
@@ -238,7 +251,9 @@ def test_content_is_on_the_disk_before_its_name_and_the_name_before_the_end(
     with FileTransaction(tmp_path / "a.txt") as changes:
         changes.write(b"T")
         changes.commit()
-    file, journal, folder = (str(tmp_path / name) for name in ("a.txt", "a.txt.journal", ""))
+    file, journal, folder = (
+        str(tmp_path / name) for name in ("a.txt", "a.txt.journal", "")
+    )
     assert steps[0].startswith(journal)
     assert steps[1:] == ["-> a.txt.journal", folder.rstrip("/"), file]
 
@@ -261,7 +276,9 @@ def test_replace_text_that_fails_keeps_the_old_text(
     replace_text(path, "old č")
     with monkeypatch.context() as patch:
         FailingFiles(patch, passing, OSError(errno.ENOSPC, "No space left on device"))
-        with pytest.raises(WorkspaceError, match=r"file\.txt: cannot be written \(No space left"):
+        with pytest.raises(
+            WorkspaceError, match=r"file\.txt: cannot be written \(No space left"
+        ):
             replace_text(path, "new")
     assert path.read_text(encoding="utf-8") == "old č"
     assert list(tmp_path.iterdir()) == [path]

@@ -33,14 +33,19 @@ def peaked(focal: float, shift: float, num_segments: int = 20) -> Lines:
     distances = distances + ((SHIFTS - shift) / 0.03)[None, :] ** 2
     random = np.random.default_rng(1)
     rotations = random.normal(size=(len(FOCALS), len(SHIFTS), 3, 3))
-    return Lines(Segments.of_image(edges, SIZE), LineLikelihood(60.0 - 0.5 * distances, rotations))
+    return Lines(
+        Segments.of_image(edges, SIZE),
+        LineLikelihood(60.0 - 0.5 * distances, rotations),
+    )
 
 
 def few() -> Lines:
     return Lines(Segments.of_image(Building(num_each=2).edges(), SIZE), None)
 
 
-def test_lines_come_back_as_written_and_stay_when_features_are_added(tmp_path: Path) -> None:
+def test_lines_come_back_as_written_and_stay_when_features_are_added(
+    tmp_path: Path,
+) -> None:
     store = FeatureStore(tmp_path / "features.h5")
     lines = peaked(0.9, 0.1)
     store.write("a.png", some_features(3), SIZE, lines=lines)
@@ -52,7 +57,9 @@ def test_lines_come_back_as_written_and_stay_when_features_are_added(tmp_path: P
     assert lines.likelihood is not None
     assert_allclose(read.segments.starts, lines.segments.starts, atol=1e-6)
     assert_allclose(read.segments.ends, lines.segments.ends, atol=1e-6)
-    assert_allclose(read.likelihood.log_likelihoods, lines.likelihood.log_likelihoods, rtol=1e-6)
+    assert_allclose(
+        read.likelihood.log_likelihoods, lines.likelihood.log_likelihoods, rtol=1e-6
+    )
     assert_allclose(read.likelihood.rotations, lines.likelihood.rotations, rtol=1e-6)
     assert len(store.read("a.png")) == 7
     without = store.lines("b.png")
@@ -67,8 +74,12 @@ def test_stores_of_before_and_of_another_grid_have_no_lines(tmp_path: Path) -> N
     store.write("old.png", some_features(3), SIZE)
     lines = peaked(0.9, 0.0)
     assert lines.likelihood is not None
-    coarse = LineLikelihood(lines.likelihood.log_likelihoods[::2], lines.likelihood.rotations[::2])
-    store.write("other.png", some_features(3), SIZE, lines=Lines(lines.segments, coarse))
+    coarse = LineLikelihood(
+        lines.likelihood.log_likelihoods[::2], lines.likelihood.rotations[::2]
+    )
+    store.write(
+        "other.png", some_features(3), SIZE, lines=Lines(lines.segments, coarse)
+    )
     assert store.lines("old.png") is None
     assert store.lines("other.png") is None
     with h5py.File(store.path) as file:
@@ -80,7 +91,13 @@ def test_what_hloc_reads_of_an_image_is_numbers_as_before(tmp_path: Path) -> Non
     store.write("a.png", some_features(3), SIZE, lines=peaked(0.9, 0.1))
     with h5py.File(store.path) as file:
         group = file["a.png"]
-        assert set(group) > {*LINE_DATASETS, "keypoints", "descriptors", "scores", "image_size"}
+        assert set(group) > {
+            *LINE_DATASETS,
+            "keypoints",
+            "descriptors",
+            "scores",
+            "image_size",
+        }
         for dataset in group.values():
             assert np.issubdtype(dataset.dtype, np.number)
         assert_array_equal(group["image_size"][()], SIZE)
@@ -96,7 +113,9 @@ def test_a_report_is_in_px_of_the_photograph_and_in_mm_for_film_of_36_mm() -> No
     assert 0.03 < report.focal_sigma < 0.12
     assert report.num_segments == 20
     text = report.sentence()
-    assert text.startswith(f"the lines tell a focal length of {report.focal_px:,.0f} px (36 mm")
+    assert text.startswith(
+        f"the lines tell a focal length of {report.focal_px:,.0f} px (36 mm"
+    )
     assert "axis" not in text
 
 
@@ -111,7 +130,10 @@ def test_a_shift_is_said_with_its_side(shift: float, side: str) -> None:
 def test_few_lines_and_open_focal_lengths_are_said() -> None:
     report = line_report(few(), (2000, 1000))
     assert report == LineReport(num_segments=6)
-    assert "6 straight lines are too few to say anything, 12 are needed" in report.sentence()
+    assert (
+        "6 straight lines are too few to say anything, 12 are needed"
+        in report.sentence()
+    )
     nothing = np.zeros((len(FOCALS), len(SHIFTS)))
     rotations = np.tile(np.eye(3), (*nothing.shape, 1, 1))
     open_lines = Lines(peaked(1.0, 0.0).segments, LineLikelihood(nothing, rotations))

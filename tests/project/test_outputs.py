@@ -12,7 +12,11 @@ import pytest
 import colmap_affrect
 from colmap_affrect.errors import OptionError
 from colmap_affrect.project import outputs
-from colmap_affrect.project.outputs import new_results, refuse_photographs, temporary_folder
+from colmap_affrect.project.outputs import (
+    new_results,
+    refuse_photographs,
+    temporary_folder,
+)
 from colmap_affrect.project.workspace import Workspace
 
 PACKAGE = Path(colmap_affrect.__file__).parent
@@ -51,7 +55,9 @@ def test_results_appear_together(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-def test_failure_takes_away_what_was_made_and_nothing_else(tmp_path: Path, error: type) -> None:
+def test_failure_takes_away_what_was_made_and_nothing_else(
+    tmp_path: Path, error: type
+) -> None:
     def save_and_fail() -> None:
         (tmp_path / "new" / "of the user.txt").write_text("mine")
         raise error
@@ -127,7 +133,9 @@ def test_folder_that_another_process_tidies_up_before_it_is_locked_is_made_again
     assert list(tmp_path.iterdir()) == []
 
 
-def test_temporary_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path) -> None:
+def test_temporary_folders_of_killed_processes_are_removed_and_no_others(
+    tmp_path: Path,
+) -> None:
     (tmp_path / ".affrect-killed" / "sub").mkdir(parents=True)
     (tmp_path / ".affrect-killed" / ".lock").touch()
     (tmp_path / ".affrect-of-somebody").mkdir()

@@ -21,10 +21,14 @@ from colmap_affrect.project.regular_files import (
     sha256_of_regular,
 )
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+pytestmark = pytest.mark.skipif(
+    not hasattr(os, "mkfifo"), reason="the system has no pipes"
+)
 
 
-@pytest.fixture(params=["pipe", "device", "socket", "folder", "link to a pipe", "link to a device"])
+@pytest.fixture(
+    params=["pipe", "device", "socket", "folder", "link to a pipe", "link to a device"]
+)
 def odd(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Something that has the name of a file."""
     path = tmp_path / "x.jpg"
@@ -53,7 +57,13 @@ def _in_its_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_what_is_no_regular_file_is_refused_at_once(odd: Path) -> None:
-    for read in (open_regular, read_regular, read_regular_text, sha256_of_regular, require_regular):
+    for read in (
+        open_regular,
+        read_regular,
+        read_regular_text,
+        sha256_of_regular,
+        require_regular,
+    ):
         with pytest.raises(NotAFileError, match="is not a file, but a"):
             read(odd)
 
@@ -73,12 +83,16 @@ def test_a_pipe_that_takes_the_place_of_a_file_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     os.mkfifo(tmp_path / "x")
-    monkeypatch.setattr("colmap_affrect.project.regular_files.require_regular", lambda _: None)
+    monkeypatch.setattr(
+        "colmap_affrect.project.regular_files.require_regular", lambda _: None
+    )
     with pytest.raises(NotAFileError):
         open_regular(tmp_path / "x")
 
 
-@pytest.mark.skipif(not Path("/proc/self/pagemap").exists(), reason="only Linux has such files")
+@pytest.mark.skipif(
+    not Path("/proc/self/pagemap").exists(), reason="only Linux has such files"
+)
 def test_files_that_never_end_are_read_as_long_as_they_say_they_are() -> None:
     assert stat.S_ISREG(Path("/proc/self/pagemap").stat().st_mode)
     assert read_regular(Path("/proc/self/pagemap")) == b""
@@ -96,7 +110,9 @@ def test_a_pipe_keeps_its_name_and_a_link_does_not(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stem", ["b" * 250, "č" * 130, "\udcff" * 230])
-def test_names_that_are_too_long_are_cut_and_stay_different(tmp_path: Path, stem: str) -> None:
+def test_names_that_are_too_long_are_cut_and_stay_different(
+    tmp_path: Path, stem: str
+) -> None:
     names = [fitting_name(f"{stem}{end}", ".png") for end in "ab"]
     assert len(set(names)) == 2
     for name in names:

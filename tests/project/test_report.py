@@ -18,7 +18,11 @@ from colmap_affrect.project.report import (
 )
 
 LARGE = ModelSummary(
-    ("a.png", "č d.png"), 120, 2.25, 0.512, bridges={"č d.png": Bridge("a.png", 32, 36, 0.031)}
+    ("a.png", "č d.png"),
+    120,
+    2.25,
+    0.512,
+    bridges={"č d.png": Bridge("a.png", 32, 36, 0.031)},
 )
 SMALL = ModelSummary(("e.png", "f.png"), 50, 2.0, 0.25)
 
@@ -33,7 +37,9 @@ REPORT = ReconstructionReport(
     num_verified_pairs=3,
     num_pairs=10,
     stages=(
-        StageReport("extract", 1.25, 3, 1, {"broken.png": "broken.png: not a readable image"}),
+        StageReport(
+            "extract", 1.25, 3, 1, {"broken.png": "broken.png: not a readable image"}
+        ),
         StageReport("map", 0.5, 2),
     ),
     recipe="default",
@@ -54,12 +60,20 @@ REPORT = ReconstructionReport(
     ),
 )
 
-SHAKY = replace(LARGE, doubtful={"a.png": (Doubt("few_three_view_points", {"num": 9}),)})
+SHAKY = replace(
+    LARGE, doubtful={"a.png": (Doubt("few_three_view_points", {"num": 9}),)}
+)
 TURNED = replace(
-    LARGE, doubtful=dict.fromkeys(LARGE.registered_names, (Doubt("no_parallax", {"share": 0.9}),))
+    LARGE,
+    doubtful=dict.fromkeys(
+        LARGE.registered_names, (Doubt("no_parallax", {"share": 0.9}),)
+    ),
 )
 EMPTY = replace(
-    REPORT, models=(), unregistered={"a.png": Missing("no_verified_pair")}, images_total=1
+    REPORT,
+    models=(),
+    unregistered={"a.png": Missing("no_verified_pair")},
+    images_total=1,
 )
 
 
@@ -134,13 +148,25 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
 
 
 def test_summary_says_where_exif_is_wrong_or_needs_the_size_of_the_sensor() -> None:
-    camera = {"id": 1, "source": "exif", "focal_px": 270.0, "refined_px": 1081.2, "lens_mm": 0.0}
+    camera = {
+        "id": 1,
+        "source": "exif",
+        "focal_px": 270.0,
+        "refined_px": 1081.2,
+        "lens_mm": 0.0,
+    }
     right = {**camera, "id": 2, "refined_px": 280.0}
     lens = {**camera, "id": 3, "source": "guess", "lens_mm": 35.0}
     text = replace(REPORT, cameras=(camera, right, lens)).summary()
     assert "cameras     focal lengths: 2 from EXIF, 1 not known beforehand\n" in text
-    assert "            EXIF may be wrong: 270 px by EXIF, 1081 px in the model; --ignore" in text
-    assert "EXIF has 35 mm, and not the size of the sensor: --focal-mm 35 --film-width-mm" in text
+    assert (
+        "            EXIF may be wrong: 270 px by EXIF, 1081 px in the model; --ignore"
+        in text
+    )
+    assert (
+        "EXIF has 35 mm, and not the size of the sensor: --focal-mm 35 --film-width-mm"
+        in text
+    )
     text = replace(REPORT, cameras=(right, {**right, "refined_px": None})).summary()
     assert "EXIF may be wrong" not in text
     assert "sensor" not in text
@@ -154,7 +180,10 @@ def test_summary_says_where_exif_is_wrong_or_needs_the_size_of_the_sensor() -> N
 def test_summary_says_what_cannot_be_trusted() -> None:
     shaky = replace(SHAKY, probabilities={"a.png": 0.31, "č d.png": 0.9})
     text = replace(REPORT, models=(shaky,)).summary()
-    assert "doubtful    a.png: only 9 of its points are seen by two other photographs\n" in text
+    assert (
+        "doubtful    a.png: only 9 of its points are seen by two other photographs\n"
+        in text
+    )
     assert "sure        1, right with a probability of 90% or more\n" in text
 
 
@@ -163,7 +192,9 @@ def test_summary_says_why_photographs_are_not_sure() -> None:
     why = "none of its points is seen by two other photographs"
     names = LARGE.registered_names[:2]
     sure = dict.fromkeys(names, 0.7)
-    two = replace(LARGE, bridges={}, probabilities=sure, unsure=dict.fromkeys(names, doubts))
+    two = replace(
+        LARGE, bridges={}, probabilities=sure, unsure=dict.fromkeys(names, doubts)
+    )
     text = replace(REPORT, models=(two,)).summary()
     line = f"unsure      {names[0]}, {names[1]}: {why}"
     assert f"sure        0, right with a probability of 90% or more\n{line}\n" in text
@@ -180,7 +211,10 @@ def test_cameras_that_mapping_makes_one_are_said_to_be() -> None:
     ]
     text = replace(REPORT, cameras=tuple(cameras)).summary()
     assert "cameras     focal lengths: 4 not known beforehand, 1 from EXIF\n" in text
-    assert "            of those not known mapping makes 2: photographs of one size share" in text
+    assert (
+        "            of those not known mapping makes 2: photographs of one size share"
+        in text
+    )
     names = [camera["names"] for camera in as_mapped(cameras)]
     assert names == [["a.png", "b.png"], ["c.png"], ["d.png"], ["e.png"]]
 

@@ -30,11 +30,15 @@ FLOAT16_ROUNDING = 1e-3
 def some_features(count: int, seed: int = 0) -> LocalFeatures:
     rng = np.random.default_rng(seed)
     lafs = rng.uniform(0, 300, (count, 2, 3))
-    lafs[:, :, :2] = np.eye(2) * rng.uniform(1, 50, (count, 1, 1)) + rng.normal(0, 0.1, (2, 2))
+    lafs[:, :, :2] = np.eye(2) * rng.uniform(1, 50, (count, 1, 1)) + rng.normal(
+        0, 0.1, (2, 2)
+    )
     descriptors = rng.uniform(0.1, 1, (count, 128)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     responses = rng.uniform(0.01, 1, count).astype(np.float32)
-    return LocalFeatures(lafs, responses, descriptors, rng.integers(0, 9, count).astype(np.int32))
+    return LocalFeatures(
+        lafs, responses, descriptors, rng.integers(0, 9, count).astype(np.int32)
+    )
 
 
 def test_levels_of_other_features_are_kept_side_by_side(tmp_path: Path) -> None:
@@ -47,7 +51,9 @@ def test_levels_of_other_features_are_kept_side_by_side(tmp_path: Path) -> None:
     wide = np.pad(long.descriptors, ((0, 0), (100, 0)))
     long = replace(long, descriptors=wide)
     store.write("a.png", first, (300, 200))
-    store.extend("a.png", replace(short, rectification_ids=np.array([0, 1, 0], np.int32)), 3)
+    store.extend(
+        "a.png", replace(short, rectification_ids=np.array([0, 1, 0], np.int32)), 3
+    )
     store.extend("a.png", long, 1)
     read = store.read("a.png")
     highest = first.rectification_ids.max()
@@ -57,7 +63,9 @@ def test_levels_of_other_features_are_kept_side_by_side(tmp_path: Path) -> None:
     assert_array_equal(store.level_indices("a.png", 3, base=3), [4, 5, 6])
     assert store.level_ranges("a.png") == {0: range(4), 3: range(4, 7), 1: range(7, 9)}
     assert read.descriptors.shape == (9, 228)
-    assert_allclose(read.descriptors[4:7, :64], short.descriptors, atol=FLOAT16_ROUNDING)
+    assert_allclose(
+        read.descriptors[4:7, :64], short.descriptors, atol=FLOAT16_ROUNDING
+    )
     assert not read.descriptors[4:7, 64:].any()
     assert_allclose(read.descriptors[7:], wide, atol=FLOAT16_ROUNDING)
 
@@ -107,7 +115,9 @@ def test_files_do_not_need_the_newest_hdf5(store: FeatureStore) -> None:
     assert store.path.read_bytes()[8] == 0
 
 
-def test_images_in_folders_with_names_of_datasets_are_told_from_these(store: FeatureStore) -> None:
+def test_images_in_folders_with_names_of_datasets_are_told_from_these(
+    store: FeatureStore,
+) -> None:
     names = ["keypoints/descriptors/a.png", "keypoints/b.png", "z.png"]
     for count, name in enumerate(names, start=3):
         store.write(name, some_features(count), (4, 3))
@@ -122,7 +132,10 @@ def test_images_in_folders_with_names_of_datasets_are_told_from_these(store: Fea
 @pytest.mark.parametrize("access", ["read", "write"])
 @pytest.mark.parametrize(
     ("attributes", "found"),
-    [({}, "found None"), ({"format": "colmap_affrect/matches"}, "found colmap_affrect/matches")],
+    [
+        ({}, "found None"),
+        ({"format": "colmap_affrect/matches"}, "found colmap_affrect/matches"),
+    ],
     ids=["foreign", "other kind"],
 )
 def test_foreign_file_is_refused_and_left_as_it_is(
@@ -133,14 +146,18 @@ def test_foreign_file_is_refused_and_left_as_it_is(
         file.create_group("a.png").attrs["content"] = ""
     before = store.path.read_bytes()
     with pytest.raises(StoreError, match=rf"{store.path}: .*{found}.*--output-path"):
-        store.names() if access == "read" else store.write("b.png", some_features(2), (4, 3))
+        store.names() if access == "read" else store.write(
+            "b.png", some_features(2), (4, 3)
+        )
     assert store.path.read_bytes() == before
 
 
 @pytest.mark.parametrize(
     "content", [b"\0", b"no HDF5 at all" * 100, b"\x89HDF\r\n\x1a\n" + b"\0" * 88]
 )
-def test_damaged_file_is_refused_with_one_line(store: FeatureStore, content: bytes) -> None:
+def test_damaged_file_is_refused_with_one_line(
+    store: FeatureStore, content: bytes
+) -> None:
     store.path.write_bytes(content)
     for access in (store.names, lambda: store.write("a.png", some_features(2), (4, 3))):
         with pytest.raises(StoreError, match=r"^.*damaged .*--overwrite.*$"):
@@ -148,10 +165,15 @@ def test_damaged_file_is_refused_with_one_line(store: FeatureStore, content: byt
     assert store.path.read_bytes() == content
 
 
-def test_values_that_were_not_written_are_damage(store: FeatureStore, matches: MatchStore) -> None:
+def test_values_that_were_not_written_are_damage(
+    store: FeatureStore, matches: MatchStore
+) -> None:
     store.write("a.png", some_features(30), (4, 3))
     matches.write([pair_matches(("a.png", "b.png"), [[0, 1]], 9)])
-    for path, name in (store.path, "a.png/descriptors"), (matches.path, "a.png/b.png/matches0"):
+    for path, name in (
+        (store.path, "a.png/descriptors"),
+        (matches.path, "a.png/b.png/matches0"),
+    ):
         with h5py.File(path, "r+") as file:
             file[name][0] = 7
     reads = (
@@ -160,7 +182,9 @@ def test_values_that_were_not_written_are_damage(store: FeatureStore, matches: M
         lambda: list(matches.read([("a.png", "b.png")])),
         matches.check_all,
     )
-    for read, mend in zip(reads, ("'extract'",) * 2 + ("match --output-path",) * 2, strict=True):
+    for read, mend in zip(
+        reads, ("'extract'",) * 2 + ("match --output-path",) * 2, strict=True
+    ):
         with pytest.raises(StoreError, match=f"is not as it was written.*{mend}"):
             read()
 
@@ -173,7 +197,9 @@ def test_pair_key_is_that_of_hloc(name1: str, name2: str, key: str) -> None:
     assert pair_key(name1, name2) == key
 
 
-def pair_matches(names: tuple[str, str], indices: list[list[int]], count: int) -> PairMatches:
+def pair_matches(
+    names: tuple[str, str], indices: list[list[int]], count: int
+) -> PairMatches:
     array = np.asarray(indices, np.int64).reshape(-1, 2)
     scores = np.linspace(0.25, 0.5, len(array)).astype(np.float32)
     return PairMatches(names, array, scores, count)
@@ -190,7 +216,8 @@ def test_matches_have_the_layout_of_hloc(matches: MatchStore) -> None:
 
 
 @pytest.mark.parametrize(
-    ("indices", "count"), [([], 0), ([], 5), ([[0, 0]], 1), ([[0, 32_768], [39_999, 3]], 40_000)]
+    ("indices", "count"),
+    [([], 0), ([], 5), ([[0, 0]], 1), ([[0, 32_768], [39_999, 3]], 40_000)],
 )
 def test_read_returns_the_matches_that_were_written(
     matches: MatchStore, indices: list[list[int]], count: int
@@ -206,10 +233,15 @@ def test_read_returns_the_matches_that_were_written(
 
 
 def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore) -> None:
-    matches.write([pair_matches((name, "z.png"), [[0, 0]], 1) for name in ("a.png", "b.png")])
+    matches.write(
+        [pair_matches((name, "z.png"), [[0, 0]], 1) for name in ("a.png", "b.png")]
+    )
     with h5py.File(matches.path, "a") as file:
         del file["b.png/z.png"]
-    assert matches.has([("a.png", "z.png"), ("b.png", "z.png")]).tolist() == [True, False]
+    assert matches.has([("a.png", "z.png"), ("b.png", "z.png")]).tolist() == [
+        True,
+        False,
+    ]
     with pytest.raises(StoreError, match=r"no matches of b\.png, z\.png; run match"):
         list(matches.read([("a.png", "z.png"), ("b.png", "z.png")]))
 
@@ -230,7 +262,9 @@ def test_learned_matches_kept_beside_those_in_use_stay_when_these_change(
 
     def found(*rows: tuple[int, int], level: int = 0) -> PairMatches:
         indices = np.array(rows, np.int64).reshape(-1, 2)
-        return PairMatches(names, indices, np.full(len(rows), 0.5, np.float32), 9, level)
+        return PairMatches(
+            names, indices, np.full(len(rows), 0.5, np.float32), 9, level
+        )
 
     matches.write([found((0, 3), (2, 1))])
     learned = Learned(found((4, 7), level=2), (12, 0))
@@ -252,9 +286,13 @@ def test_learned_matches_kept_beside_those_in_use_stay_when_these_change(
     assert matches.state == MatchState(follows="sparse.best")
 
 
-def test_pairs_without_learned_matches_beside_those_in_use_have_none(matches: MatchStore) -> None:
+def test_pairs_without_learned_matches_beside_those_in_use_have_none(
+    matches: MatchStore,
+) -> None:
     names = ("a.png", "b c.png")
-    matches.write([PairMatches(names, np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)])
+    matches.write(
+        [PairMatches(names, np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)]
+    )
     assert matches.learned([names]) == {}
     assert matches.learned_levels([names]) == {names: -1}
     assert matches.measured_worths([names]) == {names: (0, 0)}
@@ -269,7 +307,9 @@ def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
     stationary = (((40, 30), ((1, 2), (3, 4))),)
     matches.keep(stationary=stationary, effort="high", listed="digest")
     looked_at = LookedAt("digest", 2.5, is_sure=True, score_without=0.75)
-    matches.keep(step=Begun(1, pairs), has_stepped=True, looked_at=looked_at, in_vain=("a", True))
+    matches.keep(
+        step=Begun(1, pairs), has_stepped=True, looked_at=looked_at, in_vain=("a", True)
+    )
     assert matches.state == MatchState(
         "digest", ("a", True), stationary, effort="high", looked_at=looked_at,
         step=Begun(1, pairs), has_stepped=True,

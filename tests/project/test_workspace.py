@@ -83,9 +83,22 @@ KEPT = {
     "pairs": ["features.h5"],
     "match": ["features.h5", "pairs.txt"],
     "verify": ["features.h5", "matches.h5", "pairs.txt"],
-    "escalate": ["cameras.json", "database.db", "features.h5", "matches.h5", "pairs.txt"],
+    "escalate": [
+        "cameras.json",
+        "database.db",
+        "features.h5",
+        "matches.h5",
+        "pairs.txt",
+    ],
     "guide": ["cameras.json", "database.db", "features.h5", "matches.h5", "pairs.txt"],
-    "map": ["cameras.json", "database.db", "features.h5", "guided.h5", "matches.h5", "pairs.txt"],
+    "map": [
+        "cameras.json",
+        "database.db",
+        "features.h5",
+        "guided.h5",
+        "matches.h5",
+        "pairs.txt",
+    ],
 }
 
 
@@ -93,7 +106,9 @@ KEPT = {
 def test_record_options_with_overwrite_discards_this_stage_and_later_ones(
     finished: Workspace, stage: str
 ) -> None:
-    finished.record_options(stage, {"by": "somebody else"}, recipe="default", overwrite=True)
+    finished.record_options(
+        stage, {"by": "somebody else"}, recipe="default", overwrite=True
+    )
     left = sorted(path.name for path in finished.path.iterdir())
     assert left == sorted(["config.toml", *KEPT[stage]])
     record = finished.recorded()
@@ -102,14 +117,19 @@ def test_record_options_with_overwrite_discards_this_stage_and_later_ones(
     # What was chosen for later stages is kept, unless everything begins anew.
     later = STAGES[len(earlier) + 1 :] if earlier else ()
     assert record.pop("planned", {}) == {name: {"by": name} for name in later}
-    assert record == {**{name: {"by": name} for name in earlier}, stage: {"by": "somebody else"}}
+    assert record == {
+        **{name: {"by": name} for name in earlier},
+        stage: {"by": "somebody else"},
+    }
     assert finished.begun == [*earlier, stage]
 
 
 def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
     finished: Workspace, tmp_path: Path
 ) -> None:
-    with pytest.raises(StoreError, match="the extract stage was run there, which copy cannot"):
+    with pytest.raises(
+        StoreError, match="the extract stage was run there, which copy cannot"
+    ):
         finished.record_options("copy", {}, overwrite=True)
     copied = Workspace(tmp_path / "copy")
     copied.path.mkdir()
@@ -118,7 +138,9 @@ def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
         copied.record_options(stage, {"by": stage})
     copied.database.write_bytes(b"copy")
     assert copied.begun == stages
-    with pytest.raises(StoreError, match="the copy stage was run there, which extract cannot"):
+    with pytest.raises(
+        StoreError, match="the copy stage was run there, which extract cannot"
+    ):
         copied.record_options("extract", {})
     copied.snapshots.mkdir()
     copied.record_options("copy", {"by": "another"}, overwrite=True)
@@ -135,7 +157,9 @@ def test_results_of_somebody_else_are_refused_and_left_as_they_are(
     path = workspace.path / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"SQLite format 3\0 or so")
-    with pytest.raises(StoreError, match="was not made here; it is left as it is") as error:
+    with pytest.raises(
+        StoreError, match="was not made here; it is left as it is"
+    ) as error:
         workspace.record_options("extract", OPTIONS, overwrite=overwrite)
     assert str(workspace.path / name.split("/")[0]) in str(error.value)
     assert path.read_bytes() == b"SQLite format 3\0 or so"
@@ -146,11 +170,18 @@ def test_only_empty_folders_and_our_own_are_taken(tmp_path: Path) -> None:
     out = Workspace(tmp_path / "out")
     out.require_own()
     out.path.mkdir()
-    for name in (".gitkeep", "desktop.ini", "config.toml.1234abcd.affrect-new", "run.log"):
+    for name in (
+        ".gitkeep",
+        "desktop.ini",
+        "config.toml.1234abcd.affrect-new",
+        "run.log",
+    ):
         (out.path / name).touch()
     out.require_own()
     (out.path / "report.html").write_text("mine")
-    with pytest.raises(OptionError, match=r"is not empty \(report\.html\) and was not made by"):
+    with pytest.raises(
+        OptionError, match=r"is not empty \(report\.html\) and was not made by"
+    ):
         out.begin()
     assert (out.path / "run.log").read_text() == ""
     (out.path / "report.html").unlink()
@@ -162,7 +193,9 @@ def test_only_empty_folders_and_our_own_are_taken(tmp_path: Path) -> None:
     out.require_own(tmp_path)
 
 
-@pytest.mark.parametrize("name", [".lock", "run.log", "database.db-wal", "sparse", "methods"])
+@pytest.mark.parametrize(
+    "name", [".lock", "run.log", "database.db-wal", "sparse", "methods"]
+)
 def test_links_in_the_place_of_our_files_are_refused(tmp_path: Path, name: str) -> None:
     out = Workspace(tmp_path / "out")
     out.path.mkdir()
@@ -180,7 +213,9 @@ def test_models_that_somebody_put_beside_ours_are_not_removed(
     foreign = workspace.sparse / name
     foreign.parent.mkdir(parents=True, exist_ok=True)
     foreign.touch()
-    with pytest.raises(StoreError, match="was not made by this run and would be removed"):
+    with pytest.raises(
+        StoreError, match="was not made by this run and would be removed"
+    ):
         workspace.record_options("extract", {}, overwrite=True)
     assert foreign.exists()
 
@@ -196,7 +231,9 @@ with Workspace(Path(sys.argv[1])).locked():
 """
 
 
-def test_folder_in_use_by_another_process_is_refused_until_it_ends(tmp_path: Path) -> None:
+def test_folder_in_use_by_another_process_is_refused_until_it_ends(
+    tmp_path: Path,
+) -> None:
     workspace = Workspace(tmp_path / "new" / "out")
     other = subprocess.Popen(
         [sys.executable, "-c", LOCK_AND_WAIT, str(workspace.path)],
@@ -207,7 +244,9 @@ def test_folder_in_use_by_another_process_is_refused_until_it_ends(tmp_path: Pat
     with other:
         assert other.stdout.readline() == "locked\n"
         with (
-            pytest.raises(WorkspaceError, match="another colmap-affrect is working in this folder"),
+            pytest.raises(
+                WorkspaceError, match="another colmap-affrect is working in this folder"
+            ),
             workspace.locked(),
         ):
             pass
@@ -220,13 +259,17 @@ def test_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     workspace = Workspace(tmp_path / "file" / "out")
     with (
-        pytest.raises(WorkspaceError, match=r"out: cannot be used as output folder \(Not a dir"),
+        pytest.raises(
+            WorkspaceError, match=r"out: cannot be used as output folder \(Not a dir"
+        ),
         workspace.locked(),
     ):
         pass
 
 
-OTHER_VERSION = "was made by another version of .*; use another --output-path or remove it"
+OTHER_VERSION = (
+    "was made by another version of .*; use another --output-path or remove it"
+)
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -246,14 +289,19 @@ def test_record_that_cannot_be_gone_on_with_is_one_clear_line(
             read()
 
 
-def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path) -> None:
+def test_branch_begins_after_the_raw_matches(
+    finished: Workspace, tmp_path: Path
+) -> None:
     branch = finished.branch(tmp_path / "branches" / "one")
     names = ["cameras.json", "config.toml", "features.h5", "matches.h5", "pairs.txt"]
     assert sorted(path.name for path in branch.path.iterdir()) == names
     assert branch.features.read_bytes() == b"features.h5"
     assert branch.begun == ["extract", "pairs", "match"]
     record = branch.recorded()
-    assert {**record, **record["planned"]} == {**finished.recorded(), "planned": record["planned"]}
+    assert {**record, **record["planned"]} == {
+        **finished.recorded(),
+        "planned": record["planned"],
+    }
     with pytest.raises(OptionError, match="the verify stage has not been run"):
         branch.require("verify")
     branch.record_options("verify", {"by": "another seed"})

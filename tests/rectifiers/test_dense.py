@@ -17,7 +17,9 @@ STEP_PX = 4
 Tilts = list[tuple[float, float]]
 
 
-def shape_grid(classes: Tilts, labels: np.ndarray, textured: np.ndarray | None = None) -> ShapeGrid:
+def shape_grid(
+    classes: Tilts, labels: np.ndarray, textured: np.ndarray | None = None
+) -> ShapeGrid:
     """A grid whose cell (r, c) has the class ``classes[labels[r, c]]``."""
     metrics = metrics_from_tilts(*np.array(classes).T)[labels]
     textured = np.ones(labels.shape, bool) if textured is None else textured
@@ -53,16 +55,22 @@ def check_invariants(plan: RectificationPlan, size: tuple[int, int]) -> None:
 
 
 @settings(max_examples=40)
-@given(st.integers(0, 10_000), st.integers(1, 12), st.integers(1, 12), st.integers(0, 15))
+@given(
+    st.integers(0, 10_000), st.integers(1, 12), st.integers(1, 12), st.integers(0, 15)
+)
 def test_plan_dense_shapes_partitions_any_grid(
     seed: int, rows: int, columns: int, cut_px: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    classes = [(float(7.0 ** rng.random()), float(np.pi * rng.random())) for _ in range(5)]
+    classes = [
+        (float(7.0 ** rng.random()), float(np.pi * rng.random())) for _ in range(5)
+    ]
     labels = rng.integers(0, 5, (rows, columns))
     textured = rng.random((rows, columns)) < 0.8
     size = (STEP_PX * columns - cut_px % 4, STEP_PX * rows - cut_px // 4)
-    options = DenseShapesOptions(min_region_frac=0.0, min_part_frac=0.0, covered_frac=1.0)
+    options = DenseShapesOptions(
+        min_region_frac=0.0, min_part_frac=0.0, covered_frac=1.0
+    )
     grid = shape_grid(classes, labels, textured)
     plan = plan_dense_shapes(grid, size, options)
     check_invariants(plan, size)
@@ -78,7 +86,9 @@ def test_plan_dense_shapes_partitions_any_grid(
             for item, warp in zip(plan.items, warps, strict=True)
             if warp == tuple(center)
         ]
-        np.testing.assert_array_equal(np.any(parts, axis=0), blocks[: size[1], : size[0]])
+        np.testing.assert_array_equal(
+            np.any(parts, axis=0), blocks[: size[1], : size[0]]
+        )
 
 
 def test_plan_dense_shapes_skips_regions_below_the_smallest_share() -> None:

@@ -46,10 +46,14 @@ MIN_CORRELATION = 0.95
 """Of a warp and the texture rendered from the front; half a pixel of error costs more."""
 
 
-def plan_planes(photograph: Photograph, depth: Array, **options: object) -> RectificationPlan:
+def plan_planes(
+    photograph: Photograph, depth: Array, **options: object
+) -> RectificationPlan:
     """Plan with the given options of the planes and of the rectifier."""
     rectifier = DepthPlanesOptions(**options)
-    return DepthPlanes(rectifier, RectifierInputs(depth=FixedDepth(depth))).plan(photograph)
+    return DepthPlanes(rectifier, RectifierInputs(depth=FixedDepth(depth))).plan(
+        photograph
+    )
 
 
 def image_mask(segment: PlanarSegment, size: tuple[int, int]) -> Mask:
@@ -70,7 +74,9 @@ def near_crease(labels: NDArray[np.intp]) -> Mask:
 
 
 @pytest.mark.parametrize("depth_size", [(160, 100), (700, 525)])
-def test_planar_segments_of_a_room_are_its_walls_and_floor(depth_size: tuple[int, int]) -> None:
+def test_planar_segments_of_a_room_are_its_walls_and_floor(
+    depth_size: tuple[int, int],
+) -> None:
     room = corner_room()
     depth, _ = room.depth(depth_size)
     _, labels = room.depth(room.size)
@@ -93,14 +99,17 @@ def test_planar_segments_align_depth_and_image_at_pixel_centres() -> None:
     depth = np.where(
         np.arange(60) < 21,
         *(
-            Room(wall[None], np.array([d]), slanted_wall(wall).camera_matrix, size).depth(
-                depth_size
-            )[0]
+            Room(
+                wall[None], np.array([d]), slanted_wall(wall).camera_matrix, size
+            ).depth(depth_size)[0]
             for wall, d in zip(walls, (2.0, 4.0), strict=True)
         ),
     )
     photograph = Photograph(
-        np.zeros(size[::-1], np.uint8), "a.png", None, slanted_wall(walls[0]).camera_matrix
+        np.zeros(size[::-1], np.uint8),
+        "a.png",
+        None,
+        slanted_wall(walls[0]).camera_matrix,
     )
     left, right = sorted(
         planar_segments(photograph, depth, PlaneOptions(min_separation_deg=60.0)),
@@ -116,7 +125,9 @@ def test_planar_segments_align_depth_and_image_at_pixel_centres() -> None:
 def test_planar_segments_leave_out_what_is_seen_too_obliquely() -> None:
     wall = slanted_wall([0.93, 0.0, -0.37])  # 68 degrees from the optical axis
     depth, _ = wall.depth((200, 150))
-    directions = np.stack([(np.arange(400) - 215.0) / 340.0, np.zeros(400), np.ones(400)], axis=1)
+    directions = np.stack(
+        [(np.arange(400) - 215.0) / 340.0, np.zeros(400), np.ones(400)], axis=1
+    )
     for max_angle_deg in (60.0, 70.0, 80.0):
         options = PlaneOptions(max_angle_deg=max_angle_deg)
         (segment,) = planar_segments(wall.photograph(), depth, options)
@@ -125,7 +136,10 @@ def test_planar_segments_leave_out_what_is_seen_too_obliquely() -> None:
         seen = cosines >= np.cos(np.deg2rad(max_angle_deg))
         row = image_mask(segment, wall.size)[130]  # that of the principal point
         assert np.count_nonzero(row != seen) <= 1
-    assert planar_segments(wall.photograph(), depth, PlaneOptions(max_angle_deg=30.0)) == []
+    assert (
+        planar_segments(wall.photograph(), depth, PlaneOptions(max_angle_deg=30.0))
+        == []
+    )
 
 
 def test_planar_segments_are_connected_and_large_enough() -> None:
@@ -137,7 +151,9 @@ def test_planar_segments_are_connected_and_large_enough() -> None:
     assert [segment.region.origin for segment in segments] == [(0, 0), (254, 0)]
     assert [segment.region.mask.shape[1] for segment in segments] == [250, 146]
     assert not segments[1].region.contains(np.array([[310.0, 110.0]]))[0]
-    (large,) = planar_segments(wall.photograph(), depth, PlaneOptions(min_region_frac=0.5))
+    (large,) = planar_segments(
+        wall.photograph(), depth, PlaneOptions(min_region_frac=0.5)
+    )
     np.testing.assert_array_equal(large.region.mask, segments[0].region.mask)
 
 
@@ -158,7 +174,9 @@ def test_plan_keeps_features_of_the_photograph_everywhere_or_outside() -> None:
 def canvas_in_plane(item: Rectification, room: Room) -> tuple[Array, Array]:
     """(H, W, 2) pixels of the warp, and (H, W, 2) what they show, in plane coordinates."""
     width, height = item.canvas_size
-    canvas = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+    canvas = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(
+        float
+    )
     pixels = project(item.image_from_rectified, canvas.reshape(-1, 2))
     directions = np.column_stack([pixels, np.ones(len(pixels))])
     directions = directions @ np.linalg.inv(room.camera_matrix).T
@@ -171,7 +189,9 @@ NORMALS = [(0.7, 0.2, -0.68), (0.1, -0.9, -0.42)]
 
 
 @pytest.mark.parametrize("normal", NORMALS)
-def test_warp_of_a_slanted_wall_is_its_frontal_view(normal: tuple[float, float, float]) -> None:
+def test_warp_of_a_slanted_wall_is_its_frontal_view(
+    normal: tuple[float, float, float],
+) -> None:
     room = slanted_wall(normal)
     pattern = cached_texture((900, 900), seed=4, finest_sigma_px=5.0)
     image = room.render(pattern, 120.0)
@@ -187,7 +207,9 @@ def test_warp_of_a_slanted_wall_is_its_frontal_view(normal: tuple[float, float, 
     assert_allclose(fitted[:2] @ fitted[:2].T / px_in_plane**2, np.eye(2), atol=2e-3)
     # What the warp shows is the texture of the plane.
     frontal = look_up(pattern, *np.moveaxis(120.0 * shown, -1, 0))
-    assert np.corrcoef(warp(image, item)[inside], frontal[inside])[0, 1] > MIN_CORRELATION
+    assert (
+        np.corrcoef(warp(image, item)[inside], frontal[inside])[0, 1] > MIN_CORRELATION
+    )
 
 
 def shapes_at(points: Array, tilt: float, angle_rad: float) -> Array:
@@ -233,14 +255,17 @@ def test_each_segment_is_warped_by_its_own_shapes() -> None:
         assert item.region_origin == segment.region.origin
         assert item.is_affine
         assert_allclose(
-            item.rectified_from_image[:2, :2], rectifying_affine(item.tilt, item.tilt_angle_rad)
+            item.rectified_from_image[:2, :2],
+            rectifying_affine(item.tilt, item.tilt_angle_rad),
         )
     assert plan.original_region is None
 
 
 def test_a_segment_of_several_shapes_has_several_warps_of_the_same_region() -> None:
     points = points_in(1)
-    shapes = np.concatenate([shapes_at(points[:24], 4.5, 0.2), shapes_at(points[24:], 4.5, 1.7)])
+    shapes = np.concatenate(
+        [shapes_at(points[:24], 4.5, 0.2), shapes_at(points[24:], 4.5, 1.7)]
+    )
     plan = plan_room(shapes)
     assert [item.segment_id for item in plan.items] == [1, 1]
     first, second = plan.items

@@ -12,7 +12,11 @@ from synthetic import blobs, texture
 
 from colmap_affrect.data import LocalFeatures, Mask, Rectification, RectificationPlan
 from colmap_affrect.features.sift import RootSift, SiftOptions
-from colmap_affrect.geometry.affine import ellipse_extents, fit_canvas, rectifying_affine
+from colmap_affrect.geometry.affine import (
+    ellipse_extents,
+    fit_canvas,
+    rectifying_affine,
+)
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.rectifiers.execute import extract_rectified
 
@@ -41,9 +45,13 @@ def one_warp(
     region = np.ones((height, width), bool) if region is None else region
     rows, columns = np.nonzero(region)
     matrix, canvas = fit_canvas(
-        rectifying_affine(tilt, angle_rad), np.column_stack([columns, rows]).astype(float), 16.0
+        rectifying_affine(tilt, angle_rad),
+        np.column_stack([columns, rows]).astype(float),
+        16.0,
     )
-    return RectificationPlan(size, (Rectification(matrix, canvas, region, tilt, angle_rad),))
+    return RectificationPlan(
+        size, (Rectification(matrix, canvas, region, tilt, angle_rad),)
+    )
 
 
 def of_warps(features: LocalFeatures) -> LocalFeatures:
@@ -67,7 +75,9 @@ def test_extract_rectified_finds_blobs_of_a_tilted_plane_with_their_place_and_el
     xs, ys = np.meshgrid([90.0, 210.0, 330.0], [80.0, 165.0, 250.0])
     centers = np.stack([xs.ravel(), ys.ravel()], axis=1) + rng.uniform(-4, 4, (9, 2))
     image = blobs(SIZE, centers, SIGMA_PX * shape)
-    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000))
+    features = of_warps(
+        extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000)
+    )
     errors = keypoint_errors(features, centers)
     assert np.linalg.norm(errors, axis=1).max() < KEYPOINT_ERROR_PX
     assert np.abs(errors.mean(axis=0)).max() < BIAS_PX
@@ -79,7 +89,9 @@ def test_extract_rectified_finds_blobs_of_a_tilted_plane_with_their_place_and_el
         covariance = found @ found.T
         assert_allclose(covariance, expected, atol=0.25 * np.abs(expected).max())
         shape_only = covariance / np.linalg.det(covariance) ** 0.5
-        assert_allclose(shape_only, expected / np.linalg.det(expected) ** 0.5, atol=1e-6)
+        assert_allclose(
+            shape_only, expected / np.linalg.det(expected) ** 0.5, atol=1e-6
+        )
 
 
 def test_extract_rectified_rejects_ellipses_that_reach_beyond_the_image() -> None:
@@ -94,13 +106,17 @@ def test_extract_rectified_rejects_ellipses_that_reach_beyond_the_image() -> Non
     outside = np.array([[0.6 * reach[0], 230.4], [width - 0.6 * reach[0], 80.1],
                         [310.2, 0.6 * reach[1]], [90.7, height - 0.6 * reach[1]]])  # fmt: skip
     image = blobs(SIZE, np.concatenate([inside, outside]), shape)
-    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000))
+    features = of_warps(
+        extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000)
+    )
     errors = np.linalg.norm(keypoint_errors(features, inside), axis=1)
     assert errors.max() < KEYPOINT_ERROR_PX
     assert np.linalg.norm(keypoint_errors(features, outside), axis=1).min() > 3.0
 
 
-def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_again() -> None:
+def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_again() -> (
+    None
+):
     image = texture(SIZE, seed=25, finest_sigma_px=2.5)
     original = PROFILE.detect((image, None))
     # A map next to the identity finds nearly all of them again.
@@ -108,7 +124,9 @@ def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_agai
     union = extract_rectified(image, plan, PROFILE, 100_000)
     kept = union.select(union.rectification_ids == 0)
     rectified = of_warps(union)
-    deep = is_inside(original.keypoints, SIZE, 1.5 * ellipse_extents(original.lafs[:, :, :2]))
+    deep = is_inside(
+        original.keypoints, SIZE, 1.5 * ellipse_extents(original.lafs[:, :, :2])
+    )
     places = {tuple(laf.ravel()) for laf in kept.lafs}
     gone = np.array([tuple(laf.ravel()) not in places for laf in original.lafs])
     assert np.count_nonzero(gone[deep]) > 0.8 * np.count_nonzero(deep)
@@ -117,7 +135,9 @@ def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_agai
         assert np.linalg.norm(rectified.keypoints - laf[:, 2], axis=1).min() < 4.0
 
 
-def test_extract_rectified_keeps_the_features_of_the_image_unless_the_plan_says_otherwise() -> None:
+def test_extract_rectified_keeps_the_features_of_the_image_unless_the_plan_says_otherwise() -> (
+    None
+):
     image = texture(SIZE, seed=25, finest_sigma_px=2.5)
     original = PROFILE.detect((image, None))
     plan = one_warp(1.01, 0.3, SIZE)
@@ -125,7 +145,9 @@ def test_extract_rectified_keeps_the_features_of_the_image_unless_the_plan_says_
     assert_allclose(kept.lafs[kept.rectification_ids == 0], original.lafs)
     left = np.zeros((SIZE[1], SIZE[0]), bool)
     left[:, :150] = True
-    partly = extract_rectified(image, replace(plan, original_region=left), PROFILE, 100_000)
+    partly = extract_rectified(
+        image, replace(plan, original_region=left), PROFILE, 100_000
+    )
     of_image = partly.select(partly.rectification_ids == 0)
     assert (np.rint(of_image.keypoints[:, 0]) < 150).all()
     assert len(of_image) == np.count_nonzero(np.rint(original.keypoints[:, 0]) < 150)

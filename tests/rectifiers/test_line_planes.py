@@ -15,13 +15,19 @@ from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.rectifiers.base import RECTIFIERS, RectifierInputs
 
 FOCAL = 1.0  # longer sides
-TURN = turn(0, -8.0) @ turn(1, 42.0)  # columns are right, down and ahead of the building
+TURN = turn(0, -8.0) @ turn(
+    1, 42.0
+)  # columns are right, down and ahead of the building
 
 
 def pixels(points: Array) -> Array:
     """(N, 2) pixel-centre px of (N, 3) points in the frame of the building, its corner at 0."""
     in_camera = points @ TURN.T + [0.0, 0.0, 6.0]
-    return FOCAL * SIZE[0] * in_camera[:, :2] / in_camera[:, 2:] + np.array(SIZE) / 2.0 - 0.5
+    return (
+        FOCAL * SIZE[0] * in_camera[:, :2] / in_camera[:, 2:]
+        + np.array(SIZE) / 2.0
+        - 0.5
+    )
 
 
 def draw_wall(image: GrayImage, along: Array) -> None:
@@ -55,7 +61,9 @@ def test_each_wall_of_a_corner_is_shown_from_the_front(corner: Photograph) -> No
     plan = rectifier.plan(corner)
     assert len(plan.items) == 2
     for along in (np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])):
-        square = np.array([[0.6, -0.4, 0.6], [1.6, -0.4, 1.6], [1.6, 0.6, 1.6], [0.6, 0.6, 0.6]])
+        square = np.array(
+            [[0.6, -0.4, 0.6], [1.6, -0.4, 1.6], [1.6, 0.6, 1.6], [0.6, 0.6, 0.6]]
+        )
         points = square * (along + np.array([0.0, 1.0, 0.0]))
         in_image = pixels(points)
         holding = [item for item in plan.items if item.in_region(in_image).all()]

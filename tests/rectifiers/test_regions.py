@@ -28,7 +28,9 @@ def regions(draw: st.DrawFn) -> Region:
     mask = blocks[: shape[0] * shape[1]].reshape(shape)
     mask[:, 0] = mask[0] = True
     mask[-1, -1] = True
-    return Region(np.kron(mask, np.ones((10, 10), bool)), (draw(st.integers(0, 90)), 31))
+    return Region(
+        np.kron(mask, np.ones((10, 10), bool)), (draw(st.integers(0, 90)), 31)
+    )
 
 
 def pixels(region: Region) -> np.ndarray:
@@ -67,7 +69,9 @@ def test_homography_rectification_fits_the_region_and_is_twice_as_large(
 ) -> None:
     slant = np.deg2rad(slant_deg)
     direction = np.sin(slant) * np.array([np.cos(direction_rad), np.sin(direction_rad)])
-    homography = fronto_parallel_homography(np.array([*direction, -np.cos(slant)]), CAMERA)
+    homography = fronto_parallel_homography(
+        np.array([*direction, -np.cos(slant)]), CAMERA
+    )
     third = pixels(region) @ homography[2, :2] + homography[2, 2]
     if third.min() < 0.05:
         return
@@ -83,9 +87,13 @@ def test_homography_rectification_fits_the_region_and_is_twice_as_large(
     relative = item.rectified_from_image @ np.linalg.inv(homography)
     relative /= relative[2, 2]
     assert_allclose(relative[2, :2], 0.0, atol=1e-9)
-    assert_allclose(relative[:2, :2], relative[0, 0] * np.eye(2), atol=1e-6 * relative[0, 0])
+    assert_allclose(
+        relative[:2, :2], relative[0, 0] * np.eye(2), atol=1e-6 * relative[0, 0]
+    )
     unit = np.concatenate([np.eye(2), pixels(region).mean(axis=0)[:, None]], axis=1)
     jacobian = transform_lafs(item.rectified_from_image, unit[None])[0, :, :2]
     assert_allclose(
-        metrics_from_tilts(item.tilt, item.tilt_angle_rad), unit_metrics(jacobian), atol=1e-6
+        metrics_from_tilts(item.tilt, item.tilt_angle_rad),
+        unit_metrics(jacobian),
+        atol=1e-6,
     )

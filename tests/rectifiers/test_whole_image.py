@@ -50,7 +50,9 @@ def test_near_optimal_covering_leaves_no_tilt_below_its_bound_uncovered() -> Non
     assert len(centers) + 1 == 25
     assert_allclose(1 + (1 / centers[:, 0]).sum(), 7.144, atol=0.001)
     tilts, angles = np.meshgrid(np.geomspace(1, 5.8, 150), np.linspace(0, np.pi, 500))
-    labels = nearest_centers(metrics_from_tilts(tilts.ravel(), angles.ravel()), centers, 1.7)
+    labels = nearest_centers(
+        metrics_from_tilts(tilts.ravel(), angles.ravel()), centers, 1.7
+    )
     assert (labels != UNCOVERED_LABEL).all()
     beyond = nearest_centers(metrics_from_tilts([9.5], [0.3]), centers, 1.7)
     assert (beyond == UNCOVERED_LABEL).all()
@@ -58,7 +60,9 @@ def test_near_optimal_covering_leaves_no_tilt_below_its_bound_uncovered() -> Non
 
 @pytest.mark.parametrize("covering", ["asift", "near-optimal"])
 @pytest.mark.parametrize("area_preserving", [True, False])
-def test_every_warp_shows_the_whole_image_at_its_tilt(covering, area_preserving) -> None:
+def test_every_warp_shows_the_whole_image_at_its_tilt(
+    covering, area_preserving
+) -> None:
     options = AsiftOptions(covering=covering, area_preserving=area_preserving)
     plan = Asift(options, RectifierInputs()).plan(photograph_of(texture(SIZE, 1)))
     assert len(plan.items) == {"asift": 60, "near-optimal": 24}[covering]
@@ -76,9 +80,13 @@ def test_every_warp_shows_the_whole_image_at_its_tilt(covering, area_preserving)
 
 
 def test_affnet_shapes_warps_by_the_classes_that_are_there() -> None:
-    shapes = fixed_shapes([(1.0, 0.0), (2.5, 0.7), (4.9, 2.2), (7.0, 1.0)], [50, 30, 15, 5])
+    shapes = fixed_shapes(
+        [(1.0, 0.0), (2.5, 0.7), (4.9, 2.2), (7.0, 1.0)], [50, 30, 15, 5]
+    )
     options = AffNetShapesOptions(covered_frac=1.0)
-    plan = AffNetShapes(options, RectifierInputs(shapes)).plan(photograph_of(texture(SIZE, 1)))
+    plan = AffNetShapes(options, RectifierInputs(shapes)).plan(
+        photograph_of(texture(SIZE, 1))
+    )
     classes = [(item.tilt, item.tilt_angle_rad) for item in plan.items]
     labels = nearest_centers(
         metrics_from_tilts([2.5, 4.9, 7.0], [0.7, 2.2, 1.0]), np.array(classes), 1.7

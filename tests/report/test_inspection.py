@@ -10,7 +10,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import texture, write_image
 
-from colmap_affrect.data import LocalFeatures, Photograph, Rectification, RectificationPlan
+from colmap_affrect.data import (
+    LocalFeatures,
+    Photograph,
+    Rectification,
+    RectificationPlan,
+)
 from colmap_affrect.errors import ImageError
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.report.inspection import inspect_image, inspect_level, tinted
@@ -29,7 +34,9 @@ def extractor() -> ImageExtractor:
 @pytest.fixture
 def photo(tmp_path: Path) -> Path:
     """A texture that is slanted, so that it is warped."""
-    slanted = cv2.resize(texture((3 * SIZE[0], SIZE[1]), 3), SIZE, interpolation=cv2.INTER_AREA)
+    slanted = cv2.resize(
+        texture((3 * SIZE[0], SIZE[1]), 3), SIZE, interpolation=cv2.INTER_AREA
+    )
     return write_image(tmp_path / "photo.png", slanted)
 
 
@@ -42,7 +49,8 @@ def inspect(extractor: ImageExtractor, path: Path, output_path: Path) -> str:
     assert 50 < picture.shape[0] < 6000
     assert picture.std() > 5.0
     lines = cv2.imdecode(
-        np.fromfile(output_path / f"{path.stem}-inspection-lines.png", np.uint8), cv2.IMREAD_COLOR
+        np.fromfile(output_path / f"{path.stem}-inspection-lines.png", np.uint8),
+        cv2.IMREAD_COLOR,
     )
     assert lines.shape[1] == WIDTH_PX
     assert "lines: " in said
@@ -60,7 +68,9 @@ def test_level_has_the_plan_and_the_features_of_extraction(
     assert_array_equal(level.features.lafs, features.lafs)
     kept = np.bincount(level.features.rectification_ids, minlength=len(plan.items) + 1)
     assert set(level.detected) == set(range(len(plan.items) + 1))
-    assert all(kept[number] <= len(found) for number, (_, found) in level.detected.items())
+    assert all(
+        kept[number] <= len(found) for number, (_, found) in level.detected.items()
+    )
     said = inspect(extractor, photo, tmp_path / "new" / "out")
     assert f"{len(plan.items)} warp" in said
     assert f"{len(features)} features" in said
@@ -77,9 +87,13 @@ def test_levels_that_wait_for_weights_are_passed_over(
     assert (tmp_path / "out" / "photo-inspection-level-3.png").exists()
 
 
-def test_missing_depth_is_a_warning_as_in_extraction(photo: Path, tmp_path: Path) -> None:
+def test_missing_depth_is_a_warning_as_in_extraction(
+    photo: Path, tmp_path: Path
+) -> None:
     (tmp_path / "depth").mkdir()
-    recipe = load_recipe("depth-planes-recommended", [f'depth.path="{tmp_path / "depth"}"'])
+    recipe = load_recipe(
+        "depth-planes-recommended", [f'depth.path="{tmp_path / "depth"}"']
+    )
     said = inspect(prepare(recipe.extraction), photo, tmp_path / "out")
     assert "no warps; " in said
     assert "no depth map of photo.png" in said
@@ -105,7 +119,9 @@ def test_sheet_of_small_and_flat_images(
 def test_names_of_every_kind_are_written_and_drawn(
     extractor: ImageExtractor, photo: Path, tmp_path: Path
 ) -> None:
-    inspect(extractor, photo.rename(tmp_path / "a $x^{$ ü 漢字.png"), tmp_path / "Ausgabe ä")
+    inspect(
+        extractor, photo.rename(tmp_path / "a $x^{$ ü 漢字.png"), tmp_path / "Ausgabe ä"
+    )
     assert (tmp_path / "Ausgabe ä" / "a $x^{$ ü 漢字-inspection.png").exists()
 
 
@@ -124,10 +140,14 @@ def test_features_are_ellipses_of_two_sigmas() -> None:
 def test_region_is_tinted_where_it_lies() -> None:
     region = np.ones((50, 120), bool)
     item = Rectification(np.eye(3), SIZE, region, 2.0, 0.3, region_origin=(150, 20))
-    photograph = Photograph(np.full(SIZE[::-1], 100, np.uint8), "photo.png", None, np.eye(3))
+    photograph = Photograph(
+        np.full(SIZE[::-1], 100, np.uint8), "photo.png", None, np.eye(3)
+    )
     image = tinted(photograph, RectificationPlan(SIZE, (item,)))
     color = np.array(rgb(PALETTE[0]))
     is_tinted = np.zeros(SIZE[::-1], bool)
     is_tinted[20:70, 150:270] = True
-    assert_allclose(image[is_tinted], np.tile(0.55 * 100 + 0.45 * color, (6000, 1)), atol=1)
+    assert_allclose(
+        image[is_tinted], np.tile(0.55 * 100 + 0.45 * color, (6000, 1)), atol=1
+    )
     assert_array_equal(image[~is_tinted], 100)

@@ -47,14 +47,20 @@ def test_what_is_no_photograph_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(b"no image")
     with pytest.raises(ImageError, match=r"a\.jpg: not a readable image"):
         camera_from_lines(tmp_path / "a.jpg")
-    for image in (np.zeros((9, 9)), np.zeros((9, 9, 4), np.uint8), np.zeros((0, 9), np.uint8)):
+    for image in (
+        np.zeros((9, 9)),
+        np.zeros((9, 9, 4), np.uint8),
+        np.zeros((0, 9), np.uint8),
+    ):
         with pytest.raises(OptionError, match=r"image: is an array of the shape"):
             camera_from_lines(image)
     with pytest.raises(OptionError, match=r"mask: has the shape \(9, 8\)"):
         camera_from_lines(np.zeros((8, 9), np.uint8), np.ones((9, 8), np.bool_))
 
 
-def test_a_picture_has_lines_in_the_colours_of_their_directions(drawing: GrayImage) -> None:
+def test_a_picture_has_lines_in_the_colours_of_their_directions(
+    drawing: GrayImage,
+) -> None:
     lines = lines_of(drawing)
     data = line_sheet(drawing, lines, line_report(lines, SIZE))
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]

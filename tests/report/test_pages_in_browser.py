@@ -78,7 +78,9 @@ def test_a_click_on_a_camera_shows_its_photograph(browser: Browser) -> None:
     same = """return document.querySelector("#photo img").src ===
         document.querySelectorAll("#sheet img")[2].src"""
     assert browser.run(same)
-    assert "12 of 15 depths" in browser.run("return document.getElementById('photo').innerText")
+    assert "12 of 15 depths" in browser.run(
+        "return document.getElementById('photo').innerText"
+    )
     browser.click("#photo [data-step='1']")
     assert "d.png" in browser.run("return document.getElementById('photo').innerText")
     browser.click("#photo [data-step='0']")
@@ -90,7 +92,9 @@ def test_photographs_open_and_panels_grow_with_one_click(browser: Browser) -> No
     assert NAMES[0] in browser.run("return document.getElementById('photo').innerText")
     browser.click("#photo [data-step='0']")
     browser.click("#model .enlarge")
-    width = "return document.querySelector('.panel.large').getBoundingClientRect().width"
+    width = (
+        "return document.querySelector('.panel.large').getBoundingClientRect().width"
+    )
     assert browser.run(width) >= 1180
     browser.click("#model .enlarge")
     browser.click("#filters [data-group=missing]")
@@ -106,7 +110,9 @@ def test_filters_show_the_photographs_they_count(browser: Browser) -> None:
     for group, count in (("seeds", 1), ("wrong", 1), ("none", 2), ("all", 6)):
         browser.click(f"#filters [data-group={group}]")
         assert browser.run(VISIBLE_CARDS) == count
-        pressed = "return document.querySelector('#filters [aria-pressed=true]').textContent"
+        pressed = (
+            "return document.querySelector('#filters [aria-pressed=true]').textContent"
+        )
         assert f"({count})" in browser.run(pressed)
     assert browser.run("return document.getElementById('shown').textContent") == (
         "6 of 6 photographs shown"
@@ -164,18 +170,21 @@ def test_models_are_chosen_from_a_list_and_seen_beside_each_other(
     assert running.run(shown) == [True, True]
     running.click('[data-shows="0"]')
     assert running.run(shown) == [False, True]
-    kinds = running.run("return JSON.parse(document.getElementById('data').textContent).views")
+    kinds = running.run(
+        "return JSON.parse(document.getElementById('data').textContent).views"
+    )
     assert [camera["kind"] for camera in kinds[0]["cameras"]][-1] == "doubtful"
     assert [camera["kind"] for camera in kinds[1]["cameras"]][-1] == "tracks"
     assert running.log() == []
 
 
-def test_what_is_printed_has_three_sides_of_the_model_and_no_buttons(browser: Browser) -> None:
+def test_what_is_printed_has_three_sides_of_the_model_and_no_buttons(
+    browser: Browser,
+) -> None:
     browser.command("Emulation.setEmulatedMedia", media="print")
     sides = "return [...document.querySelectorAll('#model .sides img')].map((i) => i.naturalWidth)"
     assert browser.run(sides) == [600] * 3
-    buttons = (
-        "return [...document.querySelectorAll('button:not(.photo)')].map((b) => b.offsetWidth)"
-    )
+    found = "[...document.querySelectorAll('button:not(.photo)')]"
+    buttons = f"return {found}.map((b) => b.offsetWidth)"
     assert set(browser.run(buttons)) == {0}
     browser.command("Emulation.setEmulatedMedia", media="")

@@ -59,7 +59,9 @@ def test_lines_join_the_matches_in_the_colours_of_their_kinds() -> None:
     distances = np.full(drawn.shape[:2], np.inf)  # of pixels from the nearest line
     rows, columns = np.indices(distances.shape)
     for index, kind in enumerate((MatchKind.OWN, MatchKind.GUIDED)):
-        first, second = (pair.points[side][index] * scales[side] - 0.5 for side in (0, 1))
+        first, second = (
+            pair.points[side][index] * scales[side] - 0.5 for side in (0, 1)
+        )
         second[0] += WIDTH_PX // 2
         for share in (0.0, 0.3, 1.0):
             x, y = np.rint(first + share * (second - first)).astype(int)
@@ -69,15 +71,21 @@ def test_lines_join_the_matches_in_the_colours_of_their_kinds() -> None:
         normal /= np.linalg.norm(normal)
         offsets = (columns - first[0]) * normal[0] + (rows - first[1]) * normal[1]
         distances = np.minimum(distances, np.abs(offsets))
-    drawn[int(scales[0] * 300) :, : WIDTH_PX // 2] = 0  # white below the wide photograph
-    drawn[:, SIDE : WIDTH_PX // 2] = drawn[:, WIDTH_PX // 2 + int(scales[1] * 150) :] = 0
+    drawn[int(scales[0] * 300) :, : WIDTH_PX // 2] = (
+        0  # white below the wide photograph
+    )
+    drawn[:, SIDE : WIDTH_PX // 2] = drawn[
+        :, WIDTH_PX // 2 + int(scales[1] * 150) :
+    ] = 0
     assert distances[drawn.any(axis=2)].max() < 6
 
 
 def test_photographs_that_were_shrunk_get_the_same_lines() -> None:
     pair = matched([(100.0, 30.0)], [(30.0, 150.0)], [MatchKind.WARPED])
     small = [np.ascontiguousarray(image[::2, ::2]) for image in PHOTOGRAPHS]
-    np.testing.assert_array_equal(draw_matches(pair, small), draw_matches(pair, PHOTOGRAPHS))
+    np.testing.assert_array_equal(
+        draw_matches(pair, small), draw_matches(pair, PHOTOGRAPHS)
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1, 199, 1001])
@@ -105,11 +113,15 @@ class Stores(SimpleNamespace):
 
     def __init__(self, folder: Path, begun: list[str]) -> None:
         levels = [
-            SimpleNamespace(name=name, features=SimpleNamespace(has_shapes=name == "first"))
+            SimpleNamespace(
+                name=name, features=SimpleNamespace(has_shapes=name == "first")
+            )
             for name in ("first", "second")
         ]
         super().__init__(
-            workspace=SimpleNamespace(sparse=folder / "sparse", begun=begun, is_changed=False),
+            workspace=SimpleNamespace(
+                sparse=folder / "sparse", begun=begun, is_changed=False
+            ),
             extraction=SimpleNamespace(levels=levels),
             counts=num_keypoints(folder / "database.db"),
             features=self,
@@ -157,7 +169,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned: bool) -> None:
+def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(
+    scene: Path, turned: bool
+) -> None:
     stores: Any = Stores(scene, ["match"])
     reader = PairReader(ViewGraph(scene / "database.db"), stores)
     names = NAMES[3:1:-1] if turned else NAMES[2:4]
@@ -165,14 +179,18 @@ def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned
     with open_database(scene / "database.db") as database:
         images = {image.name: image.image_id for image in database.read_all_images()}
         ids = [images[name] for name in names]
-        inliers = np.asarray(database.read_two_view_geometry(*ids).inlier_matches, np.int64)
+        inliers = np.asarray(
+            database.read_two_view_geometry(*ids).inlier_matches, np.int64
+        )
         points = [np.asarray(database.read_keypoints(i)[:, :2]) for i in ids]
         raw = {tuple(row) for row in database.read_matches(*ids).tolist()}
     expected = np.where((inliers % 2).any(axis=1), MatchKind.WARPED, MatchKind.OWN)
     expected[(inliers >= 60).any(axis=1)] = MatchKind.LEARNED
     expected[[tuple(row) not in raw for row in inliers.tolist()]] = MatchKind.GUIDED
     assert np.count_nonzero(expected == MatchKind.GUIDED) == 1
-    np.testing.assert_array_equal(pair.kinds, [*expected, MatchKind.REJECTED, MatchKind.BY_HAND])
+    np.testing.assert_array_equal(
+        pair.kinds, [*expected, MatchKind.REJECTED, MatchKind.BY_HAND]
+    )
     np.testing.assert_allclose(pair.points[1][: len(inliers)], points[1][inliers[:, 1]])
     marks = [(10.0 + image_id, 20.0) for image_id in ids]
     np.testing.assert_allclose([places[-1] for places in pair.points], marks)
@@ -183,7 +201,9 @@ def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(scene: Path, turned
     )
 
 
-def test_of_the_database_of_another_program_inliers_are_of_one_kind(scene: Path) -> None:
+def test_of_the_database_of_another_program_inliers_are_of_one_kind(
+    scene: Path,
+) -> None:
     stores: Any = Stores(scene, [])
     stores.workspace.sparse = scene / "none"
     reader = PairReader(ViewGraph(scene / "database.db"), stores)
@@ -193,8 +213,14 @@ def test_of_the_database_of_another_program_inliers_are_of_one_kind(scene: Path)
     stores = Stores(scene, ["match"])
     stores.counts[NAMES[3]] += 1  # the database has others than the run
     pair = PairReader(ViewGraph(scene / "database.db"), stores).read(NAMES[2:4])
-    assert set(pair.kinds.tolist()) == {MatchKind.FOREIGN, MatchKind.REJECTED, MatchKind.BY_HAND}
-    with pytest.raises(OptionError, match=r"c\.jpg: no such photograph \(did you mean 'c\.png'"):
+    assert set(pair.kinds.tolist()) == {
+        MatchKind.FOREIGN,
+        MatchKind.REJECTED,
+        MatchKind.BY_HAND,
+    }
+    with pytest.raises(
+        OptionError, match=r"c\.jpg: no such photograph \(did you mean 'c\.png'"
+    ):
         reader.read(("c.jpg", NAMES[3]))
     with pytest.raises(OptionError, match="never matched"):
         reader.read((NAMES[3], NAMES[3]))
@@ -212,7 +238,9 @@ def test_a_pair_without_any_match_is_drawn_too(scene: Path, tmp_path: Path) -> N
     (tmp_path / "photographs").mkdir()
     for name in NAMES[:2]:
         write_image(tmp_path / "photographs" / name, texture((160, 120), 1))
-    said = pairs.draw_pair(path, NAMES[:2], tmp_path / "photographs", tmp_path / "pair.png")
+    said = pairs.draw_pair(
+        path, NAMES[:2], tmp_path / "photographs", tmp_path / "pair.png"
+    )
     assert said == f"a.png and b.png: 0 raw matches, 0 inliers\n{tmp_path / 'pair.png'}"
 
 
@@ -226,9 +254,13 @@ def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
 
 
 def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
-    model = ModelSummary(tuple("abcdef"), 9, 2.0, 0.5, doubtful={"f": (Doubt("few_matches"),)})
+    model = ModelSummary(
+        tuple("abcdef"), 9, 2.0, 0.5, doubtful={"f": (Doubt("few_matches"),)}
+    )
     report = replace(
-        small_report(tmp_path), models=(model,), unregistered={"g": Missing("not_registered")}
+        small_report(tmp_path),
+        models=(model,),
+        unregistered={"g": Missing("not_registered")},
     )
     verified = {
         ("a", "b"): 900, ("b", "c"): 800, ("c", "d"): 50, ("d", "e"): 40, ("a", "f"): 30,
@@ -236,7 +268,11 @@ def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
     }  # fmt: skip
     exact = np.zeros((500, 2), np.int64)
     guided = [GuidedPair(("b", "c"), exact, 800), GuidedPair(("a", "b"), exact, 0)]
-    agreement = {("a", "c"): 0.1, ("a", "e"): 0.0, **dict.fromkeys(pairwise("abcde"), 0.9)}
+    agreement = {
+        ("a", "c"): 0.1,
+        ("a", "e"): 0.0,
+        **dict.fromkeys(pairwise("abcde"), 0.9),
+    }
     found = pairs_to_check(report, verified, agreement, [("e", "a")], guided)
     assert found == {
         ("a", "c"): "most inliers disagree with the model",
@@ -256,10 +292,16 @@ def test_of_many_pairs_twelve_are_shown_and_without_a_model_the_missing_ones(
     verified = dict.fromkeys(pairwise(names), 100)
     report = small_report(tmp_path)
     doubtful = dict.fromkeys(names, "why")
-    whole = replace(report, models=(ModelSummary(tuple(names), 9, 2.0, 0.5, doubtful=doubtful),))
+    whole = replace(
+        report, models=(ModelSummary(tuple(names), 9, 2.0, 0.5, doubtful=doubtful),)
+    )
     assert len(pairs_to_check(whole, verified, {})) == 12
-    without = replace(report, models=(), unregistered={"007.jpg": Missing("not_registered")})
-    assert pairs_to_check(without, verified, {}) == {("006.jpg", "007.jpg"): "007.jpg is missing"}
+    without = replace(
+        report, models=(), unregistered={"007.jpg": Missing("not_registered")}
+    )
+    assert pairs_to_check(without, verified, {}) == {
+        ("006.jpg", "007.jpg"): "007.jpg is missing"
+    }
 
 
 def test_a_pair_of_long_names_and_of_a_read_only_folder_is_drawn(

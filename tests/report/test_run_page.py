@@ -72,7 +72,10 @@ def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
 
 def test_the_tool_for_tie_points_knows_names_and_sizes(html: str) -> None:
     data = json.loads(html.split('id="data">')[1].split("</script>")[0])
-    assert data["tie_points"] == {"photographs": [[n, *IMAGE_SIZE] for n in NAMES], "marks": []}
+    assert data["tie_points"] == {
+        "photographs": [[n, *IMAGE_SIZE] for n in NAMES],
+        "marks": [],
+    }
 
 
 def test_no_folder_of_this_machine_is_in_the_page(html: str, folder: Path) -> None:
@@ -80,7 +83,9 @@ def test_no_folder_of_this_machine_is_in_the_page(html: str, folder: Path) -> No
     assert "/home/" not in html
 
 
-def test_cameras_are_where_the_model_has_them_seen_from_the_front(html: str, folder: Path) -> None:
+def test_cameras_are_where_the_model_has_them_seen_from_the_front(
+    html: str, folder: Path
+) -> None:
     data = json.loads(html.split('id="data">')[1].split("</script>")[0])
     assert data["names"][0] == NAMES[0]
     (view,) = data["views"]
@@ -92,7 +97,9 @@ def test_cameras_are_where_the_model_has_them_seen_from_the_front(html: str, fol
     true = np.array([centers[NAMES[camera["index"]]] for camera in view["cameras"]])
 
     def lengths(points: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(points[:, None] - points[None], axis=2)[np.triu_indices(4, 1)]
+        return np.linalg.norm(points[:, None] - points[None], axis=2)[
+            np.triu_indices(4, 1)
+        ]
 
     ratios = lengths(shown) / lengths(true)
     np.testing.assert_allclose(ratios, ratios[0], rtol=2e-3)
@@ -107,7 +114,9 @@ def test_matrix_of_inliers_is_symmetric_and_not_there_for_many_photographs() -> 
     assert inlier_matrix([*names, "one more.png"], {}) == ""
 
 
-@pytest.mark.parametrize(("num_photographs", "side_px"), [(1, 640), (39, 640), (1000, 126)])
+@pytest.mark.parametrize(
+    ("num_photographs", "side_px"), [(1, 640), (39, 640), (1000, 126)]
+)
 def test_thumbnails_are_smaller_the_more_photographs_a_page_has(
     num_photographs: int, side_px: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

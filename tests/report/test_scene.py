@@ -21,8 +21,12 @@ FRONT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 def cam_from_world(yaw_deg: float, position: Sequence[float]) -> pycolmap.Rigid3d:
     """A camera that is turned about its y axis."""
     yaw = np.deg2rad(yaw_deg)
-    rotation = np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ np.array(position))
+    rotation = np.array(
+        [[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]]
+    )
+    return pycolmap.Rigid3d(
+        pycolmap.Rotation3d(rotation), -rotation @ np.array(position)
+    )
 
 
 def view_of(
@@ -65,7 +69,9 @@ def test_z_is_up_and_y_is_where_cameras_look(tmp_path: Path) -> None:
     assert farthest == pytest.approx(1 / 1.15)
 
 
-@pytest.mark.parametrize(("yaws_deg", "has_front"), [((-70, 70), True), ((-75, 75), False)])
+@pytest.mark.parametrize(
+    ("yaws_deg", "has_front"), [((-70, 70), True), ((-75, 75), False)]
+)
 def test_cameras_that_look_in_all_directions_have_no_front(
     yaws_deg: tuple[int, int], has_front: bool, tmp_path: Path
 ) -> None:
@@ -101,7 +107,9 @@ def test_a_tenth_of_the_points_may_be_outside_of_the_view(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("color", "shown"), [(0, 130), (1, 60), (255, 200)])
-def test_colors_show_on_light_and_on_dark_ground(color: int, shown: int, tmp_path: Path) -> None:
+def test_colors_show_on_light_and_on_dark_ground(
+    color: int, shown: int, tmp_path: Path
+) -> None:
     """Points without colours are gray."""
     poses = [cam_from_world(0.0, (x, 0.0, 0.0)) for x in (-1.0, 1.0)]
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))

@@ -74,7 +74,9 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 def browser(running: Browser, tmp_path: Path) -> Iterator[Browser]:
     """On a desktop, with downloads into a folder; the console must stay empty."""
     running.resize(1200)
-    running.command("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    running.command(
+        "Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path)
+    )
     yield running
     assert running.log() == []
 
@@ -97,7 +99,9 @@ def page(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
         write_block(tmp_path / "photographs" / name, IMAGE_SIZE, 40, 16)
     workspace = Workspace(tmp_path)
     write_scene(workspace.database, names)
-    marks = {"corner": {names[0]: np.array([100.0, 90.0]), names[4]: np.array([1.5, 2.25])}}
+    marks = {
+        "corner": {names[0]: np.array([100.0, 90.0]), names[4]: np.array([1.5, 2.25])}
+    }
     residuals = (Residual("corner", names[0], 7.25),)
     model = ModelSummary(tuple(names[:4]), 90, 3.5, 0.25, tie_points=residuals)
     report = small_report(tmp_path)
@@ -132,7 +136,9 @@ def mark_of(browser: Browser, point: str) -> list[float]:
 
 
 @pytest.mark.parametrize("page", ["jpg", "png"], indirect=True)
-def test_marks_are_px_from_the_corner_of_the_image_as_stored(browser: Browser, page: Path) -> None:
+def test_marks_are_px_from_the_corner_of_the_image_as_stored(
+    browser: Browser, page: Path
+) -> None:
     browser.open(page)
     x, y = shown(browser, 1)
     browser.press(round(x), round(y))
@@ -164,7 +170,9 @@ def test_keys_and_the_wheel_do_what_they_say(browser: Browser, page: Path) -> No
     assert [row[1] for row in browser.run(MARKS)] == ["corner", "corner"]
     before = browser.run(BOX, 0)[2] / IMAGE_SIZE[0]
     place = dict(zip("xy", shown(browser, 0), strict=True))
-    browser.command("Input.dispatchMouseEvent", type="mouseWheel", **place, deltaX=0, deltaY=-400)
+    browser.command(
+        "Input.dispatchMouseEvent", type="mouseWheel", **place, deltaX=0, deltaY=-400
+    )
     browser.press(*map(round, shown(browser, 0)))
     scale = np.e * before
     np.testing.assert_allclose(mark_of(browser, "1"), (44.0, 20.0), atol=1 / scale)
@@ -173,7 +181,9 @@ def test_keys_and_the_wheel_do_what_they_say(browser: Browser, page: Path) -> No
     assert [row[1] for row in browser.run(MARKS)] == ["corner", "corner", "1", "2"]
 
 
-def test_dragging_moves_the_photograph_and_marks_nothing(browser: Browser, page: Path) -> None:
+def test_dragging_moves_the_photograph_and_marks_nothing(
+    browser: Browser, page: Path
+) -> None:
     browser.open(page)
     x, y = shown(browser, 0)
     for _ in range(3):
@@ -196,8 +206,15 @@ def test_two_fingers_zoom_and_a_tap_marks(browser: Browser, page: Path) -> None:
     shown(browser, 0)
     x, y, width, height = browser.run(BOX, 0)
     middle = x + width / 2, y + height / 2
-    for kind, reach in (("touchStart", 20), ("touchMove", 40), ("touchMove", 80), ("touchEnd", 0)):
-        fingers = [{"x": middle[0] + s * reach, "y": middle[1], "id": s + 1} for s in (-1, 1)]
+    for kind, reach in (
+        ("touchStart", 20),
+        ("touchMove", 40),
+        ("touchMove", 80),
+        ("touchEnd", 0),
+    ):
+        fingers = [
+            {"x": middle[0] + s * reach, "y": middle[1], "id": s + 1} for s in (-1, 1)
+        ]
         points = [] if kind == "touchEnd" else fingers
         browser.command("Input.dispatchTouchEvent", type=kind, touchPoints=points)
     for kind in ("touchStart", "touchEnd"):
@@ -208,7 +225,9 @@ def test_two_fingers_zoom_and_a_tap_marks(browser: Browser, page: Path) -> None:
     np.testing.assert_allclose(mark_of(browser, "1"), expected, atol=1 / scale)
 
 
-def test_residuals_are_those_of_the_run_until_a_mark_moves(browser: Browser, page: Path) -> None:
+def test_residuals_are_those_of_the_run_until_a_mark_moves(
+    browser: Browser, page: Path
+) -> None:
     assert "corner in 0.jpg: 7.2 px" in page.read_text(encoding="utf-8")
     browser.open(page)
     assert browser.run(MARKS) == [
@@ -216,19 +235,27 @@ def test_residuals_are_those_of_the_run_until_a_mark_moves(browser: Browser, pag
         ["5 4.jpg", "corner", "1.50", "2.25", "-"],
     ]
     browser.click("#tie-points tbody button")
-    assert browser.run("return document.querySelectorAll('#tie-points select')[2].value") == "0"
+    assert (
+        browser.run("return document.querySelectorAll('#tie-points select')[2].value")
+        == "0"
+    )
     browser.key("ArrowLeft")
     assert browser.run(MARKS)[0] == ["1 0.jpg", "corner", "99.00", "90.00", "-"]
 
 
-def test_a_saved_table_can_be_opened_and_wrong_ones_say_why(browser: Browser, page: Path) -> None:
+def test_a_saved_table_can_be_opened_and_wrong_ones_say_why(
+    browser: Browser, page: Path
+) -> None:
     table = page.parent / "given.csv"
     browser.open(page)
     for text, said in (
         ("x,y\n1,2\n", "its first line must be point,photograph,x,y"),
         ("point,photograph,x,y\n1,9.jpg,1,2\n", "line 2: no such photograph, 9.jpg"),
         ("point,photograph,x,y\n\n1,1.jpg,1,\n", "line 3: must have a point, x and y"),
-        ('y,x,photograph,point\r\n2.5,1,1.jpg,"a ""b"", c"\r\n', "Marks read from given.csv: 1"),
+        (
+            'y,x,photograph,point\r\n2.5,1,1.jpg,"a ""b"", c"\r\n',
+            "Marks read from given.csv: 1",
+        ),
     ):
         table.write_text(text, encoding="utf-8")
         browser.give_files("[data-part=table-input]", table)
@@ -237,7 +264,10 @@ def test_a_saved_table_can_be_opened_and_wrong_ones_say_why(browser: Browser, pa
     saved = page.parent / "tie-points.csv"
     until(saved.exists)
     assert saved.read_text() == 'point,photograph,x,y\n"a ""b"", c",1.jpg,1.00,2.50\n'
-    assert browser.run("return document.querySelector('[data-part=saved]').offsetHeight") > 0
+    assert (
+        browser.run("return document.querySelector('[data-part=saved]').offsetHeight")
+        > 0
+    )
 
 
 def click(browser: Browser, pane: int, point: np.ndarray) -> np.ndarray:
@@ -257,7 +287,9 @@ def corners_in_photograph(name: str) -> np.ndarray:
     return FOCAL_PX * seen[:, :2] / seen[:, 2:] + np.array(SCENE_SIZE) / 2
 
 
-def test_a_lost_photograph_comes_back_by_what_was_clicked(browser: Browser, tmp_path: Path) -> None:
+def test_a_lost_photograph_comes_back_by_what_was_clicked(
+    browser: Browser, tmp_path: Path
+) -> None:
     write_photographs(tmp_path / "photographs")
     options = on_photographs(tmp_path / "photographs", tmp_path / "out")
     options += [word for pair in REJECTED for word in ("--reject-pair", pair)]
@@ -278,8 +310,13 @@ def test_a_lost_photograph_comes_back_by_what_was_clicked(browser: Browser, tmp_
     until(table.exists)
     with table.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    saved = {(row["point"], row["photograph"]): (float(row["x"]), float(row["y"])) for row in rows}
-    assert saved == {key: pytest.approx(place, abs=0.006) for key, place in clicked.items()}
+    saved = {
+        (row["point"], row["photograph"]): (float(row["x"]), float(row["y"]))
+        for row in rows
+    }
+    assert saved == {
+        key: pytest.approx(place, abs=0.006) for key, place in clicked.items()
+    }
 
     back = run_in_process_of_its_own("run", *options, "--tie-points", table, "--json")
     assert not back.report["unregistered"]

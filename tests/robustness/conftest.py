@@ -34,8 +34,15 @@ def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     folder = tmp_path_factory.mktemp("scene")
     shutil.copytree(photos, folder / "photos")
-    (folder / "photos" / "b c.png").rename(folder / "photos" / "b-c.png")  # text has no blanks
-    files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+    (folder / "photos" / "b c.png").rename(
+        folder / "photos" / "b-c.png"
+    )  # text has no blanks
+    files = [
+        "--features-path",
+        folder / "features.h5",
+        "--matches-path",
+        folder / "matches.h5",
+    ]
     out = folder / "out"
     for words in (
         run_words(folder, out),

@@ -57,11 +57,23 @@ class _NoTensor:
 ODD_ARRAYS: dict[str, tuple[Any, Any, str]] = {
     "words": (np.full((80, 2), "x"), ROWS, "keypoints are <U1; give numbers of px"),
     "complex numbers": (POINTS.astype(complex), ROWS, "keypoints are complex128"),
-    "dates": (np.zeros((80, 2), "datetime64[s]"), ROWS, r"keypoints are datetime64\[s\]"),
+    "dates": (
+        np.zeros((80, 2), "datetime64[s]"),
+        ROWS,
+        r"keypoints are datetime64\[s\]",
+    ),
     "records": (np.zeros(80, [("x", "f4")]), ROWS, "do not fit"),
     "ragged lists": ([[1.0, 2.0], [3.0]], ROWS[:2], "two arrays"),
-    "tensors that need grad": (_NoTensor(), ROWS, "numpy.. on Tensor that requires grad"),
-    "masked values": (np.ma.masked_greater(POINTS, 200.0), ROWS, "some values are masked"),
+    "tensors that need grad": (
+        _NoTensor(),
+        ROWS,
+        "numpy.. on Tensor that requires grad",
+    ),
+    "masked values": (
+        np.ma.masked_greater(POINTS, 200.0),
+        ROWS,
+        "some values are masked",
+    ),
     "no image is so large": (POINTS * 1e300, ROWS, "where no image reaches"),
     "in units of the sides": (POINTS / 300.0, ROWS, "write keypoints in px"),
     "all at one place": (np.full((80, 2), 99.0), ROWS, "at one place"),
@@ -185,10 +197,16 @@ def test_scale_that_cannot_be_right_is_refused(length: float, tmp_path: Path) ->
 
 
 PANORAMA_USES: dict[str, Callable[[Path], object]] = {
-    "undistorted": lambda p: export(p / "m", p / "o", ["undistorted"], image_path=p / "photos"),
-    "nerfstudio": lambda p: export(p / "m", p / "o", ["nerfstudio"], image_path=p / "photos"),
+    "undistorted": lambda p: export(
+        p / "m", p / "o", ["undistorted"], image_path=p / "photos"
+    ),
+    "nerfstudio": lambda p: export(
+        p / "m", p / "o", ["nerfstudio"], image_path=p / "photos"
+    ),
     "mvsnet": lambda p: export(p / "m", p / "o", ["mvsnet"], image_path=p / "photos"),
-    "another camera": lambda p: export(p / "m", p / "o", ["text"], camera_model="RADIAL"),
+    "another camera": lambda p: export(
+        p / "m", p / "o", ["text"], camera_model="RADIAL"
+    ),
     "extended": lambda p: colmap_affrect.run(
         p / "photos", p / "o", RunOptions(extend=Extension(model_path=p / "m"))
     ),
@@ -205,7 +223,9 @@ def test_model_of_panoramas_is_refused_where_a_focal_length_is_needed(
     model.cameras[1].params = [160.0, 120.0]
     model.write(tmp_path / "m")
     before = tree(tmp_path)
-    with pytest.raises(OptionError, match=r"camera 1 looks all around \(EQUIRECTANGULAR\)"):
+    with pytest.raises(
+        OptionError, match=r"camera 1 looks all around \(EQUIRECTANGULAR\)"
+    ):
         PANORAMA_USES[use](tmp_path)
     assert tree(tmp_path) == before
     assert set(export(tmp_path / "m", tmp_path / "o", ["ply", "text", "cameras"])) == {
@@ -220,11 +240,17 @@ def test_text_model_that_contradicts_itself_is_named(name: str, tmp_path: Path) 
     model.write_text(tmp_path / "text")
     path = tmp_path / "text" / name
     lines = path.read_text().splitlines()
-    kept = lines[: len(lines) // 2] if name == "points3D.txt" else [*lines[:-1], lines[-1] * 2]
+    kept = (
+        lines[: len(lines) // 2]
+        if name == "points3D.txt"
+        else [*lines[:-1], lines[-1] * 2]
+    )
     path.write_text("\n".join(kept) + "\n")
     for use in (
         lambda: export(tmp_path / "text", tmp_path / "o", ["ply"]),
-        lambda: export(tmp_path / "text", tmp_path / "o", ["nerfstudio"], image_path=tmp_path),
+        lambda: export(
+            tmp_path / "text", tmp_path / "o", ["nerfstudio"], image_path=tmp_path
+        ),
     ):
         with pytest.raises(StoreError, match="images and points are not of one model"):
             use()  # type: ignore[no-untyped-call]

@@ -26,7 +26,13 @@ from small_scene import write_photographs
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap.cameras import read_given_cameras
-from colmap_affrect.errors import AffrectError, OptionError, PartError, damage, heedless_stream
+from colmap_affrect.errors import (
+    AffrectError,
+    OptionError,
+    PartError,
+    damage,
+    heedless_stream,
+)
 from colmap_affrect.images.photographs import CameraOptions, list_images
 from colmap_affrect.images.reading import header_size, read_color, read_gray
 from colmap_affrect.matchers.base import MATCHERS, MatcherContext, Matches
@@ -38,7 +44,9 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 
 FULL = Path("/dev/full")
-needs_full = pytest.mark.skipif(not FULL.exists(), reason="the system has no device that is full")
+needs_full = pytest.mark.skipif(
+    not FULL.exists(), reason="the system has no device that is full"
+)
 
 
 # Part 1: streams.
@@ -63,13 +71,19 @@ def test_full_device_is_one_line_and_loses_nothing(
     words = ["extract", *on_photographs(photos, tmp_path / "out")]
     command = [sys.executable, "-m", "colmap_affrect", *words]
     streams: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    environment = {
+        key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"
+    }
     with FULL.open("wb") as full:
         streams[stream] = full
-        ended = subprocess.run(command, check=False, text=True, env=environment, **streams)
+        ended = subprocess.run(
+            command, check=False, text=True, env=environment, **streams
+        )
     if stream == "stdout":
         assert ended.returncode == 1
-        errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
+        errors = [
+            line for line in ended.stderr.splitlines() if line.startswith("error: ")
+        ]
         assert errors == [
             "error: what the command prints cannot be written (No space left on device)"
         ]
@@ -135,12 +149,16 @@ def write_tiff(path: Path, values: np.ndarray) -> None:
         (273, 4, 8), (277, 3, 1), (278, 4, height), (279, 4, len(data)),
         (339, 3, formats[values.dtype.kind]),
     ]  # fmt: skip
-    entries = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in tags)
+    entries = b"".join(
+        struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in tags
+    )
     start = struct.pack("<2sHI", b"II", 42, 8 + len(data))
     path.write_bytes(start + data + struct.pack("<H", len(tags)) + entries + bytes(4))
 
 
-def test_comment_of_any_length_in_a_picture_is_looked_through_at_once(tmp_path: Path) -> None:
+def test_comment_of_any_length_in_a_picture_is_looked_through_at_once(
+    tmp_path: Path,
+) -> None:
     comment, pixels = b"#" + b"x" * 10_000_000 + b"\n", bytes(range(48))
     (tmp_path / "long.ppm").write_bytes(b"P6\n" + comment + b"4 4 255\n" + pixels)
     (tmp_path / "short.ppm").write_bytes(b"P6\n#x\n4 4 255\n" + pixels)
@@ -183,7 +201,9 @@ def test_list_that_repeats_a_name_asks_for_it_once(
 ) -> None:
     asked = []
     is_file = Path.is_file
-    monkeypatch.setattr(Path, "is_file", lambda path: asked.append(path) or is_file(path))
+    monkeypatch.setattr(
+        Path, "is_file", lambda path: asked.append(path) or is_file(path)
+    )
     (tmp_path / "list.txt").write_text("a.png\n" * 1000, encoding="utf-8")
     assert list_images(photos, tmp_path / "list.txt") == ["a.png"]
     assert len(asked) < 10
@@ -260,7 +280,9 @@ def test_groups_of_any_depth_are_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("metres", ["1e300", "1e-320"])
-def test_model_is_given_no_scale_that_is_none(tmp_path: Path, call: Call, metres: str) -> None:
+def test_model_is_given_no_scale_that_is_none(
+    tmp_path: Path, call: Call, metres: str
+) -> None:
     write_model(tmp_path / "model")
     ended = call(
         "align", "--model-path", tmp_path / "model", "--output-path", tmp_path / "new",
@@ -299,21 +321,27 @@ def test_links_that_lead_in_a_circle_are_one_line(
 ) -> None:
     (tmp_path / "loop").symlink_to("loop")
     write_model(tmp_path / "model")
-    names = {key: tmp_path / key for key in ("loop", "new", "model")} | {"photos": photos}
+    names = {key: tmp_path / key for key in ("loop", "new", "model")} | {
+        "photos": photos
+    }
     ended = call(*(word.format(**names) for word in words))
     assert ended.code in (1, 2)
     assert (len(ended.errors), len(ended.stderr)) == (1, 1)
     assert str(tmp_path) in ended.errors[0]
 
 
-def test_photographs_of_another_size_are_not_exported(tmp_path: Path, call: Call) -> None:
+def test_photographs_of_another_size_are_not_exported(
+    tmp_path: Path, call: Call
+) -> None:
     """COLMAP copies them, beside a model that is of others."""
     write_model(tmp_path / "model", "PINHOLE")
     for name in ("a.png", "b.png", "side/c.png", "d.png"):
         (tmp_path / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
         write_image(tmp_path / "photos" / name, texture((80, 60), 0))
     given = ["--model-path", tmp_path / "model", "--image-path", tmp_path / "photos"]
-    ended = call("export", *given, "--output-path", tmp_path / "new", "--format", "nerfstudio")
+    ended = call(
+        "export", *given, "--output-path", tmp_path / "new", "--format", "nerfstudio"
+    )
     assert (ended.code, len(ended.errors)) == (1, 1)
     assert "a.png: is 80 x 60 px, and its camera 160 x 120" in ended.errors[0]
     assert not (tmp_path / "new").exists()
@@ -347,7 +375,12 @@ def test_folder_that_cannot_be_removed_is_named_with_its_place(
 def test_models_that_are_gone_are_made_again(tmp_path: Path, call: Call) -> None:
     """A run must not say that it finds none: somebody has removed them, or half of a folder."""
     write_photographs(tmp_path / "photos")
-    words = ["run", *on_photographs(tmp_path / "photos", tmp_path / "out"), "--json", "--no-page"]
+    words = [
+        "run",
+        *on_photographs(tmp_path / "photos", tmp_path / "out"),
+        "--json",
+        "--no-page",
+    ]
     before = call(*words).report
     sparse = Workspace(tmp_path / "out").sparse
     (sparse / "0").rename(tmp_path / "away")
@@ -409,7 +442,9 @@ def use_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str],
 def test_part_of_another_package_that_fails_is_one_line(
     use_part: Callable[[str], None], code: str
 ) -> None:
-    with pytest.raises((OptionError, PartError)) as caught:  # the former when it is loaded
+    with pytest.raises(
+        (OptionError, PartError)
+    ) as caught:  # the former when it is loaded
         use_part(code)
     assert PARTS[code] in str(caught.value)
     assert "matcher 'odd' of a package without a name (odd_part:P)" in str(caught.value)

@@ -26,7 +26,12 @@ from colmap_affrect.project.workspace import Workspace
 TRIO = sorted(NAMES[:3])
 PHOTOGRAPH = photograph((0.8, -0.3, 0.3), -7.5)
 """One more of the small scene, (240, 320) uint8."""
-FORMATS = {"WEBP": "WebP", "GIF": "GIF", "AVIF": "AVIF or HEIF", "JPEG2000": "JPEG 2000"}
+FORMATS = {
+    "WEBP": "WebP",
+    "GIF": "GIF",
+    "AVIF": "AVIF or HEIF",
+    "JPEG2000": "JPEG 2000",
+}
 """Formats that COLMAP cannot read, as Pillow and as we call them."""
 FAILING = {"start.jpg", "0 empty.jpg", "gone.png", "pipe.jpg", "bomb.png"}
 FAILING |= {f"{kind}.jpg" for kind in FORMATS}
@@ -68,11 +73,17 @@ def test_folders_without_usable_images_are_one_line(tmp_path: Path, call: Call) 
     photos.mkdir()
     for names, code, said in (
         (["notes.txt"], 2, f"{photos}: holds no images (.jpg"),
-        (["a.png", "b.jpg"], 1, f"none of the 2 images can be used; the first: {photos / 'a.png'}"),
+        (
+            ["a.png", "b.jpg"],
+            1,
+            f"none of the 2 images can be used; the first: {photos / 'a.png'}",
+        ),
     ):
         for name in names:
             (photos / name).write_bytes(b"text")
-        ended = call("run", "--image-path", photos, "--output-path", tmp_path / "out", "-q")
+        ended = call(
+            "run", "--image-path", photos, "--output-path", tmp_path / "out", "-q"
+        )
         assert (ended.code, ended.stdout, len(ended.stderr)) == (code, "", 1)
         assert said in ended.errors[0]
 
@@ -80,12 +91,20 @@ def test_folders_without_usable_images_are_one_line(tmp_path: Path, call: Call) 
 def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:
     write_photographs(tmp_path / "photos", 1)
     out = tmp_path / "out"
-    ended = call("run", "--image-path", tmp_path / "photos", "--output-path", out, *FAST, "-q")
+    ended = call(
+        "run", "--image-path", tmp_path / "photos", "--output-path", out, *FAST, "-q"
+    )
     assert ended.code == 3
-    assert ended.stderr == [f"error: one image cannot make a model; see {out / 'report.html'}"]
+    assert ended.stderr == [
+        f"error: one image cannot make a model; see {out / 'report.html'}"
+    ]
     assert "registered  0 of 1 images" in ended.stdout
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    assert (report["status"], report["num_models"], report["num_pairs"]) == ("no_model", 0, 0)
+    assert (report["status"], report["num_models"], report["num_pairs"]) == (
+        "no_model",
+        0,
+        0,
+    )
     assert codes_of_missing(report) == {"a.png": "no_verified_pair"}
 
 
@@ -106,7 +125,9 @@ def test_names_with_the_same_key_are_refused(tmp_path: Path) -> None:
     for name in ("wing/b-c.png", "wing-b/c.png"):
         (tmp_path / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
         write_image(tmp_path / "photos" / name, photograph((0, 0, 0), 0))
-    with pytest.raises(StoreError, match=r"wing-b/c\.png and wing/b-c\.png have the same key"):
+    with pytest.raises(
+        StoreError, match=r"wing-b/c\.png and wing/b-c\.png have the same key"
+    ):
         run(tmp_path / "photos", tmp_path / "out", RunOptions())
     assert not Workspace(tmp_path / "out").features.exists()
 
@@ -114,10 +135,18 @@ def test_names_with_the_same_key_are_refused(tmp_path: Path) -> None:
 def test_cameras_that_cannot_be_used_are_refused_before_anything_is_recorded(
     trio: Path, tmp_path: Path, call: Call
 ) -> None:
-    extract = ["extract", "--image-path", trio, "--output-path", tmp_path / "out", *FAST[:2]]
+    extract = [
+        "extract",
+        "--image-path",
+        trio,
+        "--output-path",
+        tmp_path / "out",
+        *FAST[:2],
+    ]
     refused = call(*extract, "--camera-model", "EQUIRECTANGULAR")
     assert (
-        "model: EQUIRECTANGULAR: cut perspective views out of the panoramas, " in refused.errors[0]
+        "model: EQUIRECTANGULAR: cut perspective views out of the panoramas, "
+        in refused.errors[0]
     )
     refused = call(*extract, "--principal-point", "5")
     assert "--principal-point: cy='': should be a valid number" in refused.errors[0]
@@ -128,10 +157,19 @@ def test_cameras_that_cannot_be_used_are_refused_before_anything_is_recorded(
 def test_damaged_features_are_made_again_with_overwrite(
     trio: Path, tmp_path: Path, call: Call
 ) -> None:
-    extract = ["extract", "--image-path", trio, "--output-path", tmp_path / "out", *FAST]
+    extract = [
+        "extract",
+        "--image-path",
+        trio,
+        "--output-path",
+        tmp_path / "out",
+        *FAST,
+    ]
     assert call(*extract).code == 0
     (tmp_path / "out" / "features.h5").write_bytes(b"damaged")
-    assert "run the same 'extract' or 'run' with --overwrite" in call(*extract).errors[0]
+    assert (
+        "run the same 'extract' or 'run' with --overwrite" in call(*extract).errors[0]
+    )
     assert call(*extract, "--overwrite").code == 0
 
 
@@ -148,7 +186,9 @@ def write_bad_images(folder: Path) -> None:
     (folder / "0 empty.jpg").write_bytes(b"")
     (folder / "gone.png").symlink_to(folder / "nowhere.png")
     os.mkfifo(folder / "pipe.jpg")
-    (folder / "bomb.png").write_bytes(png_of_size(40_000, 40_000))  # more than OpenCV takes
+    (folder / "bomb.png").write_bytes(
+        png_of_size(40_000, 40_000)
+    )  # more than OpenCV takes
     for kind in FORMATS:
         photo.save(folder / f"{kind}.jpg", format=kind)
     photo.save(folder / "x.webp")
@@ -167,8 +207,12 @@ def test_bad_images_are_named_and_the_others_registered(
 
     before = state()
     for folder in folders:
-        folder.chmod(0o555)  # does not stop root, but then the times of the folders tell
-    ended = call("run", "--image-path", trio, "--output-path", tmp_path / "out", "--json", *FAST)
+        folder.chmod(
+            0o555
+        )  # does not stop root, but then the times of the folders tell
+    ended = call(
+        "run", "--image-path", trio, "--output-path", tmp_path / "out", "--json", *FAST
+    )
     for folder in folders:
         folder.chmod(0o755)
     assert state() == before
@@ -176,9 +220,16 @@ def test_bad_images_are_named_and_the_others_registered(
     failures = extraction["failures"]
     warnings = extraction["warnings"]
     # Decoders differ in what they make of data that ends early.
-    assert set(failures) >= FAILING >= set(failures) - {"half.jpg", "half.png", "noise.jpg"}
+    assert (
+        set(failures)
+        >= FAILING
+        >= set(failures) - {"half.jpg", "half.png", "noise.jpg"}
+    )
     for kind, name in FORMATS.items():
-        assert f"is of the format {name}, which COLMAP cannot read" in failures[f"{kind}.jpg"]
+        assert (
+            f"is of the format {name}, which COLMAP cannot read"
+            in failures[f"{kind}.jpg"]
+        )
         # So it is in truth, or the rule would keep good images out.
         assert pycolmap.Bitmap.read(trio / f"{kind}.jpg", as_rgb=False) is None
     assert set(TRIO) <= set(ended.report["registered_names"])
@@ -190,7 +241,9 @@ def test_bad_images_are_named_and_the_others_registered(
 
 
 @pytest.mark.parametrize("suffix", IMAGE_SUFFIXES)
-def test_formats_that_are_taken_are_read_alike_by_colmap(tmp_path: Path, suffix: str) -> None:
+def test_formats_that_are_taken_are_read_alike_by_colmap(
+    tmp_path: Path, suffix: str
+) -> None:
     path = tmp_path / f"x{suffix}"
     mode = {".ppm": "RGB", ".pbm": "1"}.get(suffix, "L")
     PIL.Image.fromarray(PHOTOGRAPH).convert(mode).save(path)
@@ -212,12 +265,17 @@ def test_tiny_images_are_no_obstacle(trio: Path, tmp_path: Path, call: Call) -> 
     assert ended.code == 0, ended.stderr
     assert ended.report["registered_names"] == TRIO
     assert set(ended.report["unregistered"]) == set(tiny)
-    assert set(codes_of_missing(ended.report).values()) <= {"no_features", "no_verified_pair"}
+    assert set(codes_of_missing(ended.report).values()) <= {
+        "no_features",
+        "no_verified_pair",
+    }
 
 
 def test_float_pixels_that_are_not_finite_are_black_or_white(tmp_path: Path) -> None:
     values = np.array([[np.nan, np.inf, -np.inf, 0.5]], np.float32)
-    assert read_gray(write_image(tmp_path / "x.tif", values)).tolist() == [[0, 255, 0, 127]]
+    assert read_gray(write_image(tmp_path / "x.tif", values)).tolist() == [
+        [0, 255, 0, 127]
+    ]
 
 
 OF_A_RUN = (
@@ -255,8 +313,15 @@ def test_pipes_among_photographs_and_lists_are_one_line(
     os.mkfifo(trio / "side" / "run.log")
     run = ["run", "--image-path", trio, "--output-path", tmp_path / "out"]
     os.mkfifo(tmp_path / "list")
-    for option in ("--image-list-path", "--match-list-path", "--cameras-path", "--tie-points"):
+    for option in (
+        "--image-list-path",
+        "--match-list-path",
+        "--cameras-path",
+        "--tie-points",
+    ):
         ended = call(*run, option, tmp_path / "list")
         assert (ended.code, len(ended.stderr)) == (2, 1)
-        assert "is not a file, but a pipe, which can be read only once" in ended.errors[0]
+        assert (
+            "is not a file, but a pipe, which can be read only once" in ended.errors[0]
+        )
     assert list_images(trio) == TRIO

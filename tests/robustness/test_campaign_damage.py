@@ -29,7 +29,13 @@ READERS = ("run", "map", "export", "align", "doctor")
 
 def reader(name: str, scene: Path, out: Path) -> Words:
     """Arguments of a command that reads an output folder; results of some are beside it."""
-    model = ["--model-path", out / "sparse" / "0", "--output-path", out.with_name("target"), "-q"]
+    model = [
+        "--model-path",
+        out / "sparse" / "0",
+        "--output-path",
+        out.with_name("target"),
+        "-q",
+    ]
     return {
         "run": run_words(scene, out),
         "map": ["map", "-q", "--output-path", out],
@@ -45,11 +51,17 @@ def outcome(name: str, out: Path) -> dict[str, Any]:
         return tree(out.with_name("target"), times=False)
     if name == "doctor":
         return {}
-    models = {key: value for key, value in tree(out, times=False).items() if key.endswith(".bin")}
+    models = {
+        key: value
+        for key, value in tree(out, times=False).items()
+        if key.endswith(".bin")
+    }
     if name == "map":
         return database_content(out / "database.db") | models
     kept = {"features", "matches"}  # what an idle run does not read; doctor does
-    return {key: value for key, value in results(out).items() if key not in kept} | models
+    return {
+        key: value for key, value in results(out).items() if key not in kept
+    } | models
 
 
 @pytest.fixture(scope="session")
@@ -75,7 +87,9 @@ def test_damaged_file_is_mended_or_named(
     done = damage(out / name, chance, others=[scene / "out" / other for other in FILES])
     before = tree(out)
     end = call(*reader(command, scene, out))
-    sys.stdout.write(f"{done}; then {command}: {end.stderr}\n")  # shown when the test fails
+    sys.stdout.write(
+        f"{done}; then {command}: {end.stderr}\n"
+    )  # shown when the test fails
     if command == "doctor":  # which prints what it finds
         assert end.code in (0, 1), end
         assert differences(before, tree(out)) == []
@@ -85,7 +99,9 @@ def test_damaged_file_is_mended_or_named(
         try:
             found = outcome(command, out)
         except (OSError, RuntimeError, ValueError, KeyError, sqlite3.Error) as error:
-            raise AssertionError(f"success with a result that cannot be read: {error}") from error
+            raise AssertionError(
+                f"success with a result that cannot be read: {error}"
+            ) from error
         wrong = differences(expected[command], found)
         assert not wrong, f"success with a wrong result: {wrong}"
     elif command == "run":
@@ -95,7 +111,9 @@ def test_damaged_file_is_mended_or_named(
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
-@pytest.mark.parametrize("name", [*FILES, "features.h5.journal", "database.db.seal", ".lock"])
+@pytest.mark.parametrize(
+    "name", [*FILES, "features.h5.journal", "database.db.seal", ".lock"]
+)
 def test_pipe_in_the_place_of_a_file_is_named_at_once(
     scene: Path, tmp_path: Path, call: Call, name: str
 ) -> None:
@@ -130,7 +148,12 @@ def test_damaged_file_of_another_program_is_refused_or_read(
         "pairs.txt": ["--match-list-path", tmp_path / name],
         "features.h5": [],
     }[name]
-    files = ["--features-path", tmp_path / "features.h5", "--image-path", scene / "photos"]
+    files = [
+        "--features-path",
+        tmp_path / "features.h5",
+        "--image-path",
+        scene / "photos",
+    ]
     before = tree(tmp_path)
     new = tmp_path / "new.db"
     end = call("import-h5", "-q", *files, *how, *CAMERA, "--database-path", new)

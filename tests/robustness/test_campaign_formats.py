@@ -20,13 +20,17 @@ def write_pgm(path: Path, picture: Path, white: int, *, is_text: bool) -> None:
     assert image is not None
     values = (image.astype(int) * white + 127) // 255
     height, width = values.shape
-    header = f"P{2 if is_text else 5}\n# of a scanner\n{width} {height}\n{white}\n".encode()
+    header = (
+        f"P{2 if is_text else 5}\n# of a scanner\n{width} {height}\n{white}\n".encode()
+    )
     numbers = " ".join(map(str, values.ravel())).encode()
     stored = values.astype(">u2" if white > 255 else "u1").tobytes()
     path.write_bytes(header + (numbers if is_text else stored))
 
 
-@pytest.mark.parametrize(("white", "is_text"), [(31, False), (4095, False), (4095, True)])
+@pytest.mark.parametrize(
+    ("white", "is_text"), [(31, False), (4095, False), (4095, True)]
+)
 def test_photographs_with_any_white_are_registered(
     scene: Path, tmp_path: Path, call: Call, white: int, is_text: bool
 ) -> None:
@@ -36,7 +40,16 @@ def test_photographs_with_any_white_are_registered(
     for number, picture in enumerate(pictures):
         write_pgm(folder / f"{number}.pgm", picture, white, is_text=is_text)
     out = tmp_path / "out"
-    ended = call("run", "--image-path", folder, "--output-path", out, *PLAIN, "--no-page", "--json")
+    ended = call(
+        "run",
+        "--image-path",
+        folder,
+        "--output-path",
+        out,
+        *PLAIN,
+        "--no-page",
+        "--json",
+    )
     assert_clear(ended, 0)
     assert len(ended.report["registered_names"]) == len(pictures)
 
@@ -55,7 +68,9 @@ def test_database_in_utf_16_is_mapped(scene: Path, tmp_path: Path, call: Call) -
         target.execute(f"PRAGMA user_version = {version}")
         target.commit()
     out = tmp_path / "out"
-    assert_clear(call("map", "--from-database", path, "--output-path", out, "-q", "--no-page"), 0)
+    assert_clear(
+        call("map", "--from-database", path, "--output-path", out, "-q", "--no-page"), 0
+    )
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
@@ -79,7 +94,9 @@ def test_long_file_with_a_small_picture_is_not_copied(
     with (folder / "b.png").open("wb") as file:
         file.write(picture.read_bytes())
         file.truncate(3_000_000_000)
-    ended = call("convert", "--image-path", folder, "--output-path", tmp_path / "photos")
+    ended = call(
+        "convert", "--image-path", folder, "--output-path", tmp_path / "photos"
+    )
     assert "3.0 GB long" in ended.stdout + "".join(ended.stderr)
     assert sorted(path.name for path in (tmp_path / "photos").iterdir()) == ["a.png"]
 

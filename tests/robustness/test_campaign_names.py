@@ -37,19 +37,34 @@ RESULTS = {
 
 def exports(base: Path, photograph: str) -> dict[str, tuple[Words, str]]:
     """All commands that write beside the output folder: arguments, and the name of a result."""
-    files = ["--features-path", base / "features.h5", "--matches-path", base / "matches.h5"]
+    files = [
+        "--features-path",
+        base / "features.h5",
+        "--matches-path",
+        base / "matches.h5",
+    ]
     images = ["--image-path", base / "photos"]
-    new_files = ["--features-path", "{out}/features.h5", "--matches-path", "{out}/matches.h5"]
+    new_files = [
+        "--features-path",
+        "{out}/features.h5",
+        "--matches-path",
+        "{out}/matches.h5",
+    ]
     assert RESULTS.keys() == FORMATS.keys()
     found: dict[str, tuple[Words, str]] = {}
     for form, name in {**RESULTS, "ply,text,cameras,nerfstudio": "text"}.items():
         for model in ("plain", "lens"):
             given = ["--model-path", base / model, *images, "--format", form]
-            found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)
+            found[f"{form} of {model}"] = (
+                ["export", *given, "--output-path", "{out}"],
+                name,
+            )
     distance = ["--distance", "b-c.png,side/d.png,2.0", "--output-path", "{out}/new"]
     source = ["--database-path", base / "any.db"]
     image = base / "photos" / photograph
-    listed = ["--image-list-path", base / "list.txt"] if (base / "list.txt").exists() else []
+    listed = (
+        ["--image-list-path", base / "list.txt"] if (base / "list.txt").exists() else []
+    )
     to = ["--output-path", "{out}"]
     return {
         **found,
@@ -92,20 +107,31 @@ def rename_image(base: Path, name: str) -> None:
         model.find_image_with_name("a.png").name = name
         model.write(model_path)
     quoted = name.replace("'", "''")
-    execute(base / "any.db", f"UPDATE images SET name = '{quoted}' WHERE name = 'a.png'")
+    execute(
+        base / "any.db", f"UPDATE images SET name = '{quoted}' WHERE name = 'a.png'"
+    )
     for features in ("features.h5", "described.h5"):
-        with suppress(ValueError, RuntimeError), h5py.File(base / features, "a") as file:
+        with (
+            suppress(ValueError, RuntimeError),
+            h5py.File(base / features, "a") as file,
+        ):
             file.copy("a.png", name)
-    (base / "list.txt").write_text(f"{name}\nb-c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
+    (base / "list.txt").write_text(
+        f"{name}\nb-c.png\nside/č.png\nside/d.png\n", encoding="utf-8"
+    )
 
 
 def assert_whole(label: str, out: Path) -> None:
     """A command that ended well has all of its results inside of its folder."""
     found = tree(out)
-    assert not [key for key, value in found.items() if value[0] == "link" or "affrect" in key]
+    assert not [
+        key for key, value in found.items() if value[0] == "link" or "affrect" in key
+    ]
     assert any(value[0] != "folder" for value in found.values()), "nothing was written"
     if any(form in label for form in ("undistorted", "nerfstudio", "mvsnet")):
-        pictures = [path for path in (out / "dense" / "images").rglob("*") if path.is_file()]
+        pictures = [
+            path for path in (out / "dense" / "images").rglob("*") if path.is_file()
+        ]
         model = pycolmap.Reconstruction(out / "dense" / "sparse")
         assert (len(pictures), model.num_reg_images()) == (4, 4)
     if "text" in label:

@@ -46,7 +46,9 @@ def turn(degrees: float) -> NDArray[np.float64]:
     return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
 
-def photograph(degrees: float, behind: NDArray[np.uint8], number: int) -> NDArray[np.uint8]:
+def photograph(
+    degrees: float, behind: NDArray[np.uint8], number: int
+) -> NDArray[np.uint8]:
     """Render the box, turned, before a background, with noise of its own."""
     image = behind.copy()
     for side in range(4):
@@ -55,11 +57,15 @@ def photograph(degrees: float, behind: NDArray[np.uint8], number: int) -> NDArra
         corners = square @ rotation.T + (0.0, 0.0, DISTANCE)
         if rotation[:, 2] @ corners[0] <= 0.0:  # seen from behind
             continue
-        projected = FOCAL_PX * corners[:, :2] / corners[:, 2:] + np.array(SIZE) / 2 - 0.5
+        projected = (
+            FOCAL_PX * corners[:, :2] / corners[:, 2:] + np.array(SIZE) / 2 - 0.5
+        )
         ends = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (TEXTURE_PX - 1)
         mapping = cv2.getPerspectiveTransform(np.float32(ends), np.float32(projected))
         drawn = texture((TEXTURE_PX, TEXTURE_PX), 50 + side)
-        cv2.warpPerspective(drawn, mapping, SIZE, dst=image, borderMode=cv2.BORDER_TRANSPARENT)
+        cv2.warpPerspective(
+            drawn, mapping, SIZE, dst=image, borderMode=cv2.BORDER_TRANSPARENT
+        )
     noise = np.random.default_rng(number).normal(0.0, 2.0, image.shape)
     return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
 
@@ -73,14 +79,19 @@ def write_views(folder: Path, behind: NDArray[np.uint8]) -> Words:
     return ["run", "--image-path", folder, *PLAIN, *CAMERA, "--no-page"]
 
 
-def test_box_before_a_still_camera_is_registered_by_what_turns(tmp_path: Path, call: Call) -> None:
+def test_box_before_a_still_camera_is_registered_by_what_turns(
+    tmp_path: Path, call: Call
+) -> None:
     words = write_views(tmp_path / "photos", texture(SIZE, 7))
     out = tmp_path / "out"
     done = call(*words, "--output-path", out, "--json", "-q")
     assert done.code == 0, done
     assert len(done.report["registered_names"]) == NUM_VIEWS
     log = Workspace(out).log.read_text(encoding="utf-8")
-    assert "pairs never move (a caption, a frame, a watermark, or the background of some" in log
+    assert (
+        "pairs never move (a caption, a frame, a watermark, or the background of some"
+        in log
+    )
     poses = read_poses(out / "sparse" / "0")
     for first, second in pairwise(sorted(poses)):
         between = poses[second][0] @ poses[first][0].T
@@ -88,7 +99,9 @@ def test_box_before_a_still_camera_is_registered_by_what_turns(tmp_path: Path, c
         assert found_deg == pytest.approx(STEP_DEG, abs=1.0)
 
 
-def test_camera_that_goes_round_a_box_loses_no_match(tmp_path: Path, call: Call) -> None:
+def test_camera_that_goes_round_a_box_loses_no_match(
+    tmp_path: Path, call: Call
+) -> None:
     plain = np.full(SIZE[::-1], 128, np.uint8)
     words = write_views(tmp_path / "photos", plain)
     workspace = Workspace(tmp_path / "out")
@@ -98,5 +111,7 @@ def test_camera_that_goes_round_a_box_loses_no_match(tmp_path: Path, call: Call)
     matches = MatchStore(workspace.matches)
     before = hdf5_content(workspace.matches)
     pairs = list(combinations(done.report["registered_names"], 2))
-    assert StationaryFilter(FeatureStore(workspace.features), matches).learn(pairs) == ""
+    assert (
+        StationaryFilter(FeatureStore(workspace.features), matches).learn(pairs) == ""
+    )
     assert hdf5_content(workspace.matches) == before

@@ -24,7 +24,19 @@ IDS_OF_TABLES = (
     "frame_data.data_id", "frame_data.sensor_id", "frame_data.sensor_type", "keypoints.rows",
     "keypoints.cols", "matches.rows", "two_view_geometries.config", "images.name",
 )  # fmt: skip
-ODD = ("0", "-1", "1", "2", "99", "5000000000", "4294967295", "NULL", "'x'", "1.5", "x'00ff'")
+ODD = (
+    "0",
+    "-1",
+    "1",
+    "2",
+    "99",
+    "5000000000",
+    "4294967295",
+    "NULL",
+    "'x'",
+    "1.5",
+    "x'00ff'",
+)
 ADDED = (
     "INSERT INTO rig_sensors VALUES ({}, {}, {}, NULL)",
     "INSERT INTO rigs VALUES ({}, {}, {})",
@@ -66,7 +78,9 @@ def test_database_that_contradicts_itself_is_mapped_or_named(
         ["export-database", path, tmp_path / "old.db"],
     ):  # fmt: skip
         end = call(*words, "-q")
-        sys.stdout.write(f"{done}; then {words[0]}: {end.stderr}\n")  # shown when the test fails
+        sys.stdout.write(
+            f"{done}; then {words[0]}: {end.stderr}\n"
+        )  # shown when the test fails
         assert_clear(end, 0, 1, 2, 3)
         if end.code in (1, 2) and words[0] == "map":
             assert call("doctor", "-q", path).code == 1
@@ -80,7 +94,9 @@ def test_model_that_nothing_can_be_computed_with_is_named(
 ) -> None:
     model = pycolmap.Reconstruction(scene / "plain")
     odd = float(value)
-    first, second = [model.image(image_id) for image_id in sorted(model.reg_image_ids())[:2]]
+    first, second = [
+        model.image(image_id) for image_id in sorted(model.reg_image_ids())[:2]
+    ]
     if what == "pose":
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), [odd, 0.0, 0.0])
         model.frame(first.frame_id).set_cam_from_world(first.camera_id, pose)

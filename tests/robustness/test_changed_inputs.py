@@ -52,7 +52,11 @@ def same_size_and_time(scene: Path) -> None:
 def output_inside(scene: Path) -> None:
     """As inspect leaves it, and other runs."""
     for inner, record, text in (
-        ("look", "run.log", "2026-01-01 00:00:00,000 INFO colmap-affrect 0.1: inspect a.png"),
+        (
+            "look",
+            "run.log",
+            "2026-01-01 00:00:00,000 INFO colmap-affrect 0.1: inspect a.png",
+        ),
         ("side/other run", "config.toml", "format_version = 6\n"),
     ):
         folder = scene / "photos" / inner
@@ -80,13 +84,29 @@ LISTED = [*FAST, "--match-list-path", "{scene}/pairs.txt"]
 GIVEN = [*FAST[:2], "--from-database", "{scene}/source.db"]
 ADDED = photograph((0.2, -0.2, 0.3), 3.0)
 CHANGES: list[tuple[list[str], Callable[[Path], object], str]] = [
-    (FAST, same_size_and_time, "1 changed (a.png); all that hangs on them is made again"),
-    (FAST, lambda at: (at / "photos" / SECOND).write_bytes(b"\x89PNG"), "1 changed (b c.png)"),
-    (FAST, lambda at: (at / "photos" / FIRST).rename(at / "photos" / "x.png"), "1 gone (a.png)"),
+    (
+        FAST,
+        same_size_and_time,
+        "1 changed (a.png); all that hangs on them is made again",
+    ),
+    (
+        FAST,
+        lambda at: (at / "photos" / SECOND).write_bytes(b"\x89PNG"),
+        "1 changed (b c.png)",
+    ),
+    (
+        FAST,
+        lambda at: (at / "photos" / FIRST).rename(at / "photos" / "x.png"),
+        "1 gone (a.png)",
+    ),
     (FAST, lambda at: write_image(at / "photos" / "0.png", ADDED), ""),
     (FAST, output_inside, ""),
     (MASKS, lambda at: repaint(at / "masks" / f"{FIRST}.png"), "1 changed (a.png)"),
-    (LISTED, list_changed, "1 pairs are not listed any more, such as a.png and side/č.png"),
+    (
+        LISTED,
+        list_changed,
+        "1 pairs are not listed any more, such as a.png and side/č.png",
+    ),
     (GIVEN, source_changed, "cameras are given otherwise"),
 ]
 
@@ -97,9 +117,13 @@ def write_scene(scene: Path) -> None:
     (scene / "pairs.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     for name in NAMES:
         (scene / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
-        write_image(scene / "masks" / f"{name}.png", np.full(IMAGE_SIZE[::-1], 255, np.uint8))
+        write_image(
+            scene / "masks" / f"{name}.png", np.full(IMAGE_SIZE[::-1], 255, np.uint8)
+        )
     image_ids(scene / "source.db")  # makes it
-    pycolmap.import_images(scene / "source.db", scene / "photos", pycolmap.CameraMode.PER_IMAGE)
+    pycolmap.import_images(
+        scene / "source.db", scene / "photos", pycolmap.CameraMode.PER_IMAGE
+    )
 
 
 def by_sorted_names(found: dict[str, Any]) -> dict[str, Any]:
@@ -116,11 +140,22 @@ def by_sorted_names(found: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.long
 @pytest.mark.parametrize(("options", "change", "line"), CHANGES)
 def test_run_after_a_change_equals_a_fresh_one(
-    tmp_path: Path, call: Call, options: list[str], change: Callable[[Path], object], line: str
+    tmp_path: Path,
+    call: Call,
+    options: list[str],
+    change: Callable[[Path], object],
+    line: str,
 ) -> None:
     def run(out: Path) -> str:
         """Run, and return the warnings."""
-        paths = ["--image-path", tmp_path / "photos", "--output-path", out, "--max-failures", 4]
+        paths = [
+            "--image-path",
+            tmp_path / "photos",
+            "--output-path",
+            out,
+            "--max-failures",
+            4,
+        ]
         ended = call("run", *paths, *(word.format(scene=tmp_path) for word in options))
         assert ended.code in (0, 3), ended.stderr
         return "\n".join(line for line in ended.stderr if line.startswith("WARNING: "))
@@ -136,7 +171,13 @@ def test_run_after_a_change_equals_a_fresh_one(
     again, fresh = (by_sorted_names(results(out)) for out in folders)
     assert again == fresh
     reports = [json.loads((out / "report.json").read_text()) for out in folders]
-    for key in ("status", "images_total", "unregistered", "num_pairs", "num_verified_pairs"):
+    for key in (
+        "status",
+        "images_total",
+        "unregistered",
+        "num_pairs",
+        "num_verified_pairs",
+    ):
         assert reports[0][key] == reports[1][key]
 
 
@@ -148,7 +189,9 @@ def stage(tmp_path: Path, call: Call) -> Stage:
     """Run a stage on ``photos``; return what was done and the lines of stderr."""
 
     def run_stage(name: str, *arguments: object) -> list[str]:
-        given = ["--image-path", tmp_path / "photos", *FAST] if name == "extract" else []
+        given = (
+            ["--image-path", tmp_path / "photos", *FAST] if name == "extract" else []
+        )
         ended = call(name, "--output-path", tmp_path / "out", *given, "-q", *arguments)
         return [ended.stdout.partition(" in ")[0], *ended.stderr]
 
@@ -156,7 +199,9 @@ def stage(tmp_path: Path, call: Call) -> Stage:
     return run_stage
 
 
-def test_stages_after_extract_ask_for_what_a_change_took_away(tmp_path: Path, stage: Stage) -> None:
+def test_stages_after_extract_ask_for_what_a_change_took_away(
+    tmp_path: Path, stage: Stage
+) -> None:
     assert stage("extract") == ["extract: 3 done"]
     assert stage("extract") == ["extract: 0 done, 3 already there"]
     stage("pairs"), stage("match")
@@ -181,34 +226,46 @@ def cameras_of(path: Path) -> set[tuple[object, ...]]:
     return {(camera.camera_id, camera.model_name, *camera.params) for camera in cameras}
 
 
-def test_other_cameras_extract_and_match_nothing_anew(tmp_path: Path, stage: Stage) -> None:
+def test_other_cameras_extract_and_match_nothing_anew(
+    tmp_path: Path, stage: Stage
+) -> None:
     for name in ("extract", "pairs", "match"):
         stage(name)
     out = tmp_path / "out"
     before = [hdf5_content(out / name) for name in ("features.h5", "matches.h5")]
     assert len(cameras_of(out / "database.db")) == 3
-    said = stage("extract", "--camera-mode", "single", "--camera-params", "400,400,200,150")
+    said = stage(
+        "extract", "--camera-mode", "single", "--camera-params", "400,400,200,150"
+    )
     assert said[0] == "extract: 0 done, 3 already there, 1 with a warning"
     log = (out / "run.log").read_text(encoding="utf-8")
     assert "cameras are given otherwise; all that hangs on them is made again" in log
-    assert cameras_of(out / "database.db") == {(1, "PINHOLE", 400.0, 400.0, 200.0, 150.0)}
+    assert cameras_of(out / "database.db") == {
+        (1, "PINHOLE", 400.0, 400.0, 200.0, 150.0)
+    }
     stage("pairs")
     assert stage("match") == ["match: 0 done, 3 already there"]
-    assert [hdf5_content(out / name) for name in ("features.h5", "matches.h5")] == before
+    assert [
+        hdf5_content(out / name) for name in ("features.h5", "matches.h5")
+    ] == before
 
 
 @pytest.mark.long
 def test_run_with_other_cameras_equals_a_fresh_one(tmp_path: Path, call: Call) -> None:
     write_photographs(tmp_path / "photos")
     folders = tmp_path / "out", tmp_path / "fresh"
-    for out, mode in zip((folders[0], *folders), ("per-image", "single", "single"), strict=True):
+    for out, mode in zip(
+        (folders[0], *folders), ("per-image", "single", "single"), strict=True
+    ):
         given = ["--image-path", tmp_path / "photos", "--output-path", out, *FAST]
         assert call("run", *given, "--camera-mode", mode).code == 0
     assert results(folders[0]) == results(folders[1])
     assert len(cameras_of(folders[0] / "database.db")) == 1
 
 
-def test_other_folder_with_none_of_the_photographs_is_refused(tmp_path: Path, stage: Stage) -> None:
+def test_other_folder_with_none_of_the_photographs_is_refused(
+    tmp_path: Path, stage: Stage
+) -> None:
     stage("extract")
     store = FeatureStore(Workspace(tmp_path / "out").features)
     before = store.contents()
@@ -221,7 +278,9 @@ def test_other_folder_with_none_of_the_photographs_is_refused(tmp_path: Path, st
     assert store.contents() == before
 
 
-def test_photographs_that_moved_or_are_gone_are_named_by_map(tmp_path: Path, stage: Stage) -> None:
+def test_photographs_that_moved_or_are_gone_are_named_by_map(
+    tmp_path: Path, stage: Stage
+) -> None:
     for name in ("extract", "pairs", "match", "verify"):
         stage(name)
     (tmp_path / "photos" / FIRST).rename(tmp_path / "away.png")
@@ -232,10 +291,16 @@ def test_photographs_that_moved_or_are_gone_are_named_by_map(tmp_path: Path, sta
 
 def test_changed_photograph_of_a_users_database_is_named(tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", 2)
-    extract_features(tmp_path / "own.db", tmp_path / "photos", extraction_options=FAST[1])
+    extract_features(
+        tmp_path / "own.db", tmp_path / "photos", extraction_options=FAST[1]
+    )
     repaint(tmp_path / "photos" / FIRST)
-    with pytest.raises(StoreError, match=r"own\.db: since it was made, 1 changed \(a\.png\); use"):
-        extract_features(tmp_path / "own.db", tmp_path / "photos", extraction_options=FAST[1])
+    with pytest.raises(
+        StoreError, match=r"own\.db: since it was made, 1 changed \(a\.png\); use"
+    ):
+        extract_features(
+            tmp_path / "own.db", tmp_path / "photos", extraction_options=FAST[1]
+        )
 
 
 @pytest.mark.parametrize("step", ["MatchStore.remove", "FeatureStore.remove"])
@@ -247,7 +312,9 @@ def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
     (tmp_path / "photos" / SECOND).unlink()
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"colmap_affrect.project.stores.{step}", Mock(side_effect=KeyboardInterrupt))
+        patch.setattr(
+            f"colmap_affrect.project.stores.{step}", Mock(side_effect=KeyboardInterrupt)
+        )
         with pytest.raises(KeyboardInterrupt):  # of which the process makes one line
             stage("extract")
     assert stage("extract")[0] == "extract: 1 done, 1 already there, 1 with a warning"
@@ -275,7 +342,15 @@ def test_a_photograph_that_vanishes_while_a_run_works_is_left_out(
         return usual(*given, **named)
 
     monkeypatch.setattr(extract_stage, before, vanish)
-    run = ["run", "--image-path", photos, "--output-path", tmp_path / "out", *FAST, "--json"]
+    run = [
+        "run",
+        "--image-path",
+        photos,
+        "--output-path",
+        tmp_path / "out",
+        *FAST,
+        "--json",
+    ]
     done = call(*run)
     assert done.code == 1
     assert done.errors[0].startswith("error: could not read 1 of the images: z.png; ")

@@ -44,11 +44,15 @@ CHANGES: dict[str, Change] = {
     "image renamed": sql(RENAMED),
     "pair deleted": sql(f"DELETE FROM matches WHERE {LAST_PAIR}"),
     "other keypoints": sql("UPDATE keypoints SET data = zeroblob(length(data))"),
-    "other geometry": sql(f"UPDATE two_view_geometries SET F = zeroblob(72) WHERE {LAST_PAIR}"),
+    "other geometry": sql(
+        f"UPDATE two_view_geometries SET F = zeroblob(72) WHERE {LAST_PAIR}"
+    ),
     "other camera": sql("UPDATE cameras SET params = zeroblob(length(params))"),
     "camera of no size": sql("UPDATE cameras SET width = 'wide'"),
     "table dropped": sql("DROP TABLE frames"),
-    "trigger": sql("CREATE TRIGGER t AFTER INSERT ON matches BEGIN DELETE FROM images; END"),
+    "trigger": sql(
+        "CREATE TRIGGER t AFTER INSERT ON matches BEGIN DELETE FROM images; END"
+    ),
     "noise": by_chance(noise),
     "cut": by_chance(cut),
     "missing": Path.unlink,
@@ -102,7 +106,10 @@ def test_what_the_stores_hold_is_made_again(
     if case in ("noise", "cut"):
         assert "database.db: cannot be used (" in warning
         why = warning.partition("database.db: ")[2].partition("; it is")[0]
-    assert f"database.db: {why}; it is made again from features.h5 and matches.h5" in warning
+    assert (
+        f"database.db: {why}; it is made again from features.h5 and matches.h5"
+        in warning
+    )
     assert kept.exists()
     assert results(out) == results(finished / "out")
     assert again("run") == again("map") == []
@@ -140,13 +147,17 @@ def test_damaged_index_is_found_and_made_again(
     assert again("run") == []
 
 
-def test_damage_that_came_meanwhile_is_mended_by_the_next_command(out: Path, call: Call) -> None:
+def test_damage_that_came_meanwhile_is_mended_by_the_next_command(
+    out: Path, call: Call
+) -> None:
     """A file with the stamp of its seal is not looked through: COLMAP stumbles over the damage."""
     path = out / "database.db"
     seal = out / "database.db.seal"
     harm(path, "sqlite_autoindex_images_1")
     harm(path, "two_view_geometries")
-    seal.write_text(f"{seal.read_text().splitlines()[0]}\n{stamp_of(database_files(path)[:2])}\n")
+    seal.write_text(
+        f"{seal.read_text().splitlines()[0]}\n{stamp_of(database_files(path)[:2])}\n"
+    )
     first, second = (call("map", "--output-path", out, "--overwrite") for _ in range(2))
     assert (first.code, len(first.errors)) == (1, 1)
     assert str(path) in first.errors[0]
@@ -163,13 +174,20 @@ def test_map_makes_a_damaged_database_again(
     harm(out / "database.db", table)
     (warning,) = again("map")
     assert "database.db: cannot be used (" in warning
-    assert database_content(out / "database.db") == database_content(finished / "out/database.db")
+    assert database_content(out / "database.db") == database_content(
+        finished / "out/database.db"
+    )
 
 
 def test_database_that_was_touched_or_left_by_a_killed_command_is_used(
     finished: Path, out: Path, again: Again
 ) -> None:
-    for harmless in (Path.touch, image_ids, sql("VACUUM"), sql("DELETE FROM descriptors")):
+    for harmless in (
+        Path.touch,
+        image_ids,
+        sql("VACUUM"),
+        sql("DELETE FROM descriptors"),
+    ):
         harmless(out / "database.db")
         assert again("run") == []
     Workspace(out).seal.unlink()
@@ -177,17 +195,24 @@ def test_database_that_was_touched_or_left_by_a_killed_command_is_used(
     assert results(out) == results(finished / "out")
 
 
-def test_map_maps_a_changed_database_as_it_is(out: Path, again: Again, call: Call) -> None:
+def test_map_maps_a_changed_database_as_it_is(
+    out: Path, again: Again, call: Call
+) -> None:
     path = out / "database.db"
     execute(path, f"DELETE FROM two_view_geometries WHERE {LAST_PAIR}", RENAMED)
     changed = database_content(path)
     for _ in range(2):
         (warning,) = again("map")
-        assert f"{path}: was changed since the last run, and is mapped as it is" in warning
+        assert (
+            f"{path}: was changed since the last run, and is mapped as it is" in warning
+        )
     assert database_content(path) == changed
     kept = out / "database.changed.db"
     other = ["--output-path", out.with_name("other")]
-    assert f"'colmap-affrect map --from-database {kept} --output-path OTHER'" in again("verify")[0]
+    assert (
+        f"'colmap-affrect map --from-database {kept} --output-path OTHER'"
+        in again("verify")[0]
+    )
     assert len(database_content(path)["inliers"]) == 3
     assert call("map", "-q", "--from-database", kept, *other).code == 0
     execute(path, "UPDATE matches SET data = zeroblob(1)")
@@ -215,5 +240,7 @@ def test_copies_are_made_again_from_the_original(
     assert f"it is made again from {original}" in ended.stderr[0]
     assert content() == before
     workspace.database.unlink()
-    assert f"is missing; it is made again from {original}" in call("map", *paths).stderr[0]
+    assert (
+        f"is missing; it is made again from {original}" in call("map", *paths).stderr[0]
+    )
     assert content() == before

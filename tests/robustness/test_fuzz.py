@@ -46,7 +46,9 @@ def recipe(path: Path) -> None:
 
 def depth_map(path: Path) -> None:
     camera = camera_matrix((6, 4))
-    photograph = Photograph(np.zeros((4, 6), np.uint8), "a.jpg", path.with_name("a.jpg"), camera)
+    photograph = Photograph(
+        np.zeros((4, 6), np.uint8), "a.jpg", path.with_name("a.jpg"), camera
+    )
     depth = DepthMaps(DepthOptions(path=str(path.parent))).depth(photograph)
     assert depth.dtype == np.float32
     assert not (depth <= 0).any()
@@ -64,7 +66,11 @@ RECIPES = [(recipe_folder() / f"{name}.toml").read_bytes() for name in recipe_na
     ("a.tif", depth_map, [encoded(".tif", DEPTH.astype(np.float32))], 130),
 ])  # fmt: skip
 def test_damaged_files_are_taken_or_refused(
-    tmp_path: Path, name: str, read: Callable[[Path], None], valid: list[bytes], count: int
+    tmp_path: Path,
+    name: str,
+    read: Callable[[Path], None],
+    valid: list[bytes],
+    count: int,
 ) -> None:
     chance = random.Random(1)
     path = tmp_path / name
@@ -75,7 +81,9 @@ def test_damaged_files_are_taken_or_refused(
         content = bytearray(chance.choice(valid))
         for harm in chance.choices(HARMS, k=chance.choice((1, 1, 3))):
             harm(content, chance) if content else None
-        path.unlink(missing_ok=True)  # cutting the old one to nothing takes ten times as long
+        path.unlink(
+            missing_ok=True
+        )  # cutting the old one to nothing takes ten times as long
         path.write_bytes(content)
         try:
             with warnings.catch_warnings():

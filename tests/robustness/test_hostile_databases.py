@@ -17,19 +17,38 @@ from small_scene import write_photographs
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
 from colmap_affrect.colmap.database_copy import read_names
-from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.colmap.verification import (
+    VerificationOptions,
+    verified_pairs,
+    verify,
+)
 from colmap_affrect.doctor import Diagnosis, examine_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.interop.pycolmap_api import extract_features
 
 ROWS = [
-    ("UPDATE images SET camera_id = 999 WHERE image_id = 1", "images whose camera does not exist"),
-    ("UPDATE matches SET data = x'ffffffffffffffff', rows = 1", "at which COLMAP crashes"),
-    ("UPDATE two_view_geometries SET qvec = zeroblob(32), tvec = NULL", "(qvec and tvec of pair"),
+    (
+        "UPDATE images SET camera_id = 999 WHERE image_id = 1",
+        "images whose camera does not exist",
+    ),
+    (
+        "UPDATE matches SET data = x'ffffffffffffffff', rows = 1",
+        "at which COLMAP crashes",
+    ),
+    (
+        "UPDATE two_view_geometries SET qvec = zeroblob(32), tvec = NULL",
+        "(qvec and tvec of pair",
+    ),
     ("UPDATE cameras SET width = 'wide'", "damaged"),
-    ("UPDATE rigs SET ref_sensor_type = 1", "frames that hold images twice, or of other cameras"),
-    ("INSERT INTO rig_sensors VALUES (1, 5, 1, NULL)", "sensors of rigs whose place in the rig"),
+    (
+        "UPDATE rigs SET ref_sensor_type = 1",
+        "frames that hold images twice, or of other cameras",
+    ),
+    (
+        "INSERT INTO rig_sensors VALUES (1, 5, 1, NULL)",
+        "sensors of rigs whose place in the rig",
+    ),
 ]
 """What is done to a database, and what is said of it; more kinds are in the tests of checks."""
 
@@ -91,20 +110,27 @@ def test_panoramas_are_refused_before_anything_is_recorded(
     for command in (["extract", *given], ["run", *given], ["map", *given[:2]]):
         ended = call(*command, "-q", "--from-database", path)
         assert (ended.code, len(ended.stderr)) == (1, 1)
-        assert "look all around, which have no focal length (camera 2: EQUIREC" in ended.stderr[0]
+        assert (
+            "look all around, which have no focal length (camera 2: EQUIREC"
+            in ended.stderr[0]
+        )
         assert not (out / "config.toml").exists()
     assert num_errors(path) == 0  # COLMAP has a use for it
     with pytest.raises(DatabaseError, match=r"camera 2: E.*; cut perspective views"):
         extract_features(path, photos)
     assert not (path.parent / "any.affrect" / "config.toml").exists()
-    assert call("extract", "-q", *given, "--from-database", healthy, *FAST[:2]).code == 0
+    assert (
+        call("extract", "-q", *given, "--from-database", healthy, *FAST[:2]).code == 0
+    )
 
 
 def test_hot_journal_is_refused_with_advice(path: Path, call: Call) -> None:
     """What a killed program had not completed is not read as if it counted."""
     killed = path.with_name("killed.db")
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:
-        connection.execute("PRAGMA cache_size = 1")  # pages reach the file before the end
+        connection.execute(
+            "PRAGMA cache_size = 1"
+        )  # pages reach the file before the end
         connection.execute("BEGIN")
         connection.execute("UPDATE keypoints SET data = zeroblob(length(data))")
         connection.execute("UPDATE images SET name = 'half ' || name")
@@ -112,7 +138,9 @@ def test_hot_journal_is_refused_with_advice(path: Path, call: Call) -> None:
         shutil.copy(f"{path}-journal", f"{killed}-journal")
         connection.execute("ROLLBACK")
     before = killed.read_bytes()
-    ended = call("map", "--from-database", killed, "--output-path", path.with_name("out"))
+    ended = call(
+        "map", "--from-database", killed, "--output-path", path.with_name("out")
+    )
     assert ended.code == 1
     assert "sqlite3 killed.db .tables" in ended.errors[0]
     assert num_errors(killed) == 1
@@ -131,7 +159,8 @@ CAMERA_SIZE = (1600, 1200)
 
 @pytest.mark.parametrize("prior", [False, True], ids=["no prior", "prior"])
 @pytest.mark.parametrize(
-    ("count", "num_pairs"), [(200, 1), (1000, 1), pytest.param(1000, 50, marks=pytest.mark.slow)]
+    ("count", "num_pairs"),
+    [(200, 1), (1000, 1), pytest.param(1000, 50, marks=pytest.mark.slow)],
 )
 def test_random_matches_are_rejected(
     tmp_path: Path, count: int, num_pairs: int, prior: bool
@@ -148,7 +177,9 @@ def test_random_matches_are_rejected(
         image_ids = range(1, 2 * num_pairs + 1)
         write_images(database, camera, map(str, image_ids))
         for image_id in image_ids:
-            lafs[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, count)) * rng.uniform(6, 30, 2)
+            lafs[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, count)) * rng.uniform(
+                6, 30, 2
+            )
             lafs[:, :, 2] = rng.uniform(0, np.subtract(CAMERA_SIZE, 1), (count, 2))
             write_keypoints(database, image_id, lafs)
             if image_id % 2 == 0:
@@ -157,8 +188,13 @@ def test_random_matches_are_rejected(
     assert verified_pairs(path, 1) == {}
 
 
-def test_database_without_images_is_one_line(healthy: Path, path: Path, call: Call) -> None:
-    execute(path, *(f"DELETE FROM {table}" for table in ("images", "keypoints", "frame_data")))
+def test_database_without_images_is_one_line(
+    healthy: Path, path: Path, call: Call
+) -> None:
+    execute(
+        path,
+        *(f"DELETE FROM {table}" for table in ("images", "keypoints", "frame_data")),
+    )
     execute(path, "DELETE FROM matches", "DELETE FROM two_view_geometries")
     photos = healthy.parent / "photos"
     out = path.with_name("out")
@@ -170,10 +206,13 @@ def test_database_without_images_is_one_line(healthy: Path, path: Path, call: Ca
         assert not out.exists()
 
 
-def test_triggers_of_a_received_database_do_nothing(healthy: Path, path: Path, call: Call) -> None:
+def test_triggers_of_a_received_database_do_nothing(
+    healthy: Path, path: Path, call: Call
+) -> None:
     for table in ("keypoints", "images", "frames"):
         execute(
-            path, f"CREATE TRIGGER t{table} AFTER INSERT ON {table} BEGIN DELETE FROM images; END"
+            path,
+            f"CREATE TRIGGER t{table} AFTER INSERT ON {table} BEGIN DELETE FROM images; END",
         )
     out = path.with_name("out")
     given = ["--image-path", healthy.parent / "photos", "--output-path", out]

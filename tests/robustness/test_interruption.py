@@ -98,7 +98,9 @@ class Case:
 def content(out: Path) -> dict[str, Any]:
     """All results of a run: what :func:`results.results` has, and each file of the models."""
     models = tree(out / "sparse", times=False)
-    return results(out) | {name: value for name, value in models.items() if name.endswith(".bin")}
+    return results(out) | {
+        name: value for name, value in models.items() if name.endswith(".bin")
+    }
 
 
 def wait_until_at_work(process: subprocess.Popen[str], out: Path) -> None:
@@ -113,7 +115,9 @@ def wait_until_at_work(process: subprocess.Popen[str], out: Path) -> None:
         time.sleep(0.005)
 
 
-def end_after(delay_s: float, number: signal.Signals, arguments: Sequence[str], out: Path) -> bool:
+def end_after(
+    delay_s: float, number: signal.Signals, arguments: Sequence[str], out: Path
+) -> bool:
     """Start a run and send it a signal; return whether it was still at work then."""
     with start(*arguments) as process:
         wait_until_at_work(process, out)
@@ -134,7 +138,9 @@ def wait_until_signals_are_put_off(pid: int) -> None:
         blocked = int(re.search(r"^SigBlk:\t(\w+)", status, re.MULTILINE)[1], 16)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell what is put off")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="other systems do not tell what is put off"
+)
 @pytest.mark.parametrize("send", [os.kill, os.killpg])
 @pytest.mark.parametrize("times", [1, 2])
 def test_interrupt_while_a_command_starts_ends_it_at_once_with_one_line(
@@ -154,7 +160,9 @@ def test_interrupt_while_a_command_starts_ends_it_at_once_with_one_line(
             _, stderr = process.communicate(timeout=60)
         assert time.monotonic() - sent < 3.0
         assert process.returncode == 130, stderr
-        lines = [line for line in stderr.splitlines() if not line.startswith("extract: ")]
+        lines = [
+            line for line in stderr.splitlines() if not line.startswith("extract: ")
+        ]
         assert lines == ["interrupted; run the same command again to go on"], number
 
 
@@ -162,7 +170,9 @@ def run_traced(options: Sequence[object], arguments: Sequence[str]) -> int:
     """Run under ``strace`` and return the exit code."""
     command = ["strace", "-f", "-qq", *map(str, options), "-e", f"trace={CALLS}"]
     command += [sys.executable, "-m", "colmap_affrect", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, check=False
+    )
     assert "Traceback" not in done.stderr, done.stderr
     return done.returncode
 
@@ -182,7 +192,10 @@ def assert_readable(out: Path) -> None:
 def cases(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Case]:
     """A fast run, and one of all stages; they are run when they are first asked for."""
     every = [*CAMERA, "--recipe", "on-demand", "--set", "guided.enabled=always"]
-    return [Case(photos, options, tmp_path_factory.mktemp("case")) for options in (FAST, every)]
+    return [
+        Case(photos, options, tmp_path_factory.mktemp("case"))
+        for options in (FAST, every)
+    ]
 
 
 @pytest.mark.parametrize("number", range(2 * TIMES))
@@ -222,7 +235,9 @@ def test_runs_killed_when_they_enter_a_system_call_lose_nothing(
 
 
 def mounted(*command: object) -> bool:
-    done = subprocess.run(["mount", *map(str, command)], capture_output=True, check=False)
+    done = subprocess.run(
+        ["mount", *map(str, command)], capture_output=True, check=False
+    )
     return done.returncode == 0
 
 
@@ -234,7 +249,9 @@ def test_runs_on_full_disks_go_on_when_these_have_grown(
     case = cases[number % 2]
     disk = tmp_path / "disk"
     assert case.worked_s
-    needed = sum(p.stat().st_size for p in (case.folder / "out").rglob("*") if p.is_file())
+    needed = sum(
+        p.stat().st_size for p in (case.folder / "out").rglob("*") if p.is_file()
+    )
     num_kib = random.Random(number).randrange(8, needed // 1024)
     disk.mkdir()
     if not mounted("-t", "tmpfs", "-o", f"size={num_kib}k", "none", disk):
@@ -271,7 +288,11 @@ def assert_says_what_to_do(ended: Ended, path: Path) -> None:
 
 @pytest.mark.parametrize("passing", [2, 4])
 def test_hdf5_write_that_fails_loses_nothing_else(
-    cases: list[Case], tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, passing: int
+    cases: list[Case],
+    tmp_path: Path,
+    call: Call,
+    monkeypatch: pytest.MonkeyPatch,
+    passing: int,
 ) -> None:
     workspace = Workspace(tmp_path / "out")
     calls = []
@@ -286,7 +307,9 @@ def test_hdf5_write_that_fails_loses_nothing_else(
     with monkeypatch.context() as patch:
         patch.setattr(FileTransaction, "commit", full)
         ended = call(*cases[0].arguments(workspace.path))
-    assert_says_what_to_do(ended, workspace.features if passing < 4 else workspace.matches)
+    assert_says_what_to_do(
+        ended, workspace.features if passing < 4 else workspace.matches
+    )
     assert len(FeatureStore(workspace.features).names()) == passing
     cases[0].assert_finishes(workspace.path)
 
@@ -296,7 +319,9 @@ def test_record_of_options_that_does_not_fit_on_the_disk(
 ) -> None:
     workspace = Workspace(tmp_path / "out")
     with file_size_limit(700):
-        assert_says_what_to_do(call(*cases[0].arguments(workspace.path)), workspace.config)
+        assert_says_what_to_do(
+            call(*cases[0].arguments(workspace.path)), workspace.config
+        )
     assert not workspace.config.exists()
     assert not workspace.features.exists()
 
@@ -331,7 +356,9 @@ def run_on_cores(cores: set[int], photos: Path, out: Path) -> dict[str, object]:
 
 
 @pytest.mark.skipif(available_cores() < 2, reason="needs two cores")
-def test_results_do_not_depend_on_the_number_of_cores(photos: Path, tmp_path: Path) -> None:
+def test_results_do_not_depend_on_the_number_of_cores(
+    photos: Path, tmp_path: Path
+) -> None:
     cores = sorted(os.sched_getaffinity(0))
     one = run_on_cores({cores[0]}, photos, tmp_path / "one")
     assert one["registered"]

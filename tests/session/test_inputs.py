@@ -32,7 +32,9 @@ def photos(tmp_path: Path) -> Path:
 def test_only_features_of_warps_by_depth_are_made_from_cameras(
     photos: Path, recipe: str, settings: tuple[str, ...], num_contents: int
 ) -> None:
-    extraction = load_recipe(recipe, [one.format(photos=photos) for one in settings]).extraction
+    extraction = load_recipe(
+        recipe, [one.format(photos=photos) for one in settings]
+    ).extraction
     found = set()
     for cameras in (CameraOptions(), *OTHERS):
         inputs = Inputs.of(photos, cameras=cameras)
@@ -42,12 +44,20 @@ def test_only_features_of_warps_by_depth_are_made_from_cameras(
     assert len(found) == num_contents
 
 
-def test_cameras_have_a_digest_of_what_is_given_wherever_it_lies(tmp_path: Path) -> None:
+def test_cameras_have_a_digest_of_what_is_given_wherever_it_lies(
+    tmp_path: Path,
+) -> None:
     tables = [tmp_path / name for name in ("one.csv", "same.csv", "other.csv")]
     for table, focal in zip(tables, (300, 300, 310), strict=True):
         table.write_text(f"name,focal_px\na.png,{focal}\n", encoding="utf-8")
-    given = [CameraOptions(), *OTHERS, *(CameraOptions(cameras_path=str(t)) for t in tables)]
-    digests = [Inputs.of(tmp_path, cameras=cameras).cameras_digest() for cameras in given]
+    given = [
+        CameraOptions(),
+        *OTHERS,
+        *(CameraOptions(cameras_path=str(t)) for t in tables),
+    ]
+    digests = [
+        Inputs.of(tmp_path, cameras=cameras).cameras_digest() for cameras in given
+    ]
     assert digests[0] == ""
     assert digests[-3] == digests[-2]
     assert len(set(digests)) == len(digests) - 1

@@ -45,7 +45,9 @@ def test_database_that_is_kept_open_is_opened_once_and_closed_in_the_end(
     assert graph.ids.keys() == {"a.png", "b.png"}
 
 
-def test_digest_is_of_what_was_written_while_the_database_is_kept_open(tmp_path: Path) -> None:
+def test_digest_is_of_what_was_written_while_the_database_is_kept_open(
+    tmp_path: Path,
+) -> None:
     graph = ViewGraph(tmp_path / "database.db")
     digests = []
     with graph.kept_open():
@@ -57,7 +59,9 @@ def test_digest_is_of_what_was_written_while_the_database_is_kept_open(tmp_path:
     assert digests[0] != digests[1] == rows_digest(graph.path)
 
 
-def test_database_that_was_removed_or_replaced_meanwhile_is_opened_anew(tmp_path: Path) -> None:
+def test_database_that_was_removed_or_replaced_meanwhile_is_opened_anew(
+    tmp_path: Path,
+) -> None:
     graph = ViewGraph(tmp_path / "database.db")
     other = tmp_path / "other.db"
     with open_database(other) as database:
@@ -75,7 +79,9 @@ def test_database_that_was_removed_or_replaced_meanwhile_is_opened_anew(tmp_path
         assert graph.ids.keys() == {"other.png"}
 
 
-def test_failure_of_the_database_is_one_line_and_it_is_opened_again(tmp_path: Path) -> None:
+def test_failure_of_the_database_is_one_line_and_it_is_opened_again(
+    tmp_path: Path,
+) -> None:
     graph = ViewGraph(tmp_path / "database.db")
     with graph.kept_open():
         with graph.opened() as database:

@@ -36,7 +36,9 @@ def unmatched(verified: Path, tmp_path: Path) -> Path:
     with open_database(path) as database:
         database.clear_matches()
         database.clear_two_view_geometries()
-        database.write_matches(1, 2, np.zeros((0, 2), np.uint32))  # as COLMAP's matchers leave it
+        database.write_matches(
+            1, 2, np.zeros((0, 2), np.uint32)
+        )  # as COLMAP's matchers leave it
     return path
 
 
@@ -58,10 +60,14 @@ def test_database_with_descriptors_alone_is_matched_and_mapped(
     assert [stage.num_done for stage in again.stages] == [0, 0]
 
 
-def test_listed_pairs_alone_are_matched_by_descriptors(unmatched: Path, tmp_path: Path) -> None:
+def test_listed_pairs_alone_are_matched_by_descriptors(
+    unmatched: Path, tmp_path: Path
+) -> None:
     names = names_of(unmatched)
     listed = tmp_path / "pairs.txt"
-    listed.write_text(f"{names[0]} {names[1]}\n{names[1]} {names[2]}\n", encoding="utf-8")
+    listed.write_text(
+        f"{names[0]} {names[1]}\n{names[1]} {names[2]}\n", encoding="utf-8"
+    )
     report = colmap_affrect.map_database(
         unmatched, tmp_path / "out", match_list_path=listed, page=False
     )
@@ -73,7 +79,9 @@ def test_database_without_matches_and_descriptors_is_refused(
 ) -> None:
     with open_database(unmatched) as database:
         database.clear_descriptors()
-    with pytest.raises(DatabaseError, match="has no matches, nor descriptors to match by"):
+    with pytest.raises(
+        DatabaseError, match="has no matches, nor descriptors to match by"
+    ):
         colmap_affrect.map_database(unmatched, tmp_path / "out", page=False)
 
 
@@ -87,19 +95,31 @@ def test_list_of_matches_is_mapped_with_the_keypoints_of_a_database(
         for pair_id in database.read_num_matches()[0]:
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             rows = database.read_matches(first, second)
-            lines += [f"{names[first]} {names[second]}", *(f"{a} {b}" for a, b in rows), ""]
+            lines += [
+                f"{names[first]} {names[second]}",
+                *(f"{a} {b}" for a, b in rows),
+                "",
+            ]
     given = tmp_path / "matches.txt"
     given.write_text("\n".join(lines), encoding="utf-8")
     with open_database(unmatched) as database:
         database.clear_descriptors()
     report = colmap_affrect.map_database(
-        unmatched, tmp_path / "out", matches_path=given, match_type=match_type, page=False
+        unmatched,
+        tmp_path / "out",
+        matches_path=given,
+        match_type=match_type,
+        page=False,
     )
     assert len(report.registered_names) == NUM_IMAGES
     assert report.stages[0].num_done == (6 if match_type == "raw" else 0)
     given.write_text("\n".join(lines[: lines.index("") + 1]), encoding="utf-8")
     report = colmap_affrect.map_database(
-        unmatched, tmp_path / "out", matches_path=given, match_type=match_type, page=False
+        unmatched,
+        tmp_path / "out",
+        matches_path=given,
+        match_type=match_type,
+        page=False,
     )
     assert report.num_verified_pairs == 1  # the copy is made anew
     given.write_text("a b\n0 0\n", encoding="utf-8")
@@ -120,13 +140,16 @@ def test_cameras_are_given_for_the_database_of_another_program(
     colmap_affrect.map_database(verified, tmp_path / "out", cameras=cameras, page=False)
     workspace = Workspace(tmp_path / "out")
     records = {
-        record.names[0]: record for record in read_camera_records(workspace.cameras).values()
+        record.names[0]: record
+        for record in read_camera_records(workspace.cameras).values()
     }
     assert records[first].given == ("focal",)
     assert set(records[second].given) == {"focal", "principal-point", "distortion"}
     assert [record.source for record in records.values()].count("given") == 2
     model = pycolmap.Reconstruction(workspace.sparse / "0")
-    found = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    found = {
+        image.name: model.cameras[image.camera_id] for image in model.images.values()
+    }
     assert found[first].model_name == "SIMPLE_RADIAL"
     assert found[first].params[0] == 1280.0
     assert found[second].model_name == "PINHOLE"
@@ -155,7 +178,9 @@ def test_cameras_that_do_not_fit_are_refused_before_anything_is_made(
     verified: Path, tmp_path: Path, row: str, message: str
 ) -> None:
     table = tmp_path / "cameras.csv"
-    table.write_text("name,focal_px,model\n" + row.replace("NAME", names_of(verified)[0]))
+    table.write_text(
+        "name,focal_px,model\n" + row.replace("NAME", names_of(verified)[0])
+    )
     with pytest.raises(OptionError, match=message):
         colmap_affrect.map_database(
             verified, tmp_path / "out", cameras=CameraOptions(cameras_path=str(table))
@@ -175,13 +200,17 @@ def test_cameras_of_a_model_that_is_extended_are_not_called_unknown(
     (tmp_path / "old").mkdir()
     found.write(tmp_path / "old")
     extension = colmap_affrect.Extension(model_path=tmp_path / "old")
-    report = colmap_affrect.map_database(verified, tmp_path / "out", extend=extension, page=False)
+    report = colmap_affrect.map_database(
+        verified, tmp_path / "out", extend=extension, page=False
+    )
     assert report.added == (first.name,)
     line = "focal lengths: 3 of the model that is extended, 1 not known beforehand"
     assert line in report.summary()
 
 
-def test_what_is_given_beside_a_database_is_on_record_and_comes_back(tmp_path: Path) -> None:
+def test_what_is_given_beside_a_database_is_on_record_and_comes_back(
+    tmp_path: Path,
+) -> None:
     given = ForeignDatabase(
         tmp_path / "any.db", tmp_path, CameraOptions(focal_length_px=7.0), tmp_path / "m.h5",
         "inliers",
@@ -192,7 +221,9 @@ def test_what_is_given_beside_a_database_is_on_record_and_comes_back(tmp_path: P
     assert ForeignDatabase.of_record(plain.to_record()) == plain
 
 
-def test_functions_with_pycolmaps_names_match_foreign_descriptors(unmatched: Path) -> None:
+def test_functions_with_pycolmaps_names_match_foreign_descriptors(
+    unmatched: Path,
+) -> None:
     matched, verified = colmap_affrect.match_exhaustive(unmatched)
     assert (matched.num_done, verified.num_done) == (5, 5)  # one pair is on record
     with open_database(unmatched) as database:

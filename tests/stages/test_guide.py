@@ -51,7 +51,9 @@ def guided(after: Workspace, tmp_path: Path) -> Context:
     return Context(copy_of(after, tmp_path / "guided"))
 
 
-def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, context: Context) -> None:
+def test_pairs_gain_and_what_was_there_stays_on_record(
+    before: Workspace, context: Context
+) -> None:
     exact = Context(before).verified_inliers()
     assert guide(context, ALWAYS).num_done == len(exact) == 6
     found = context.verified_inliers()
@@ -71,7 +73,9 @@ def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, contex
 def raw_matches(path: Path) -> list[tuple[int, bytes]]:
     with open_database(path) as database:
         pair_ids, matches = database.read_all_matches()
-    return [(pair, found.tobytes()) for pair, found in zip(pair_ids, matches, strict=True)]
+    return [
+        (pair, found.tobytes()) for pair, found in zip(pair_ids, matches, strict=True)
+    ]
 
 
 def test_guided_matches_are_right(guided: Context) -> None:
@@ -90,7 +94,9 @@ def test_guided_matches_are_right(guided: Context) -> None:
         assert found["inlier_mask"][len(exact[pair]) :].mean() > 0.9
 
 
-def test_sets_that_hang_together_are_left_alone(before: Workspace, context: Context) -> None:
+def test_sets_that_hang_together_are_left_alone(
+    before: Workspace, context: Context
+) -> None:
     digest = rows_digest(before.database)
     assert guide(context).num_done == 0
     assert not context.workspace.guided.exists()
@@ -102,13 +108,17 @@ def test_only_images_in_need(context: Context, monkeypatch: pytest.MonkeyPatch) 
     in_need = {NAMES[1]}
     monkeypatch.setattr(stage, "weakly_connected_images", lambda *_: in_need)
     assert guide(context).num_done == 3
-    assert {pair.names for pair in context.guided.read()} == {p for p in every if NAMES[1] in p}
+    assert {pair.names for pair in context.guided.read()} == {
+        p for p in every if NAMES[1] in p
+    }
     in_need.add(NAMES[0])
     report = guide(context)
     assert (report.num_done, report.num_kept) == (2, 3)
 
 
-def test_captions_are_not_found_again(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_captions_are_not_found_again(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Here they are said to be everywhere, and matches from one to another are none of a scene."""
     monkeypatch.setattr(stationary, "MAX_SHARE_BESIDE", 1.0)
     everywhere = np.indices((NUM_CELLS, NUM_CELLS)).reshape(2, -1).T

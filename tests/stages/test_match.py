@@ -41,7 +41,9 @@ def store(tmp_path: Path) -> FeatureStore:
         centers = random.uniform(10, 400, (NUM_FEATURES, 2))
         ones = np.ones(NUM_FEATURES)
         lafs = lafs_from_keypoints(centers, 6 * ones, 0 * ones)
-        store.write(name, LocalFeatures(lafs, ones.astype(np.float32), rows), (420, 420))
+        store.write(
+            name, LocalFeatures(lafs, ones.astype(np.float32), rows), (420, 420)
+        )
     return store
 
 
@@ -65,7 +67,9 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
         return read(cache, name)
 
     monkeypatch.setattr(CachedMatcher, "_prepare", counted)
-    monkeypatch.setattr(stage, "CACHE_BYTES", 5 * stage.BYTES_PER_FEATURE * NUM_FEATURES)
+    monkeypatch.setattr(
+        stage, "CACHE_BYTES", 5 * stage.BYTES_PER_FEATURE * NUM_FEATURES
+    )
     assert matches(store) == expected
     assert len(NAMES) < len(reads) <= 3 * len(NAMES)
 
@@ -73,10 +77,14 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
 def test_the_strongest_features_are_matched_first(store: FeatureStore) -> None:
     features = store.read(NAMES[0])
     responses = np.roll(np.arange(1.0, NUM_FEATURES + 1), 7).astype(np.float32)
-    store.write(NAMES[0], replace(features, responses=responses), store.image_size(NAMES[0]))
+    store.write(
+        NAMES[0], replace(features, responses=responses), store.image_size(NAMES[0])
+    )
     pair = (NAMES[0], NAMES[1])
     (every,) = iterate_matches([pair], Matching(store, NearestOptions()))
-    (some,) = iterate_matches([pair], Matching(store, NearestOptions(), max_num_features=30))
+    (some,) = iterate_matches(
+        [pair], Matching(store, NearestOptions(), max_num_features=30)
+    )
     strongest = np.argsort(-responses)[:30]
     assert (every.of_some, some.of_some) == (False, True)
     assert len(some.indices) > 5
@@ -96,7 +104,10 @@ def test_all_features_are_matched_where_the_strongest_do_not_tie_both_images(
         return PairMatches((names[0], names[1]), indices, scores, num, of_some=of_some)
 
     store = MatchStore(tmp_path / "matches.h5")
-    many = [pair(names, MANY_MATCHES) for names in ("ab", "ac", "ad", "bc", "bd", "eb", "ea")]
+    many = [
+        pair(names, MANY_MATCHES)
+        for names in ("ab", "ac", "ad", "bc", "bd", "eb", "ea")
+    ]
     few = [pair(names, MANY_MATCHES - 1) for names in ("cd", "ce", "fa")]
     known = [pair("ga", 5, of_some=False)]
     store.write([*many, *few, *known])
@@ -115,10 +126,15 @@ def test_all_features_are_matched_once_a_pair_that_tied_an_image_is_not_listed(
     out = tmp_path / "out"
     (a, b, c, _) = PHOTOGRAPHS
     where = ["--output-path", out]
-    assert call("extract", "--image-path", photos, *where, "--recipe", "rectified").code == 0
+    assert (
+        call("extract", "--image-path", photos, *where, "--recipe", "rectified").code
+        == 0
+    )
     listed = tmp_path / "list.txt"
     pairs = exhaustive_pairs(PHOTOGRAPHS)
-    listed.write_text("".join(f"{one}\t{two}\n" for one, two in pairs), encoding="utf-8")
+    listed.write_text(
+        "".join(f"{one}\t{two}\n" for one, two in pairs), encoding="utf-8"
+    )
     assert call("pairs", *where, "--match-list-path", listed).code == 0
     assert call("match", *where, "--set", "matching.max_num_first=300").code == 0
     store = MatchStore(out / "matches.h5")
@@ -144,7 +160,12 @@ def test_all_features_are_not_matched_where_a_sample_of_pairs_gains_nothing(
     assert call("extract", "--image-path", photos, "--output-path", out).code == 0
     assert call("pairs", "--output-path", out).code == 0
     for _ in range(2):
-        assert call("match", "--output-path", out, "--set", "matching.max_num_first=300").code == 0
+        assert (
+            call(
+                "match", "--output-path", out, "--set", "matching.max_num_first=300"
+            ).code
+            == 0
+        )
         store = MatchStore(out / "matches.h5")
         assert bool(store.nums_of_some(exhaustive_pairs(PHOTOGRAPHS))) == are_left
         monkeypatch.setattr(stage, "MIN_GROWTH", 0.0)

@@ -35,8 +35,12 @@ from colmap_affrect.stages.one_image import num_images_at_once, prepare
 
 WIDTH = 480
 HEIGHT = 360
-GRID = np.stack(np.meshgrid(np.arange(30, WIDTH - 20, 45), np.arange(30, HEIGHT - 20, 45)), -1)
-BLOBS = GRID.reshape(-1, 2) + np.random.default_rng(5).uniform(-2, 2, (GRID.size // 2, 2))
+GRID = np.stack(
+    np.meshgrid(np.arange(30, WIDTH - 20, 45), np.arange(30, HEIGHT - 20, 45)), -1
+)
+BLOBS = GRID.reshape(-1, 2) + np.random.default_rng(5).uniform(
+    -2, 2, (GRID.size // 2, 2)
+)
 BLOB_SIGMA_PX = 5.2
 MAX_BIAS_PX = 0.06
 """Half a pixel too much or too little at any step would be a bias of 0.17 px or more."""
@@ -44,7 +48,9 @@ MAX_ERROR_PX = 0.3
 
 
 def write_blobs(path: Path) -> None:
-    image = blobs((WIDTH, HEIGHT), BLOBS, BLOB_SIGMA_PX * np.eye(2), amplitude=120, background=100)
+    image = blobs(
+        (WIDTH, HEIGHT), BLOBS, BLOB_SIGMA_PX * np.eye(2), amplitude=120, background=100
+    )
     path.parent.mkdir(exist_ok=True)
     write_image(path, image)
 
@@ -54,7 +60,9 @@ def extracted(
 ) -> tuple[Workspace, StageReport]:
     workspace = Workspace(tmp_path / "out")
     with workspace.locked():
-        return workspace, extract(Context(workspace), Inputs.of(photos, **given), recipe)
+        return workspace, extract(
+            Context(workspace), Inputs.of(photos, **given), recipe
+        )
 
 
 @pytest.mark.parametrize("max_size", [WIDTH, 360, 240])
@@ -79,7 +87,9 @@ def test_faded_photograph_is_stretched_and_said_to_be(tmp_path, stretch):
     photos = tmp_path / "photos"
     write_blobs(photos / "good.png")
     good = cv2.imread(str(photos / "good.png"), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(photos / "good.png"), cv2.normalize(good, None, 0, 255, cv2.NORM_MINMAX))
+    cv2.imwrite(
+        str(photos / "good.png"), cv2.normalize(good, None, 0, 255, cv2.NORM_MINMAX)
+    )
     cv2.imwrite(str(photos / "faded.png"), 90 + good // 5)
     recipe = load_recipe("default", [f"stretch_contrast={str(stretch).lower()}"])
     workspace, report = extracted(tmp_path, photos, recipe)
@@ -90,7 +100,9 @@ def test_faded_photograph_is_stretched_and_said_to_be(tmp_path, stretch):
 
 
 COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
-COURTYARD_CAMERA = CameraOptions(mode="single", model="PINHOLE", params="1080,1080,360,270")
+COURTYARD_CAMERA = CameraOptions(
+    mode="single", model="PINHOLE", params="1080,1080,360,270"
+)
 DEPTH = ["depth.kind=z", "max_image_size_px=360"]
 
 
@@ -107,8 +119,12 @@ def courtyard(tmp_path: Path, num_maps: int) -> tuple[Path, Path]:
     return photos, depth
 
 
-@pytest.mark.parametrize("recipe", ["depth-planes-recommended", "depth-affnet-recommended"])
-def test_image_without_its_depth_map_is_extracted_unrectified_with_a_warning(tmp_path, recipe):
+@pytest.mark.parametrize(
+    "recipe", ["depth-planes-recommended", "depth-affnet-recommended"]
+)
+def test_image_without_its_depth_map_is_extracted_unrectified_with_a_warning(
+    tmp_path, recipe
+):
     photos, depth = courtyard(tmp_path, 1)
     options = load_recipe(recipe, [*DEPTH, f"depth.path='{depth}'"])
     workspace, report = extracted(tmp_path, photos, options, cameras=COURTYARD_CAMERA)
@@ -139,7 +155,9 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
 
 def test_device_that_is_not_there_is_one_clear_line(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(AffrectError, match=r"--device cuda: .*use --device cpu or auto") as error:
+    with pytest.raises(
+        AffrectError, match=r"--device cuda: .*use --device cpu or auto"
+    ) as error:
         prepare(load_recipe("default").extraction, Resources(device="cuda"))
     assert "\n" not in str(error.value)
 
@@ -164,13 +182,21 @@ def test_images_at_once_are_as_many_as_there_are_cores_and_memory_for(
     monkeypatch.setattr(one_image, "available_cores", lambda: 8)
     counts = []
     for gibibytes in (1, 9, 100):
-        monkeypatch.setattr(one_image, "available_memory_bytes", lambda g=gibibytes: g << 30)
+        monkeypatch.setattr(
+            one_image, "available_memory_bytes", lambda g=gibibytes: g << 30
+        )
         counts.append(num_images_at_once(levels))
     assert counts == [1, 3, 8]
     shrunk = {"max_image_size_px": 1024, "features": "aliked"}
     learned = ExtractionOptions.from_mapping(shrunk, "test").levels
-    for gibibytes, expected in ((1, 1), (9, 2), (100, 2)):  # 1.6 GiB an image, and two at most
-        monkeypatch.setattr(one_image, "available_memory_bytes", lambda g=gibibytes: g << 30)
+    for gibibytes, expected in (
+        (1, 1),
+        (9, 2),
+        (100, 2),
+    ):  # 1.6 GiB an image, and two at most
+        monkeypatch.setattr(
+            one_image, "available_memory_bytes", lambda g=gibibytes: g << 30
+        )
         assert num_images_at_once(learned) == expected
 
 
@@ -188,7 +214,9 @@ def test_work_in_another_process_refuses_other_weights(
     pickle.loads(matcher)
     found["affnet"].write_bytes(b"of another release")
     for content in (pickled, matcher):
-        with pytest.raises(AffrectError, match=r"AffNet\.pth: is not the file affnet of"):
+        with pytest.raises(
+            AffrectError, match=r"AffNet\.pth: is not the file affnet of"
+        ):
             pickle.loads(content)
 
 

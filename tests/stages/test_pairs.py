@@ -33,7 +33,9 @@ def write_rooms(folder: Path, names: list[str]) -> None:
     for index, name in enumerate(ROOM_OF):
         if name in names:
             position = (0.2 * index - 0.4, -0.1 * index, 0.05 * index)
-            write_image(folder / name, photograph(position, -2.0 * index, ROOM_OF[name]))
+            write_image(
+                folder / name, photograph(position, -2.0 * index, ROOM_OF[name])
+            )
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +54,13 @@ def rooms(extracted: Path, tmp_path: Path) -> Workspace:
 
 
 def extract(folder: Path) -> None:
-    command = ["extract", "--image-path", folder / "photos", "--output-path", folder / "out"]
+    command = [
+        "extract",
+        "--image-path",
+        folder / "photos",
+        "--output-path",
+        folder / "out",
+    ]
     assert main([str(argument) for argument in [*command, "-q", *FAST]]) == 0
 
 
@@ -62,7 +70,9 @@ def choose(call: Call, workspace: Workspace, *arguments: object) -> list[str]:
     return workspace.pairs.read_text().splitlines()
 
 
-def test_photographs_of_one_room_are_chosen_by_their_features(rooms: Workspace, call: Call) -> None:
+def test_photographs_of_one_room_are_chosen_by_their_features(
+    rooms: Workspace, call: Call
+) -> None:
     arguments = ["--pairs", "retrieval", "--num-neighbors", 1]
     assert choose(call, rooms, *arguments) == ["1.png 3.png", "2.png 4.png"]
 
@@ -77,7 +87,9 @@ def test_pairs_stay_and_come_when_photographs_come(
     arguments = ["--pairs", "retrieval", "--num-neighbors", 1]
     before = choose(call, rooms, *arguments)
     with monkeypatch.context() as patch:
-        patch.setattr(stage, "retrieved_pairs", None)  # nothing has come: it is not called
+        patch.setattr(
+            stage, "retrieved_pairs", None
+        )  # nothing has come: it is not called
         assert choose(call, rooms, *arguments) == before
     write_rooms(tmp_path / "photos", ["10.png"])
     extract(tmp_path)
@@ -89,7 +101,14 @@ def test_pairs_stay_and_come_when_photographs_come(
 def test_methods_and_a_list_are_joined(rooms: Workspace, call: Call) -> None:
     listed = rooms.path.parent / "list.txt"
     listed.write_text("4.png 1.png\n")
-    given = ["--pairs", "retrieval,sequence", "--num-neighbors", 1, "--match-list-path", listed]
+    given = [
+        "--pairs",
+        "retrieval,sequence",
+        "--num-neighbors",
+        1,
+        "--match-list-path",
+        listed,
+    ]
     pairs = ["1.png 2.png", "1.png 3.png", "1.png 4.png", "2.png 3.png", "2.png 4.png"]
     assert choose(call, rooms, *given) == [*pairs, "3.png 4.png"]
     assert rooms.recorded()["pairs"] == {
@@ -111,8 +130,12 @@ def test_gps_without_positions_is_refused_and_nothing_discarded(
 
 
 def test_pairs_by_gps_and_sequence_together(rooms: Workspace) -> None:
-    write_positions(rooms.database, {"1.png": (50.0, 14.0, 0.0), "4.png": (50.0, 14.001, 500.0)})
-    stage.choose_pairs(Context(rooms), PairOptions(methods=("gps", "sequence"), num_neighbors=1))
+    write_positions(
+        rooms.database, {"1.png": (50.0, 14.0, 0.0), "4.png": (50.0, 14.001, 500.0)}
+    )
+    stage.choose_pairs(
+        Context(rooms), PairOptions(methods=("gps", "sequence"), num_neighbors=1)
+    )
     assert rooms.pairs.read_text().splitlines() == [
         "1.png 2.png",
         "1.png 4.png",
@@ -129,7 +152,9 @@ def write_positions(
     ids = image_ids(path)
     with open_database(path) as database:
         for name, position in positions.items():
-            prior = pycolmap.PosePrior(position=np.array(position), coordinate_system=system)
+            prior = pycolmap.PosePrior(
+                position=np.array(position), coordinate_system=system
+            )
             prior.corr_data_id = database.read_image(ids[name]).data_id
             database.write_pose_prior(prior)
 
@@ -137,15 +162,26 @@ def write_positions(
 def test_nearest_positions_are_in_metres_and_few(rooms: Workspace) -> None:
     # A degree of latitude is 111 km; 1, 2 and 4 lie 33 m and 44 m apart, 3 is another 3.3 km away.
     latitudes = {"1.png": 50.0, "2.png": 50.0003, "4.png": 50.0007, "3.png": 50.03}
-    write_positions(rooms.database, {name: (lat, 14.0, 0.0) for name, lat in latitudes.items()})
-    assert nearest_positions(rooms.database, 1, 100.0) == [("1.png", "2.png"), ("2.png", "4.png")]
+    write_positions(
+        rooms.database, {name: (lat, 14.0, 0.0) for name, lat in latitudes.items()}
+    )
+    assert nearest_positions(rooms.database, 1, 100.0) == [
+        ("1.png", "2.png"),
+        ("2.png", "4.png"),
+    ]
     assert nearest_positions(rooms.database, 2, 40.0) == [("1.png", "2.png")]
     assert ("3.png", "4.png") in nearest_positions(rooms.database, 1, 10_000.0)
     assert len(nearest_positions(rooms.database, 3, 10_000.0)) == 6
 
 
-def test_nearest_positions_take_cartesian_ones_and_images_without(rooms: Workspace) -> None:
-    positions = {"1.png": (0.0, 0.0, 0.0), "2.png": (3.0, 4.0, 9.0), "3.png": (0.0, 20.0, 0.0)}
+def test_nearest_positions_take_cartesian_ones_and_images_without(
+    rooms: Workspace,
+) -> None:
+    positions = {
+        "1.png": (0.0, 0.0, 0.0),
+        "2.png": (3.0, 4.0, 9.0),
+        "3.png": (0.0, 20.0, 0.0),
+    }
     write_positions(rooms.database, positions, CARTESIAN)
     assert nearest_positions(rooms.database, 5, 5.1) == [("1.png", "2.png")]
 
@@ -159,13 +195,22 @@ def test_positions_that_are_none_on_earth_do_not_count(
     stage.choose_pairs(Context(rooms), PairOptions(methods=("gps",)))
     assert rooms.pairs.read_text().splitlines() == ["1.png 4.png"]
     assert "2.png (latitude 0, longitude 0: no position was known)" in caplog.text
-    assert "gps: 2 of 4 photographs were not taken within 100 m of another one" in caplog.text
+    assert (
+        "gps: 2 of 4 photographs were not taken within 100 m of another one"
+        in caplog.text
+    )
 
 
 def test_no_pair_by_gps_is_an_error(rooms: Workspace) -> None:
-    far = {"1.png": (50.0, 14.0, 0.0), "2.png": (96.0, 14.0, 0.0), "3.png": (14.0, 50.0, 0.0)}
+    far = {
+        "1.png": (50.0, 14.0, 0.0),
+        "2.png": (96.0, 14.0, 0.0),
+        "3.png": (14.0, 50.0, 0.0),
+    }
     write_positions(rooms.database, far)
-    with pytest.raises(AffrectError, match="by its position no photograph was taken within 100 m"):
+    with pytest.raises(
+        AffrectError, match="by its position no photograph was taken within 100 m"
+    ):
         stage.choose_pairs(Context(rooms), PairOptions(methods=("gps",)))
     assert not rooms.pairs.exists()
 

@@ -85,7 +85,9 @@ def without_times(report: dict[str, object]) -> dict[str, object]:
     }
 
 
-def test_run_registers_all_photographs_and_leaves_all_results(finished: Finished) -> None:
+def test_run_registers_all_photographs_and_leaves_all_results(
+    finished: Finished,
+) -> None:
     workspace, report = finished
     assert report.status == "ok"
     assert report.registered_names == tuple(sorted(NAMES))
@@ -105,7 +107,11 @@ def test_run_registers_all_photographs_and_leaves_all_results(finished: Finished
     assert camera.params.tolist() == [float(value) for value in INTRINSICS.split(",")]
     assert (camera.width, camera.height) == IMAGE_SIZE
     (record,) = read_camera_records(workspace.cameras).values()
-    assert (record.names, record.source, record.is_fixed) == (tuple(names), "given", True)
+    assert (record.names, record.source, record.is_fixed) == (
+        tuple(names),
+        "given",
+        True,
+    )
     assert len(workspace.pairs.read_text(encoding="utf-8").splitlines()) == 6
     stages = ["extract", "pairs", "match", "verify", "escalate", "guide", "map"]
     assert workspace.recorded().keys() == {"recipe", *stages, "made_from", "mapped"}
@@ -125,11 +131,16 @@ def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(
     workspace, _ = finished
     ids = image_ids(workspace.database)
     assert sorted(ids) == sorted(NAMES)
-    with h5py.File(workspace.features, "r") as file, open_database(workspace.database) as database:
+    with (
+        h5py.File(workspace.features, "r") as file,
+        open_database(workspace.database) as database,
+    ):
         for name in NAMES:
             keypoints = database.read_keypoints(ids[name])
             assert len(keypoints) > 500
-            assert_array_equal(keypoints[:, :2], file[name]["keypoints"][()] + np.float32(0.5))
+            assert_array_equal(
+                keypoints[:, :2], file[name]["keypoints"][()] + np.float32(0.5)
+            )
 
 
 def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from_there(
@@ -157,16 +168,29 @@ def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from
     assert record | planned == expected.recorded()
     assert image_ids(made.database) == image_ids(expected.database)
     assert database_content(made.database) == database_content(expected.database)
-    reports = [json.loads(space.report.read_text(encoding="utf-8")) for space in (made, expected)]
+    reports = [
+        json.loads(space.report.read_text(encoding="utf-8"))
+        for space in (made, expected)
+    ]
     assert without_times(reports[0]) == without_times(reports[1])
     report = run(photos, made.path, OPTIONS)
     assert without_times(report.to_mapping()) == without_times(first.to_mapping())
     assert made.config.read_bytes() == expected.config.read_bytes()
 
 
-def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_advice_is_about_what_is_wrong(
+    finished: Finished, monkeypatch: pytest.MonkeyPatch
+) -> None:
     workspace, report = finished
-    command = ("colmap-affrect", "run", "--image-path", "a b", "--output-path", "out", "-q")
+    command = (
+        "colmap-affrect",
+        "run",
+        "--image-path",
+        "a b",
+        "--output-path",
+        "out",
+        "-q",
+    )
     context = Context(workspace, command=command)
     (model, *_) = report.models
     lost = NAMES[0]
@@ -174,7 +198,9 @@ def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.M
 
     monkeypatch.setattr(Workspace, "recipe", lambda _: "rectified")
 
-    def commands(missing: list[str], model: ModelSummary, at: Context = context) -> list[str]:
+    def commands(
+        missing: list[str], model: ModelSummary, at: Context = context
+    ) -> list[str]:
         found = [one.command for one in advice(at, missing, [model], 0)]
         for words in filter(None, found):  # the parser takes what is advised
             build_parser().parse_args(shlex.split(words)[1:])
@@ -199,7 +225,9 @@ def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.M
     assert commands([], alone) == [f"{again} --reject-pair '{lost},{NAMES[1]}'"]
     said = replace(context, by_hand=ByHand(tie_points_path=Path("t.csv")), command=())
     (_, tie_points, _) = advice(said, [lost], [model], 0)
-    assert tie_points.why.startswith("no point of t.csv is seen by two photographs of one model")
+    assert tie_points.why.startswith(
+        "no point of t.csv is seen by two photographs of one model"
+    )
     assert tie_points.command.startswith("colmap-affrect map --output-path ")
     given = replace(said, command=("colmap-affrect", "map", "--tie-points", "t.csv"))
     (_, tie_points, _) = advice(given, [lost], [model, model], 0)
@@ -208,12 +236,18 @@ def test_advice_is_about_what_is_wrong(finished: Finished, monkeypatch: pytest.M
     (copies,) = advice(context, [*NAMES], [], 900)
     assert "from other places" in copies.why
     monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
-    monkeypatch.setattr(Resources, "how_to_complete", lambda *_: "pip install it, or fetch it")
-    assert advice(context, [lost], [model], 0)[0].command == f"pip install it && {again}"
+    monkeypatch.setattr(
+        Resources, "how_to_complete", lambda *_: "pip install it, or fetch it"
+    )
+    assert (
+        advice(context, [lost], [model], 0)[0].command == f"pip install it && {again}"
+    )
 
 
 def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
-    before = {path: path.read_bytes() for path in (copy.features, copy.matches, copy.pairs)}
+    before = {
+        path: path.read_bytes() for path in (copy.features, copy.matches, copy.pairs)
+    }
     model = (copy.sparse / "0" / "points3D.bin").stat().st_mtime_ns
     tables = database_content(copy.database)
     report = run(photos, copy.path, OPTIONS)
@@ -249,12 +283,16 @@ def test_image_whose_features_are_lost_gets_the_same_again(
     assert without_times(report.to_mapping()) == without_times(first.to_mapping())
 
 
-def test_other_options_than_before_are_named(copy: Workspace, photos: Path, call: Call) -> None:
+def test_other_options_than_before_are_named(
+    copy: Workspace, photos: Path, call: Call
+) -> None:
     out = ["--output-path", copy.path]
     images = ["--image-path", photos]
     cameras = CAMERA_ARGUMENTS
     seed = ["--random-seed", 3]
-    before = {path: path.read_bytes() for path in (copy.features, copy.matches, copy.config)}
+    before = {
+        path: path.read_bytes() for path in (copy.features, copy.matches, copy.config)
+    }
     cases = [
         (["run", *images, *seed, *cameras, "--set", "features.contrast_threshold=0.02"],
          "features.contrast_threshold=0.013, and it is 0.02"),
@@ -286,7 +324,14 @@ def test_options_survive_stage_by_stage(
         'rectifier = "identity"\nmatching.max_ratio = 0.8\nmapping.init_min_num_inliers = 40\n'
     )
     monkeypatch.chdir(tmp_path)
-    extract = ["extract", "--image-path", photos, "--output-path", out, *CAMERA_ARGUMENTS]
+    extract = [
+        "extract",
+        "--image-path",
+        photos,
+        "--output-path",
+        out,
+        *CAMERA_ARGUMENTS,
+    ]
     assert call(*extract, "--recipe", "own.toml").code == 0
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
@@ -297,32 +342,45 @@ def test_options_survive_stage_by_stage(
     now = Workspace(out)
     assert workspace.require("match")["max_ratio"] == 0.8
     assert workspace.require("map")["init_min_num_inliers"] == 40
-    changed = call("match", "--output-path", out, "--set", "matching.max_ratio=0.7", "--overwrite")
+    changed = call(
+        "match", "--output-path", out, "--set", "matching.max_ratio=0.7", "--overwrite"
+    )
     assert changed.code == 0
     assert now.require("match")["max_ratio"] == 0.7
     wrong = call("match", "--output-path", out, "--set", "rectifier.name=identity")
-    assert wrong.errors == ["error: --set: only options of matching can be changed here"]
+    assert wrong.errors == [
+        "error: --set: only options of matching can be changed here"
+    ]
 
 
 @pytest.mark.long
-def test_mapper_options_are_added_to_what_is_on_record(copy: Workspace, call: Call) -> None:
+def test_mapper_options_are_added_to_what_is_on_record(
+    copy: Workspace, call: Call
+) -> None:
     seeds = ["--preset", "colmap", "--random-seed", "4"]
     assert call("map", "--output-path", copy.path, "--overwrite", *seeds).code in (0, 3)
     option = ["--mapper-options", "ba_refine_principal_point=true"]
-    assert call("map", "--output-path", copy.path, "--overwrite", *option).code in (0, 3)
+    assert call("map", "--output-path", copy.path, "--overwrite", *option).code in (
+        0,
+        3,
+    )
     record = copy.require("map")
     assert (record["min_model_size"], record["random_seed"]) == (10, 4)
     assert record["mapper_options"] == {"ba_refine_principal_point": True}
 
 
 @pytest.mark.parametrize("stage", ["pairs", "match", "verify", "map"])
-def test_stage_before_its_turn_says_what_to_run(tmp_path: Path, call: Call, stage: str) -> None:
+def test_stage_before_its_turn_says_what_to_run(
+    tmp_path: Path, call: Call, stage: str
+) -> None:
     code, stdout, stderr = call(stage, "--output-path", tmp_path)
     assert (code, stdout, len(stderr)) == (2, "", 1)
     assert "stage has not been run there; run 'colmap-affrect " in stderr[0]
 
 
-def test_pairs_that_are_not_listed_any_more_leave_the_database(copy: Workspace, call: Call) -> None:
+def test_pairs_that_are_not_listed_any_more_leave_the_database(
+    copy: Workspace, call: Call
+) -> None:
     names = FeatureStore(copy.features).names()
     path = copy.path.parent / "list.txt"
     for lines, overwrite, has_lost in [
@@ -330,16 +388,23 @@ def test_pairs_that_are_not_listed_any_more_leave_the_database(copy: Workspace, 
         ([names[:2], names[1:3], names[2:4]], [], False),
         ([names[:2]], [], True),
     ]:
-        path.write_text("".join("\t".join(line) + "\n" for line in lines), encoding="utf-8")
+        path.write_text(
+            "".join("\t".join(line) + "\n" for line in lines), encoding="utf-8"
+        )
         arguments = ["--output-path", copy.path, "--match-list-path", path, *overwrite]
         code, _, stderr = call("pairs", *arguments)
         assert code == 0, stderr
-        assert any("2 pairs are not listed any more" in line for line in stderr) == has_lost
+        assert (
+            any("2 pairs are not listed any more" in line for line in stderr)
+            == has_lost
+        )
     assert call("match", "--output-path", copy.path).code == 0
     assert set(database_content(copy.database)["raw matches"]) == {tuple(names[:2])}
 
 
-def test_match_index_out_of_range_is_refused_before_it_is_written(copy: Workspace) -> None:
+def test_match_index_out_of_range_is_refused_before_it_is_written(
+    copy: Workspace,
+) -> None:
     pair = ("a.png", "b c.png")
     count = FeatureStore(copy.features).num_keypoints()[pair[1]]
     with h5py.File(copy.matches, "a") as file:
@@ -381,7 +446,10 @@ def test_advice_names_what_was_not_tried_and_the_command_that_goes_on(
 ) -> None:
     workspace, report = finished
     words = ("colmap-affrect", "run", "--image-path", "a b", "--output-path", "out")
-    left = [MatchedAgain("measured, all tilts", 28, 1200.0), MatchedAgain("new", 1, 60.0)]
+    left = [
+        MatchedAgain("measured, all tilts", 28, 1200.0),
+        MatchedAgain("new", 1, 60.0),
+    ]
     context = Context(workspace, command=(*words, "--effort", "normal"))
     more, *_ = advice(context, [NAMES[0]], report.models, 0, left, "normal")
     assert more.why.startswith("not tried, at most about ")
@@ -397,7 +465,9 @@ def test_advice_names_what_was_not_tried_and_the_command_that_goes_on(
         assert shlex.split(more.command) == [*words, "--effort=low"]
     (more,) = advice(replace(context, command=()), [], report.models, 0, left, "low")
     assert more.command == ""
-    assert more.why.endswith("; give the command of the run again, with --effort normal")
+    assert more.why.endswith(
+        "; give the command of the run again, with --effort normal"
+    )
 
 
 def test_photographs_that_are_all_lost_are_not_to_be_joined_with_the_others(

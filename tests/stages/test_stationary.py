@@ -22,13 +22,17 @@ SCENE_MOTION_PX = np.array([31.0, 17.0])
 
 
 def stores(
-    folder: Path, points: list[NDArray[np.float64]], sizes: list[tuple[int, int]] | None = None
+    folder: Path,
+    points: list[NDArray[np.float64]],
+    sizes: list[tuple[int, int]] | None = None,
 ) -> tuple[FeatureStore, MatchStore, list[tuple[str, str]]]:
     """Write images whose features of one number are matched with each other."""
     features = FeatureStore(folder / "features.h5")
     matches = MatchStore(folder / "matches.h5")
     names = [f"{k}.jpg" for k in range(len(points))]
-    for name, places, size in zip(names, points, sizes or [SIZE] * len(points), strict=True):
+    for name, places, size in zip(
+        names, points, sizes or [SIZE] * len(points), strict=True
+    ):
         ones = np.ones(len(places))
         count = len(places)
         lafs = lafs_from_keypoints(places, 5.0 * ones, 0.0 * ones)
@@ -45,7 +49,8 @@ def stores(
 def scans(count: int) -> list[NDArray[np.float64]]:
     jitter = np.random.default_rng(3).uniform(-0.5, 0.5, (count, *CAPTION.shape))
     return [
-        np.concatenate([SCENE + k * SCENE_MOTION_PX, CAPTION + jitter[k]]) for k in range(count)
+        np.concatenate([SCENE + k * SCENE_MOTION_PX, CAPTION + jitter[k]])
+        for k in range(count)
     ]
 
 
@@ -60,8 +65,12 @@ def test_caption_is_left_out_and_what_moves_stays(tmp_path: Path) -> None:
     assert StationaryFilter(features, matches).learn(pairs) == ""
 
 
-def test_of_a_watermark_all_over_only_what_does_not_move_is_left_out(tmp_path: Path) -> None:
-    marks = np.stack(np.meshgrid(np.arange(30, 960, 60), np.arange(30, 640, 60)), -1).reshape(-1, 2)
+def test_of_a_watermark_all_over_only_what_does_not_move_is_left_out(
+    tmp_path: Path,
+) -> None:
+    marks = np.stack(
+        np.meshgrid(np.arange(30, 960, 60), np.arange(30, 640, 60)), -1
+    ).reshape(-1, 2)
     scene = np.random.default_rng(4).uniform((0, 0), SIZE, (3, 4000, 2))
     points = [np.concatenate([marks + 0.1 * k, scene[k]]) for k in range(3)]
     features, matches, pairs = stores(tmp_path, points)
@@ -72,7 +81,9 @@ def test_of_a_watermark_all_over_only_what_does_not_move_is_left_out(tmp_path: P
         assert np.count_nonzero(~is_mark) > 0.95 * 4000
 
 
-def test_pair_that_is_matched_later_is_filtered_by_what_is_known(tmp_path: Path) -> None:
+def test_pair_that_is_matched_later_is_filtered_by_what_is_known(
+    tmp_path: Path,
+) -> None:
     features, matches, pairs = stores(tmp_path, scans(4))
     given = next(matches.read(pairs))
     StationaryFilter(features, matches).learn(pairs)
@@ -80,7 +91,9 @@ def test_pair_that_is_matched_later_is_filtered_by_what_is_known(tmp_path: Path)
     assert len(again.indices) == len(SCENE)
 
 
-def test_match_of_equal_letters_at_two_places_of_a_caption_is_left_out(tmp_path: Path) -> None:
+def test_match_of_equal_letters_at_two_places_of_a_caption_is_left_out(
+    tmp_path: Path,
+) -> None:
     """It moves, as a match of the scene does, but both of its ends are where nothing moves."""
     features, matches, pairs = stores(tmp_path, scans(4))
     given = next(matches.read(pairs))
@@ -88,7 +101,9 @@ def test_match_of_equal_letters_at_two_places_of_a_caption_is_left_out(tmp_path:
     swapped = given.indices.copy()
     swapped[len(SCENE) :, 1] = swapped[: len(SCENE) - 1 : -1, 1]
     to_caption = replace(given, indices=np.roll(given.indices, len(CAPTION), axis=0))
-    to_caption.indices[:, 0] = given.indices[:, 0]  # from the scene to the caption and back
+    to_caption.indices[:, 0] = given.indices[
+        :, 0
+    ]  # from the scene to the caption and back
     again = StationaryFilter(features, MatchStore(matches.path))
     assert len(again.filtered(replace(given, indices=swapped)).indices) == len(SCENE)
     kept = again.filtered(to_caption).indices
@@ -129,10 +144,14 @@ def turned(points: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
     s = np.sin(np.deg2rad(degrees))
     x, y, z = (points @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])).T
     noise = np.random.default_rng(int(degrees) + 100).normal(0.0, 0.2, (len(points), 2))
-    return np.stack([480 + 1100 * x / (z + 4), 320 + 1100 * y / (z + 4)], axis=1) + noise
+    return (
+        np.stack([480 + 1100 * x / (z + 4), 320 + 1100 * y / (z + 4)], axis=1) + noise
+    )
 
 
-@pytest.mark.parametrize("depth", [0.0, 0.1, 0.5], ids=["a plane", "a relief", "an object"])
+@pytest.mark.parametrize(
+    "depth", [0.0, 0.1, 0.5], ids=["a plane", "a relief", "an object"]
+)
 def test_what_a_camera_turns_about_is_kept(tmp_path: Path, depth: float) -> None:
     """In the middle of all photographs motions are small, but not to the pixel."""
     spread = np.random.default_rng(5).uniform(-1, 1, (1200, 3)) * (1.2, 0.9, depth)
@@ -143,14 +162,18 @@ def test_what_a_camera_turns_about_is_kept(tmp_path: Path, depth: float) -> None
     assert all(len(found.indices) == 1200 for found in matches.read(pairs))
 
 
-def turntable(count: int, num_behind: int = 600) -> tuple[list[NDArray[np.float64]], int]:
+def turntable(
+    count: int, num_behind: int = 600
+) -> tuple[list[NDArray[np.float64]], int]:
     """Photographs of an object that turns before a still camera; how many points it has."""
     shape = np.random.default_rng(5).uniform(-0.6, 0.6, (200, 3))
     behind = np.random.default_rng(6).uniform((0, 0), SIZE, (num_behind, 2))
     behind = behind[np.linalg.norm(behind - (480, 320), axis=1) > 300]
     jitter = np.random.default_rng(7).normal(0.0, 0.2, (count, *behind.shape))
     views = [turned(shape, 12.0 * k) for k in range(count)]
-    return [np.concatenate([views[k], behind + jitter[k]]) for k in range(count)], len(shape)
+    return [np.concatenate([views[k], behind + jitter[k]]) for k in range(count)], len(
+        shape
+    )
 
 
 def test_background_of_an_object_that_turns_before_a_still_camera_is_left_out(
@@ -166,7 +189,9 @@ def test_background_of_an_object_that_turns_before_a_still_camera_is_left_out(
         assert np.count_nonzero(~of_object) < 0.02 * len(points[0])
 
 
-def test_what_begins_or_ends_on_the_background_of_a_pair_is_left_out(tmp_path: Path) -> None:
+def test_what_begins_or_ends_on_the_background_of_a_pair_is_left_out(
+    tmp_path: Path,
+) -> None:
     """As of windows that look alike, or of something on the object that looks like one."""
     points, num = turntable(6, 2000)
     features, matches, pairs = stores(tmp_path, points)
@@ -184,7 +209,9 @@ def test_what_begins_or_ends_on_the_background_of_a_pair_is_left_out(tmp_path: P
         assert np.count_nonzero(~are_of_object) < 0.2 * 60
 
 
-def test_what_stands_still_is_left_out_of_later_matches_anywhere(tmp_path: Path) -> None:
+def test_what_stands_still_is_left_out_of_later_matches_anywhere(
+    tmp_path: Path,
+) -> None:
     """Other features lie at other places, where nothing was seen that does not move."""
     points, num = turntable(6)
     hidden = np.array([[470.0, 30.0], [300.0, 610.0]])
@@ -192,7 +219,9 @@ def test_what_stands_still_is_left_out_of_later_matches_anywhere(tmp_path: Path)
     features, matches, pairs = stores(tmp_path, points)
     all_matched = list(matches.read(pairs))
     for found in all_matched:
-        matches.write([replace(found, indices=found.indices[:-2], scores=found.scores[:-2])])
+        matches.write(
+            [replace(found, indices=found.indices[:-2], scores=found.scores[:-2])]
+        )
     StationaryFilter(features, matches).learn(pairs)
     again = StationaryFilter(features, MatchStore(matches.path))
     for found in all_matched:
@@ -233,7 +262,9 @@ def test_where_nothing_else_moves_nothing_is_left_out_and_the_line_says_what_to_
     assert all(len(found.indices) == 240 for found in matches.read(pairs))
 
 
-def test_wrong_matches_of_a_still_camera_are_no_object_that_moves(tmp_path: Path) -> None:
+def test_wrong_matches_of_a_still_camera_are_no_object_that_moves(
+    tmp_path: Path,
+) -> None:
     random = np.random.default_rng(8)
     anywhere = [random.uniform((720, 0), SIZE, (60, 2)) for _ in range(6)]
     points = [np.concatenate([SCENE, one]) for one in anywhere]
@@ -242,7 +273,9 @@ def test_wrong_matches_of_a_still_camera_are_no_object_that_moves(tmp_path: Path
     assert all(len(found.indices) == 260 for found in matches.read(pairs))
 
 
-def test_photographs_from_one_place_among_others_keep_what_ties_them(tmp_path: Path) -> None:
+def test_photographs_from_one_place_among_others_keep_what_ties_them(
+    tmp_path: Path,
+) -> None:
     """Six of a tripod, two of another: pairs of both kinds keep all their matches."""
     moved = SCENE * (1.05, 1.0) + SCENE_MOTION_PX
     features, matches, pairs = stores(tmp_path, [SCENE] * 6 + [moved] * 2)
@@ -251,7 +284,9 @@ def test_photographs_from_one_place_among_others_keep_what_ties_them(tmp_path: P
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 1.5])
-def test_caption_of_sheets_that_were_laid_anew_is_left_out(tmp_path: Path, shift_px: float) -> None:
+def test_caption_of_sheets_that_were_laid_anew_is_left_out(
+    tmp_path: Path, shift_px: float
+) -> None:
     random = np.random.default_rng(9)
     points = []
     for k, scan in enumerate(scans(5)):
@@ -259,7 +294,9 @@ def test_caption_of_sheets_that_were_laid_anew_is_left_out(tmp_path: Path, shift
         turn = np.deg2rad(random.uniform(-0.1, 0.1))
         laid = turn * np.stack([-from_centre[:, 1], from_centre[:, 0]], axis=1)
         laid += random.uniform(-shift_px, shift_px, 2)
-        points.append(np.concatenate([SCENE + k * SCENE_MOTION_PX, scan[len(SCENE) :] + laid]))
+        points.append(
+            np.concatenate([SCENE + k * SCENE_MOTION_PX, scan[len(SCENE) :] + laid])
+        )
     features, matches, pairs = stores(tmp_path, points)
     assert StationaryFilter(features, matches).learn(pairs)
     for found in matches.read(pairs):
@@ -273,7 +310,9 @@ def test_place_where_other_pairs_move_is_kept(tmp_path: Path) -> None:
     turned = [np.concatenate([SCENE, CAPTION])]
     for k in range(1, 7):
         moved = SCENE + k * SCENE_MOTION_PX
-        moved[:40] = SCENE[:40] if k < 4 else moved[:40]  # four images agree there, three do not
+        moved[:40] = (
+            SCENE[:40] if k < 4 else moved[:40]
+        )  # four images agree there, three do not
         turned.append(np.concatenate([moved, CAPTION + 9.0 * k]))
     features, matches, pairs = stores(tmp_path, turned)
     assert StationaryFilter(features, matches).learn(pairs) == ""
