@@ -6,6 +6,7 @@ covariance of the bundle adjustment, with its priors of intrinsics, tells how fa
 Bundle adjustment - a modern synthesis, 2000, Sec. 9).
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -17,12 +18,18 @@ from colmap_affrect.mappers.adjustment import Adjuster
 MAX_NUM_IMAGES = 100
 """Larger models are not looked at: the time grows with the cube of the images, and half of so many
 hardly stand at one place."""
+NOT_HELD_DEG = 180.0
+"""From this deviation on a direction may be any: what tracks tell is off by a few degrees, what
+they do not tell by thousands."""
 
 
 def direction_sigmas_deg(
     model: pycolmap.Reconstruction, adjuster: Adjuster
 ) -> dict[int, float]:
     """Return how uncertain the directions from each image to others are.
+
+    Directions that tracks do not hold at all are passed over: the scale of bridges is known by
+    something else (:mod:`colmap_affrect.mappers.bridging`), of which the covariance knows nothing.
 
     Args:
         model: That has been adjusted.
@@ -44,19 +51,25 @@ def direction_sigmas_deg(
     covariance = adjuster.pose_covariance(model)
     if covariance is None:
         return {}
-    noise_px = adjuster.noise_px
-    sigmas_deg: dict[int, list[float]] = {image_id: [] for image_id in image_ids}
-    for number, first in enumerate(image_ids):
-        for second in image_ids[number + 1 :]:
-            sigma_deg = _direction_sigma_deg(model, covariance, first, second)
-            if sigma_deg is not None:
-                sigmas_deg[first].append(noise_px * sigma_deg)
-                sigmas_deg[second].append(noise_px * sigma_deg)
     num_needed = math.ceil((len(image_ids) - 1) / 2)
     found = dict[int, float]()
-    for image_id, of_image in sigmas_deg.items():
-        if len(of_image) >= num_needed:
-            found[image_id] = sorted(of_image)[num_needed - 1]
+    for image_id, sigmas_deg in _held(model, covariance, adjuster.noise_px).items():
+        if len(sigmas_deg) >= num_needed:
+            found[image_id] = sorted(sigmas_deg)[num_needed - 1]
+    return found
+
+
+def _held(
+    model: pycolmap.Reconstruction, covariance: pycolmap.BACovariance, noise_px: float
+) -> dict[int, list[float]]:
+    """Return the deviations of the directions of each image that tracks hold, in degrees."""
+    image_ids = sorted(model.reg_image_ids())
+    found: dict[int, list[float]] = {image_id: [] for image_id in image_ids}
+    for first, second in itertools.combinations(image_ids, 2):
+        sigma_deg = noise_px * _direction_sigma_deg(model, covariance, first, second)
+        if sigma_deg < NOT_HELD_DEG:
+            found[first].append(sigma_deg)
+            found[second].append(sigma_deg)
     return found
 
 
@@ -65,7 +78,7 @@ def _direction_sigma_deg(
     covariance: pycolmap.BACovariance,
     first: int,
     second: int,
-) -> float | None:
+) -> float:
     """Return the deviation of the direction from one image to another, in the frame of the first.
 
     It is that of both angles together, the root of the sum of their variances, for keypoints with a
@@ -76,7 +89,7 @@ def _direction_sigma_deg(
     others = covariance.get_cam_cov_from_world(second)
     common = covariance.get_cam_cross_cov_from_world(first, second)
     if own is None or others is None or common is None:
-        return None
+        return math.inf
     joint = np.block([[own, common], [np.transpose(common), others]])
     first_pose = model.images[first].cam_from_world()
     second_pose = model.images[second].cam_from_world()
@@ -85,7 +98,7 @@ def _direction_sigma_deg(
     to_second: Array = first_pose.translation - center
     distance = float(np.linalg.norm(to_second))
     if distance == 0.0:
-        return 180.0
+        return math.inf
     jacobian = np.hstack(
         [
             2.0 * _cross_matrix(center),

@@ -241,8 +241,8 @@ def _without_wrong_images(mapped: MappedModel, task: MappingTask) -> _ScoredMode
     is_stale = False  # growths are of a model with a few images more
     while model.num_reg_images() > 1:
         confidences = _best_of_frames(model, score_images(mapped, task, growths))
-        worst = min(confidences, key=lambda name: confidences[name].probability)
-        is_wrong = confidences[worst].probability < MIN_PROBABILITY and not task.extend
+        worst = min(confidences, key=lambda name: confidences[name].of_evidence)
+        is_wrong = confidences[worst].of_evidence < MIN_PROBABILITY and not task.extend
         if is_wrong:
             for name in _deregister(model, worst):
                 scored.taken_out[name] = confidences[worst]

@@ -150,6 +150,13 @@ class Confidence:
     probability: float  # that its pose is right
     reasons: tuple[Doubt, ...]  # what speaks most against that
     gain: float = 0.0  # what more matches may add to the probability
+    noise_share: float = 1.0
+    """Factor of the probability for what noise leaves open, which is no sign of a wrong pose."""
+
+    @property
+    def of_evidence(self) -> float:
+        """Probability by what speaks for and against the pose alone."""
+        return self.probability / self.noise_share
 
 
 @dataclass(frozen=True)
@@ -221,7 +228,8 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
         _probability(log_odds) * share_of_directions / (1.0 + odds_of_two_scenes)
     )
     with_matches = _probability(log_odds + mendable) * share_of_directions
-    return Confidence(probability, _main_reasons(losses), with_matches - probability)
+    gain = with_matches - probability
+    return Confidence(probability, _main_reasons(losses), gain, share_of_directions)
 
 
 def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:

@@ -94,6 +94,17 @@ def test_images_that_were_taken_out_are_passed_over() -> None:
     assert model.num_frames() == 4
 
 
+def test_images_whose_distance_tracks_do_not_tell_are_left_out() -> None:
+    model = model_of(FAR)
+    for index, point_id in enumerate(sorted(model.point3D_ids())):
+        # Image 4 keeps points that only image 1 sees beside it.
+        leaving = (2, 3) if index % 2 else (4,)
+        for image_id in leaving:
+            model.delete_observation(image_id, index)
+    found = direction_sigmas_deg(model, adjuster(0.3))
+    assert list(found) == [1, 2, 3]
+
+
 def test_known_focal_lengths_make_directions_surer() -> None:
     known = direction_sigmas_deg(model_of(NEAR), adjuster(0.0))
     unknown = direction_sigmas_deg(model_of(NEAR), adjuster(0.3))

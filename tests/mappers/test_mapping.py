@@ -291,17 +291,26 @@ def test_a_model_of_a_small_set_is_large_enough(
     assert len(model.registered_names) == 3
 
 
-@pytest.mark.parametrize(("probability", "num_images"), [(0.2, 3), (0.04, 2)])
+@pytest.mark.parametrize(
+    ("probability", "noise_share", "num_images"),
+    [(0.2, 1.0, 3), (0.04, 1.0, 2), (0.04, 0.1, 3)],
+)
 def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, probability: float, num_images: int
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    probability: float,
+    noise_share: float,
+    num_images: int,
 ) -> None:
+    """What noise leaves open is no sign of a wrong pose."""
     synthesize(tmp_path / "database.db", num_rigs=3, num_points3D=60)
 
     def score(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
         names = sorted(model_poses(mapped.reconstruction))
         found = dict.fromkeys(names, Confidence(0.99, ()))
         if len(names) == 3:
-            found[names[-1]] = Confidence(probability, (Doubt("few_matches"),))
+            doubts = (Doubt("few_matches"),)
+            found[names[-1]] = Confidence(probability, doubts, 0.0, noise_share)
         return found
 
     monkeypatch.setattr(mapping, "score_images", score)

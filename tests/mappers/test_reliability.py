@@ -181,6 +181,9 @@ def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses
     at_one_place = confidence(replace(GOOD, direction_sigma_deg=6.0))
     assert at_one_place.reasons == (Doubt("near_others", {"sigma_deg": 6.0}),)
     assert at_one_place.gain < 0.1  # more matches do not help
+    far_off = confidence(replace(GOOD, direction_sigma_deg=60.0))
+    assert far_off.probability < 0.01
+    assert far_off.of_evidence == pytest.approx(confidence(GOOD).probability)
 
 
 def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(
