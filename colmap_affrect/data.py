@@ -219,9 +219,8 @@ class RectificationPlan:
 
     image_size: tuple[int, int]  # (width, height) in px
     items: tuple[Rectification, ...] = ()  # the warps
-    original_region: Mask | None = (
-        None  # (H, W) where features of the image stay; None: all
-    )
+    # (H, W) where features of the image stay; None: all
+    original_region: Mask | None = None
     # a feature of a warp takes the place of one of the image itself at the same place and scale:
     # for disjoint regions, each with the map that suits it best
     replaces_original: bool = False

@@ -69,9 +69,8 @@ class AffrectError(Exception):
     """Base of all errors that the command line prints as one line."""
 
     exit_code = 1
-    names_flags: ClassVar[bool] = (
-        False  # as the command line does; else arguments of functions
-    )
+    # As the command line does; else arguments of functions
+    names_flags: ClassVar[bool] = False
 
     def __str__(self) -> str:
         text = super().__str__()

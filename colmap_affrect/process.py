@@ -24,9 +24,8 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.parallel.subprocesses import end_with
 
-PATIENCE_S = (
-    4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
-)
+# That a command has to end after Ctrl-C or SIGTERM, before it is killed
+PATIENCE_S = 4.0
 WITHOUT_MEMORY = " (perhaps for want of memory)"
 KEPT = (
     "run.log may say why, and what was done before is kept: run the same command again, or "

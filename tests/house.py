@@ -26,9 +26,8 @@ NOT_CODE = {
     tokenize.ENDMARKER,
 }
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
-MANY_ARGUMENTS = (
-    3  # of a public function, from which on its docstring has a section for them
-)
+# Of a public function, from which on its docstring has a section for them
+MANY_ARGUMENTS = 3
 
 
 @dataclass(frozen=True)

@@ -44,9 +44,8 @@ class CameraRecord:
     given: tuple[
         Given, ...
     ] = ()  # what of the intrinsics is the user's, to be left as it is
-    lens_mm: float = (
-        0.0  # by EXIF, where nothing tells the size of the sensor, and so the px
-    )
+    # By EXIF, where nothing tells the size of the sensor, and so the px
+    lens_mm: float = 0.0
     uncropped_px: float = 0.0  # what EXIF says of a crop, if it was not scaled; else 0
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:

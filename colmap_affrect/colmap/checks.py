@@ -73,17 +73,14 @@ KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine
 MAX_OUTSIDE = 0.01  # of the longer side: so far some programs find, or move, what is at the border
 MAX_OUTSIDE_PX = 2.0  # more than that
 MIN_NORMALISED = 3  # keypoints, none further from the corner than ...
-MAX_NORMALISED = (
-    2.0  # ... so many px: their unit is a side of the image, or half of one
-)
-MIN_IN_A_CORNER = (
-    100  # keypoints that should fill an image, of each of so many images ...
-)
+# ... so many px: their unit is a side of the image, or half of one
+MAX_NORMALISED = 2.0
+# Keypoints that should fill an image, of each of so many images ...
+MIN_IN_A_CORNER = 100
 MIN_IMAGES_IN_A_CORNER = 3  # ... or more; none of them reaches further than ...
 IN_A_CORNER = 0.6  # ... so many sides from the upper left corner
-MIN_AT_ONE_PLACE = (
-    10  # one place has a few keypoints, of several orientations or shapes
-)
+# One place has a few keypoints, of several orientations or shapes
+MIN_AT_ONE_PLACE = 10
 
 
 def refuse_unusable(

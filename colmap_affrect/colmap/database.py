@@ -287,9 +287,8 @@ def write_keypoints(
 
 DESCRIPTOR_SIZE = 128
 DESCRIPTOR_NORM = 512
-SIGNED_SHIFT = (
-    0.30  # added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0
-)
+# Added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0
+SIGNED_SHIFT = 0.30
 
 
 def read_descriptors(

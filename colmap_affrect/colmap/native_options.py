@@ -13,9 +13,8 @@ from typing import Any
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import flat, suggestion
 
-MAX_NUM_THREADS = (
-    1024  # COLMAP starts them all, and waits for ever for those that it cannot have
-)
+# COLMAP starts them all, and waits for ever for those that it cannot have
+MAX_NUM_THREADS = 1024
 
 Plain = bool | int | float | str
 

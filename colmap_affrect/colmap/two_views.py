@@ -38,13 +38,11 @@ PLANAR = (  # pairs that a homography explains: their epipolar geometry is arbit
 CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
 MAX_FRAME_ANGLE_DEG = 20.0  # frames of right matches are off by 5 to 10 degrees
 CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0  # of frames that are turned at random
-MAX_CHANCE = (
-    0.99  # frames that agree by chance nearly always, upright ones for one, say nothing
-)
+# Frames that agree by chance nearly always, upright ones for one, say nothing
+MAX_CHANCE = 0.99
 MIN_VARIETY = 0.05  # of elements of shapes of area one; below they have no direction
-MIN_TRANSLATION = (
-    1e-9  # of a decomposed homography, in units of the distance of its plane
-)
+# Of a decomposed homography, in units of the distance of its plane
+MIN_TRANSLATION = 1e-9
 
 
 def pair_model(

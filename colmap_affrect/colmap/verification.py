@@ -28,9 +28,8 @@ Frames = tuple[
 Matches = NDArray[np.integer]  # (M, 2), rows of the features of each image of a pair
 
 PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many
-MAX_WRITTEN_SHARE = (
-    0.15  # of the inliers on a line of writing; where more are, they made it
-)
+# Of the inliers on a line of writing; where more are, they made it
+MAX_WRITTEN_SHARE = 0.15
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
 

@@ -30,12 +30,10 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
-SMALL = (
-    30  # images up to which learned matching takes all pairs of images to match again
-)
-MIN_PHOTOGRAPHS = (
-    0.2  # expected of all that the budget allows, below which nothing is tried
-)
+# Images up to which learned matching takes all pairs of images to match again
+SMALL = 30
+# Expected of all that the budget allows, below which nothing is tried
+MIN_PHOTOGRAPHS = 0.2
 
 
 @dataclass(frozen=True)

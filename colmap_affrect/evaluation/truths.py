@@ -36,19 +36,15 @@ CONFIDENCE = 0.9999  # at which estimators may end before all iterations
 NUM_ESTIMATES = 5  # with other orders of the matches; the one of median error counts
 MIN_HOMOGRAPHY_MATCHES = 4  # determine a homography
 MIN_FUNDAMENTAL_MATCHES = 8  # determine a fundamental matrix linearly
-MIN_POSE_MATCHES = (
-    6  # five determine several essential matrices, without support for any of them
-)
+# Five determine several essential matrices, without support for any of them
+MIN_POSE_MATCHES = 6
 MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices; judged
-CORRECT_PX = (
-    3.0  # largest transfer error or Sampson distance of a correct match; judged
-)
-GRID_STEP_PX = (
-    4  # in x and y, of the pixels over which the error of a homography is a mean
-)
-MAX_ERROR_PX = (
-    5.0  # of the homography of a solved pair; a column of the paper's table on EVD
-)
+# Largest transfer error or Sampson distance of a correct match; judged
+CORRECT_PX = 3.0
+# In x and y, of the pixels over which the error of a homography is a mean
+GRID_STEP_PX = 4
+# Of the homography of a solved pair; a column of the paper's table on EVD
+MAX_ERROR_PX = 5.0
 MAX_ERROR_DEG = 5.0  # of the rotation of a solved pair: the paper's limit
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
 MAX_AUC_ERROR_DEG = 10.0  # of the area under the curve of recall; that of the IMC
@@ -72,9 +68,8 @@ class PairScore:
 
     error: float  # of the protocol, px or degrees; infinite where no model was found
     num_inliers: int  # of the model that was estimated
-    num_correct: int | None = (
-        None  # matches that agree with the truth; None where it cannot tell
-    )
+    # Matches that agree with the truth; None where it cannot tell
+    num_correct: int | None = None
     direction_error_deg: float = math.inf  # of the translation of poses
     solved: float = 0.0  # from 0 to 1; 1 or 0 where the protocol has a threshold
     kind: str = ""  # of the truth, as tables name it; empty without one

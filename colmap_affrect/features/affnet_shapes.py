@@ -49,14 +49,12 @@ STRIP_CELLS = 64  # rows of cells that are computed at once, to bound the memory
 WINDOW_PX = 33  # surroundings whose mean and deviation normalize a pixel: about a patch
 DEVIATION_FLOOR = 0.01 * 255
 """Gray values added to deviations, so that surroundings without texture stay so; judged."""
-PAPER_DEVIATION_FLOOR = (
-    1e-6  # added to the deviation of the whole image (the authors' value)
-)
+# Added to the deviation of the whole image (the authors' value)
+PAPER_DEVIATION_FLOOR = 1e-6
 MAX_NORMALIZED = 6.0
 """Largest normalized value, as in the fully convolutional network of AffNet's authors."""
-PATCH_SIGMAS = (
-    12.0  # half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
-)
+# Half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
+PATCH_SIGMAS = 12.0
 BATCH_SIZE = 256  # patches that go through the network at once
 
 

@@ -128,9 +128,8 @@ def image_corners(image_size: tuple[int, int]) -> Array:
     return np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
 
 
-CANVAS_ROUNDING_PX = (
-    1e-9  # float64 rounding of a mapped point adds no column or row to a canvas
-)
+# Float64 rounding of a mapped point adds no column or row to a canvas
+CANVAS_ROUNDING_PX = 1e-9
 
 
 def fit_canvas(

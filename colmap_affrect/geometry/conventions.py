@@ -19,9 +19,8 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Array, Bools, Floats
 
 HALF_PIXEL = 0.5
-MEASUREMENT_SIGMAS = (
-    6.0  # radius of the measurement ellipse of a local affine frame, in sigmas
-)
+# Radius of the measurement ellipse of a local affine frame, in sigmas
+MEASUREMENT_SIGMAS = 6.0
 
 
 def colmap_from_pixel(points: Floats) -> Floats:

@@ -5,9 +5,8 @@ import math
 from colmap_affrect.geometry.arrays import Array
 
 NO_FIX_DEG = 1e-6  # receivers without a fix write 0, 0, which is in the sea
-MAX_ALTITUDE_M = (
-    100_000.0  # above and below zero: no photograph is taken beyond (edge of space)
-)
+# Above and below zero: no photograph is taken beyond (edge of space)
+MAX_ALTITUDE_M = 100_000.0
 
 
 def why_not_on_earth(position: Array) -> str:

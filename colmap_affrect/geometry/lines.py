@@ -24,9 +24,8 @@ FOCALS: Array = np.exp(np.linspace(math.log(0.4), math.log(6.0), 28))
 SHIFTS: Array = np.linspace(-0.3, 0.3, 25)
 """Grid of shifts, longer sides: view cameras go to a quarter of their plate."""
 
-MIN_NUM_SEGMENTS = (
-    12  # fewer say nothing: three directions and a focal length have 4 unknowns
-)
+# Fewer say nothing: three directions and a focal length have 4 unknowns
+MIN_NUM_SEGMENTS = 12
 NUM_SEGMENTS_OF_TRIALS = 90  # the longest, by which first frames are tried
 NUM_TRIALS = 160  # frames of three directions that are tried for each focal length
 NUM_KEPT = 3  # of these, which are refined for each focal length
@@ -40,12 +39,10 @@ by ``tests/benchmarks/lines.py``, with each scene left out in turn."""
 USUAL_FOCAL = 1.2  # longer sides: what COLMAP guesses
 USUAL_FOCAL_SIGMA = 0.5  # of the logarithm of the focal lengths that photographs have
 KNOWN_SIGMA = 0.15  # of log focal length, below which lines know it
-MIDDLE_SIGMA = (
-    0.02  # longer sides, of the axis of a photograph that is as the camera took it
-)
-SHIFTED_SIGMA = (
-    0.15  # longer sides, of the axis of a print: view cameras shift, and prints are cut
-)
+# Longer sides, of the axis of a photograph that is as the camera took it
+MIDDLE_SIGMA = 0.02
+# Longer sides, of the axis of a print: view cameras shift, and prints are cut
+SHIFTED_SIGMA = 0.15
 MIN_EVIDENCE = 3.0  # nats, from which on lines have their directions not by chance
 SHIFT_EVIDENCE = 3.0  # nats, from which on lines say that the axis is not in the middle
 

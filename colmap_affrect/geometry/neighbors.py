@@ -10,9 +10,8 @@ import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Integers
 
-NUM_NEIGHBORS = (
-    8  # nearest matches in each image that may support one; judged on photographs
-)
+# Nearest matches in each image that may support one; judged on photographs
+NUM_NEIGHBORS = 8
 MIN_SUPPORTING = 2
 """Neighbours that must support a match in both images; judged: one supports some wrong matches,
 two hardly any."""
@@ -21,9 +20,8 @@ MAX_RELATIVE_ERROR = 0.5
 MIN_DISTANCE_PX = 4.0
 """Distance of a neighbour in both images. Nearer matches are of the same point, in several
 orientations or warps; judged."""
-CHUNK_ROWS = (
-    512  # matches that are compared with all others at a time, which bounds memory
-)
+# Matches that are compared with all others at a time, which bounds memory
+CHUNK_ROWS = 512
 
 
 def num_consistent_matches(lafs1: Floats, lafs2: Floats) -> int:

@@ -16,30 +16,24 @@ Size = tuple[int, int]
 FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
 """Focal lengths that are tried for a rotated camera, in units of the longer side. From ten on a
 rotation is a shift of the image."""
-MAX_NUM_POINTS = (
-    500  # measure a ratio to two per cent (theory: binomial standard deviation)
-)
-MIN_DEPTH = (
-    1e-3  # of a rotated ray of length 1; what is behind lands far outside of the image
-)
+# Measure a ratio to two per cent (theory: binomial standard deviation)
+MAX_NUM_POINTS = 500
+# Of a rotated ray of length 1; what is behind lands far outside of the image
+MIN_DEPTH = 1e-3
 NUM_STARTS = 30  # rotations of two matches each; least squares begin with the best one
 MAX_ITERATIONS = 3  # least squares are repeated without outliers
 
-TEXT_ERROR_FRAC = (
-    0.001  # error of a match of print, in units of the longer side; judged
-)
-TEXT_HEIGHT_FRAC = (
-    0.015  # height of a line of small print, in units of the longer side; judged
-)
-MAX_TEXT_SLOPE = (
-    0.087  # sine of the angle of a line of text to a side of the image, five degrees
-)
+# Error of a match of print, in units of the longer side; judged
+TEXT_ERROR_FRAC = 0.001
+# Height of a line of small print, in units of the longer side; judged
+TEXT_HEIGHT_FRAC = 0.015
+# Sine of the angle of a line of text to a side of the image, five degrees
+MAX_TEXT_SLOPE = 0.087
 MAX_NUM_TRIALS = 300  # of RANSAC: enough for a set that one in eight matches is in
 
 MIN_SAME_VIEW_RATIO = 0.85  # matches of copies that a change of scale explains; judged
-SAME_VIEW_ERROR_FRAC = (
-    0.01  # their error, in units of the longer side: paper is not flat; judged
-)
+# Their error, in units of the longer side: paper is not flat; judged
+SAME_VIEW_ERROR_FRAC = 0.01
 
 COMPARED_SIZE_PX = 400  # longer side of images whose windows are correlated
 WINDOW_PX = 11  # side of the windows

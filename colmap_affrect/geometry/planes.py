@@ -20,9 +20,8 @@ MIN_WEIGHT_FRAC = 0.5
 """Share of the window's weight that known neighbours need; a mere line has 0.499 of it."""
 MAX_SLANT_COS = np.cos(np.deg2rad(85.0))
 """Cosine of the largest viewing angle of a plane; steeper neighbours are on another surface."""
-SPIRAL_STEP = (
-    3.6  # distance of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars 1997)
-)
+# Distance of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars 1997)
+SPIRAL_STEP = 3.6
 
 
 def shrink_depth(depth: Floats, max_size_px: int) -> tuple[Floats, Array]:

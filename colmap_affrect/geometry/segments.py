@@ -15,9 +15,8 @@ from colmap_affrect.geometry.conventions import HALF_PIXEL
 MAX_NUM_SEGMENTS = 160  # the longest are looked at
 ANGLE_SIGMA = 0.008  # rad, of a segment's direction: lenses distort, and walls are not quite plumb
 END_SIGMA = 0.0008  # longer sides, of the ends of a segment: about one px
-SAME_LINE_DISTANCE = (
-    0.012  # longer sides; closer parallel segments are of one cornice or frame
-)
+# Longer sides; closer parallel segments are of one cornice or frame
+SAME_LINE_DISTANCE = 0.012
 SAME_LINE_ANGLE = 0.05  # rad
 
 

@@ -22,9 +22,8 @@ keypoints are badly localized."""
 MAX_COMPARED = 300  # motions that are compared with each other, which bounds time
 MAX_SLOPE = 0.5
 """Difference of the motions of two points of one object, as a share of their distance; judged."""
-MAX_FITS = (
-    3  # of a rotation to the motions that agree, each of which may make more agree
-)
+# Of a rotation to the motions that agree, each of which may make more agree
+MAX_FITS = 3
 
 
 def stationary_log_ratios(

@@ -21,18 +21,16 @@ from numpy.typing import ArrayLike, NDArray
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
 
-STEP_PX = (
-    4  # dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
-)
+# Dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
+STEP_PX = 4
 MAX_TANH = 0.999  # where logarithms of metrics are cut off: a tilt of 45
 SMALLEST_NORM = 1e-12  # of deviators that are divided by their norm
 SMALLEST_LOG = 1e-9  # below it sinh(x) / x is 1 in float64
 MIN_DISTINCT_RATIO = 0.5
 """Shapes that differ, as a share of all, where they were measured one by one: then nearly all do;
 judged."""
-SHAPE_STEP = (
-    1e-4  # shapes of unit area that are this close are equal; float32 rounding is less
-)
+# Shapes of unit area that are this close are equal; float32 rounding is less
+SHAPE_STEP = 1e-4
 GRID_TILTS = np.geomspace(
     2.0, 6.21970, 6
 )  # candidates for 1.7-balls up to tilt 5.8 (the paper)

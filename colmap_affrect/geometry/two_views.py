@@ -20,9 +20,8 @@ NUM_PLANE_PARAMETERS = 3
 MAX_PLANE_ERROR = 0.04
 """Relative standard deviation of a predicted inverse depth, and of those a plane is fitted to;
 half of ``MAX_LOG_DIFFERENCE``."""
-PLANE_DAMPING = (
-    1e-9  # added to normal equations, which twelve points on a line leave singular
-)
+# Added to normal equations, which twelve points on a line leave singular
+PLANE_DAMPING = 1e-9
 NUM_INDEPENDENT = 10
 """Ratios that make the scale more certain, at most: all share the errors of the same poses;
 judged."""

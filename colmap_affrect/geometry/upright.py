@@ -10,9 +10,8 @@ MAX_ANGLE = math.radians(4.0)  # between the uprights of two photographs that ag
 MIN_NUM_AGREEING = 2  # photographs
 MIN_SHARE = 0.5  # of those that say something; more than so many must agree
 MAX_LEAN = math.radians(45.0)  # of the upright from how cameras are held on average
-MIN_COMMON = (
-    0.3  # length of the mean upright of cameras, below which they are held in all ways
-)
+# Length of the mean upright of cameras, below which they are held in all ways
+MIN_COMMON = 0.3
 
 
 def agreed_up(directions: Floats, held: Floats) -> tuple[Floats, Bools] | None:

@@ -30,9 +30,8 @@ SUFFIXES = (
 )  # in the order in which they are looked for
 MAX_NUM_VALUES = 1 << 27  # of a map; more is taken for damage
 PNG_STEP = 0.001  # depth of one step of 16 bits; only the ratio of depths matters
-MAX_ASPECT_RATIO = (
-    1.05  # of aspects of map and photograph: networks round sizes to 32 px
-)
+# Of aspects of map and photograph: networks round sizes to 32 px
+MAX_ASPECT_RATIO = 1.05
 MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
 
 

@@ -15,9 +15,8 @@ from PIL import ExifTags
 
 from colmap_affrect.images.reading import opened, read_header, stored_size
 
-FILM_DIAGONAL_MM = (
-    43.27  # of 35 mm film, to which equivalents refer (by COLMAP's rounding)
-)
+# Of 35 mm film, to which equivalents refer (by COLMAP's rounding)
+FILM_DIAGONAL_MM = 43.27
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """By EXIF's number of the unit of focal-plane resolutions: inches, cm, and, as COLMAP reads them,
 mm and micrometres."""
@@ -25,18 +24,16 @@ PLAUSIBLE_FOCALS = (
     0.3,
     6.0,
 )  # in longer sides: 118 to 10 degrees, which hold nearly all lenses
-MAX_CONTRADICTION = (
-    1.15  # ratio of focal lengths that still agree: equivalents are rounded
-)
+# Ratio of focal lengths that still agree: equivalents are rounded
+MAX_CONTRADICTION = 1.15
 MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
 SENSOR_ASPECTS = (
     3 / 2,
     4 / 3,
     16 / 9,
 )  # photographs of another shape may have been cropped
-MAX_THUMBNAIL_PX = (
-    160  # longer side of the thumbnails of cameras, often with black bars
-)
+# Longer side of the thumbnails of cameras, often with black bars
+MAX_THUMBNAIL_PX = 160
 RESOLUTION = "focal-plane resolution"
 EQUIVALENT = "35 mm equivalent"
 SENSOR = "known sensor"
@@ -50,15 +47,12 @@ class CameraTags:
     body: tuple[str, str, str] = ("", "", "")  # make, model and serial number
     lens: str = ""  # model of the lens
     focal_mm: float | None = None  # focal length
-    equivalent_mm: float | None = (
-        None  # of a camera with 35 mm film and the same field of view
-    )
-    px_per_mm: tuple[float, float | None] | None = (
-        None  # focal-plane resolution, x and perhaps y
-    )
-    original_size: tuple[int, int] | None = (
-        None  # (width, height) when EXIF was written
-    )
+    # Of a camera with 35 mm film and the same field of view
+    equivalent_mm: float | None = None
+    # Focal-plane resolution, x and perhaps y
+    px_per_mm: tuple[float, float | None] | None = None
+    # (width, height) when EXIF was written
+    original_size: tuple[int, int] | None = None
     zoom: float = 1.0  # of the part of the sensor that was enlarged; 1 without
 
     @property
@@ -102,12 +96,10 @@ class ExifFocal:
     )  # of the stored file; None if EXIF does not say or cannot be trusted
     is_rescaled: bool = False  # it is not the one that COLMAP would take
     why: str = ""  # what is wrong; empty if nothing
-    lens_mm: float = (
-        0.0  # focal length of the lens, where nothing tells how large the sensor is
-    )
-    uncropped_px: float = (
-        0.0  # of the whole photograph that this is a crop of, if EXIF says it
-    )
+    # Focal length of the lens, where nothing tells how large the sensor is
+    lens_mm: float = 0.0
+    # Of the whole photograph that this is a crop of, if EXIF says it
+    uncropped_px: float = 0.0
 
 
 def read_camera_tags(path: Path) -> CameraTags | None:

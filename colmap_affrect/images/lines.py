@@ -12,13 +12,11 @@ from colmap_affrect.geometry.lines import Lines, measure_lines
 from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.images.reading import shrink_to
 
-MAX_SIZE_PX = (
-    1024  # longest side that photographs are shrunk to: lines stay, and grain goes
-)
+# Longest side that photographs are shrunk to: lines stay, and grain goes
+MAX_SIZE_PX = 1024
 MIN_LENGTH = 0.02  # longer sides
-BORDER = (
-    0.025  # longer sides; segments along the image's border and closer are of its frame
-)
+# Longer sides; segments along the image's border and closer are of its frame
+BORDER = 0.025
 ALONG = 0.05  # rad, of a segment that runs along the border
 
 

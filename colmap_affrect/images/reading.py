@@ -258,23 +258,19 @@ TONE_PERCENTILES = (
     0.5,
     99.5,
 )  # black and white of a stretched photograph but for dust and glints
-MIN_TONE_RANGE = (
-    0.5  # a photograph whose tones fill less of the range of its file is stretched
-)
-MAX_TONE_STEP = (
-    16  # neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
-)
+# A photograph whose tones fill less of the range of its file is stretched
+MIN_TONE_RANGE = 0.5
+# Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
+MAX_TONE_STEP = 16
 FLOAT_RANGE = (
     -0.5,
     2.0,
 )  # of floats that are meant from 0 to 1: filters and highlights go beyond
 NUM_TONES = 250_000  # about so many pixels are looked at
-FRAME_FRAC = (
-    0.1  # along each border is passed over: scans have frames and captions there
-)
-BIG_TIFF = (
-    43  # what files of more than 4 GiB have in the place of 42, with offsets of 64 bits
-)
+# Along each border is passed over: scans have frames and captions there
+FRAME_FRAC = 0.1
+# What files of more than 4 GiB have in the place of 42, with offsets of 64 bits
+BIG_TIFF = 43
 GRAY_AS_STORED = (
     cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 )

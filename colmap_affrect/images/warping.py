@@ -12,13 +12,11 @@ from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.geometry.conventions import is_inside
 
-ANTI_ALIASING_SIGMA = (
-    0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
-)
+# Px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
+ANTI_ALIASING_SIGMA = 0.8
 TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression
-SAMPLES_PER_TILE = (
-    5  # points along a side of a tile at which its compression is measured
-)
+# Points along a side of a tile at which its compression is measured
+SAMPLES_PER_TILE = 5
 MAX_DENSITY = 16  # samples per px of a warp along an axis; beyond, memory counts more than aliasing
 
 

@@ -36,9 +36,8 @@ from colmap_affrect.project.tables import read_table
 GEOREFERENCE = (
     "georeference.json"  # beside a model: what COLMAP's files have no place for
 )
-MIN_WIDTH = (
-    0.01  # of known places across the line that fits them best, in units of its length
-)
+# Of known places across the line that fits them best, in units of its length
+MIN_WIDTH = 0.01
 METRIC = ("x", "y", "z")
 ON_EARTH = ("latitude", "longitude", "altitude")
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)

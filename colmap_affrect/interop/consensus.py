@@ -10,12 +10,10 @@ from colmap_affrect.geometry.arrays import Array, Bools
 
 MAX_NUM_TRIPLES = 500  # similarities that are tried, each by three places
 GROSS = 5.0  # times the median residual: beyond is no error of measuring any more
-SMALL_SAMPLE = (
-    5.0  # few places fit too well by chance, of which the median says too little
-)
-FAR_BEYOND = (
-    10.0  # times how far three places spread is the fourth, if these alone tell it
-)
+# Few places fit too well by chance, of which the median says too little
+SMALL_SAMPLE = 5.0
+# Times how far three places spread is the fourth, if these alone tell it
+FAR_BEYOND = 10.0
 
 
 def residuals(new_from_old: pycolmap.Sim3d, before: Array, after: Array) -> Array:

@@ -31,23 +31,20 @@ NOISE_PX = 0.7  # standard deviation of keypoints, judged on the benchmark scene
 FAST = 15  # iterations while a model grows
 MEDIUM = 50  # iterations before models are compared
 FINAL = 300  # iterations of models that are kept
-FAST_TOLERANCE = (
-    1e-5  # relative change of the cost at which Ceres ends a fast adjustment
-)
+# Relative change of the cost at which Ceres ends a fast adjustment
+FAST_TOLERANCE = 1e-5
 TOLERANCE = 1e-7  # the same of all others
 DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one (measured)
 MIN_LONG_TRACKS = 100
 """Tracks of three images that every image needs before tracks of two are left out (judged)."""
-TIE_POINT_LOSS_SCALE = (
-    4.0  # in deviations of keypoints: tie points pull from farther away
-)
+# In deviations of keypoints: tie points pull from farther away
+TIE_POINT_LOSS_SCALE = 4.0
 
 # When a trial adjustment ends early. Judged: this changes the growth of the cost by less than
 # three times as many iterations do, four per cent.
 FIRST_STEPS = 3  # of an adjustment, which say nothing of those that follow
-SMALL_STEP = (
-    0.001  # part of the excess over the other cost, below which a step is small
-)
+# Part of the excess over the other cost, below which a step is small
+SMALL_STEP = 0.001
 NUM_SMALL = 3  # small steps in a row that end an adjustment
 
 

@@ -63,9 +63,8 @@ class MappingTask:
     extend: ExistingModel | None = None  # register images into this model
     # models from before pairs were matched again, the best first: mappers may begin with them
     previous_models: Sequence[MappedModel] = ()
-    snapshot_path: Path | None = (
-        None  # of snapshots to go on from; mappers may leave it unused
-    )
+    # Of snapshots to go on from; mappers may leave it unused
+    snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None  # stops mapping from outside
     # pairs of image names that only affine frames verify which were not measured one by one
     unmeasured_pairs: frozenset[tuple[str, str]] = frozenset()
@@ -75,9 +74,8 @@ class MappingTask:
     # what the straight lines of images say of their cameras, by image name; runs leave it empty,
     # as far as it is not measured that models of stored lines (FeatureStore.lines) are better
     lines: Mapping[str, LineCamera] = field(default_factory=dict)
-    may_share: bool = (
-        False  # images of one size may turn out to share an uncalibrated camera
-    )
+    # Images of one size may turn out to share an uncalibrated camera
+    may_share: bool = False
     # keypoints of the tie points, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 

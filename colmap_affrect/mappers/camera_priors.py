@@ -36,16 +36,14 @@ LYING_LINES = 0.1  # share of photographs whose lines say something else than th
 CROP_SIGMA = 0.2
 """Of the logarithm of the focal length of a crop, around that of the whole photograph in px: some
 crops were enlarged or shrunk, too (judged)."""
-DISTORTION_SIGMA = (
-    0.07  # of each distortion coefficient, judged on lenses that are no fisheyes
-)
+# Of each distortion coefficient, judged on lenses that are no fisheyes
+DISTORTION_SIGMA = 0.07
 SHIFTED_SHARE = 0.2  # of the photographs of which nothing is known (judged)
 NO_SHARE = 1e-9  # of measurements that are false
 WIDE_SIGMA = 1.0  # of the logarithm of a focal length of which nothing is expected
 MIN_FOCAL_PX = 1e-9  # whose logarithm is taken
-MAX_DEVIATIONS = (
-    2.5  # by which EXIF and lines may differ before they contradict each other
-)
+# By which EXIF and lines may differ before they contradict each other
+MAX_DEVIATIONS = 2.5
 ZOOMS = 1.0, 1.4, 0.7, 2.0
 """Factors of the usual focal length near which unknown ones begin (judged): all lenses from wide to
 long are within a fifth of one of them. Where lines tell more, starts are nearer to each other."""

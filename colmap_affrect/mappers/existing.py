@@ -80,9 +80,8 @@ class ExistingModel:
 
     def constrain(self, native: pycolmap.IncrementalPipelineOptions) -> None:
         """Have pycolmap's mapper keep poses, cameras and rigs, unless they may move."""
-        native.load_all_images = (
-            True  # also those of the model that no match ties to others
-        )
+        # Also those of the model that no match ties to others
+        native.load_all_images = True
         if self.refine:
             return
         native.fix_existing_frames = True

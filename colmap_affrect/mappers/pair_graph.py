@@ -44,9 +44,8 @@ MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
 MAX_MATCHES = 500  # inliers of a pair that are sampled for agreement and relative poses
 MAX_TRIALS = 1000  # of RANSAC, for a relative pose
-MAX_PAIRS_OF_IMAGE = (
-    15  # the strongest of each image that models are scored by (judged)
-)
+# The strongest of each image that models are scored by (judged)
+MAX_PAIRS_OF_IMAGE = 15
 MIN_NUM_MATCHES = 15  # inliers of a pair; COLMAP's min_num_matches
 MIN_SHARE = 0.5  # of the inliers of a pair: fewer that agree contradict poses
 

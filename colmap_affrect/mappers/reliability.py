@@ -19,26 +19,21 @@ from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, fea
 from colmap_affrect.project.reasons import Doubt
 
 # Shapes of the terms, judged where the share of right photographs no longer changes.
-LOG_RATIO_SCALE = (
-    3.0  # log-likelihood ratio, from which on more counts by its logarithm only
-)
+# Log-likelihood ratio, from which on more counts by its logarithm only
+LOG_RATIO_SCALE = 3.0
 MAX_THREE_VIEW_POINTS = 300  # more points make no photograph surer
-USUAL_ROTATION_RATIO = (
-    0.5  # share of matches that a rotation may explain from any two positions
-)
-MAX_LOG_SPREAD = (
-    0.5  # of focal lengths: farther apart they are no surer parts of others
-)
+# Share of matches that a rotation may explain from any two positions
+USUAL_ROTATION_RATIO = 0.5
+# Of focal lengths: farther apart they are no surer parts of others
+MAX_LOG_SPREAD = 0.5
 # A bridge edge between two components may be of two scenes, found by chance among all pairs.
 CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (judged)
-CHANCE_SCALE = (
-    10.0  # inliers more that make the former less likely by a factor of e (judged)
-)
+# Inliers more that make the former less likely by a factor of e (judged)
+CHANCE_SCALE = 10.0
 MAX_ERROR_DEG = 5.0  # of poses that count as right, in BENCHMARKS and in the fit
 MIN_SIGMA_DEG = 1e-3  # of directions; they are divided by
-MIN_LOSS = (
-    0.7  # of the log odds: what takes less, half of the odds, is no reason to doubt
-)
+# Of the log odds: what takes less, half of the odds, is no reason to doubt
+MIN_LOSS = 0.7
 NUM_REASONS = 2  # that are said of a photograph
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")

@@ -18,9 +18,8 @@ logger = logging.getLogger(__name__)
 SNAPSHOT_FRAMES = 100
 """Images between two snapshots. A model of so many images is kept whatever comes after it, so that
 mapping can go on from a snapshot of it."""
-NUM_KEPT = (
-    2  # a snapshot may be incomplete when a run is killed; the one before is complete
-)
+# A snapshot may be incomplete when a run is killed; the one before is complete
+NUM_KEPT = 2
 
 
 @contextmanager

@@ -93,9 +93,8 @@ class SparseMapper(IncrementalMapper):
         is_small = len(graph.keypoints) < LARGE and not task.extend
         if is_small:
             if FORWARD_MOTION not in self.options.mapper_options:
-                native.mapper.init_max_forward_motion = (
-                    1.0  # the score decides on such pairs
-                )
+                # The score decides on such pairs
+                native.mapper.init_max_forward_motion = 1.0
             return self._map_small(task, graph, native, output_path, show_or_stop)
         search = self._search(task, graph, native, show_or_stop)
         search = replace(search, num_starts=1)

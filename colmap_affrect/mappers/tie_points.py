@@ -22,9 +22,8 @@ AGREEING_PX = 4.0 * SIGMA_PX  # residuals up to which a tie point agrees with a 
 # Shares of tie points that agree (judged).
 AGREES_IF_RIGHT = 0.9  # with right poses: some marks are wrong
 AGREES_BY_CHANCE = 0.05  # with wrong poses
-MIN_NUM_POINTS = (
-    4  # that must agree to register an image: three always do, the others are the test
-)
+# That must agree to register an image: three always do, the others are the test
+MIN_NUM_POINTS = 4
 MAX_LOG_ODDS = 2.5
 """Of an image by its tie points. Measured: of images that six tie points alone register, twelve of
 thirteen are right."""
@@ -32,9 +31,8 @@ NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P)
 # A tie point that one image alone sees has the median depth of the points near its mark (judged).
 NEIGHBOR_RADIUS = 0.1  # of the longer side of the image
 NUM_NEIGHBORS = 5
-MAX_NUM_OBSERVED = (
-    2_000  # of an image, among which neighbours are looked for, to save time
-)
+# Of an image, among which neighbours are looked for, to save time
+MAX_NUM_OBSERVED = 2_000
 
 
 class ImageResidual(NamedTuple):

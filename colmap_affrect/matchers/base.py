@@ -38,9 +38,8 @@ class MatcherContext(NetworkContext):
     """What a matcher works with, beside its options."""
 
     device: str = "auto"  # as given by the user
-    num_comparisons: float = (
-        0.0  # about how many pairs of features will be compared in all
-    )
+    # About how many pairs of features will be compared in all
+    num_comparisons: float = 0.0
 
 
 @dataclass(frozen=True)

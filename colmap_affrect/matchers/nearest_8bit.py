@@ -18,9 +18,8 @@ from colmap_affrect.geometry.arrays import Bools, Bytes, Indices, Singles
 from colmap_affrect.geometry.neighbors import NeighborLists
 from colmap_affrect.parallel.executor import available_cores, one_openmp_thread
 
-MIN_COMPARISONS_PER_CORE = (
-    6e8  # with fewer, loading torch takes longer than it saves (measured)
-)
+# With fewer, loading torch takes longer than it saves (measured)
+MIN_COMPARISONS_PER_CORE = 6e8
 ERROR_SIGMAS = 6.0  # of the rounding error, allowed for on each side
 MAX_CODE = 127  # largest signed code
 ZERO_CODE = 128  # signed code 0 as an unsigned one

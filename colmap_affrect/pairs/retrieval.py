@@ -18,9 +18,8 @@ from colmap_affrect.pairs.lists import Pair, most_similar_pairs
 from colmap_affrect.progress import Progress
 
 NUM_WORDS = 256
-NUM_SAMPLED_IMAGES = (
-    512  # the vocabulary of larger sets is built from that many of their images
-)
+# The vocabulary of larger sets is built from that many of their images
+NUM_SAMPLED_IMAGES = 512
 NUM_SAMPLES = 1 << 15  # descriptors that the vocabulary is built from
 NUM_ITERATIONS = 10
 VECTORS_AT_ONCE = 512  # compared with as many others at a time, which bounds memory

@@ -37,9 +37,8 @@ CONNECT_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 5.0
 POLL_S = 1.0  # that a result is waited for before somebody looks whether the cluster is there
 TRANSFER_S = 60.0  # that a finished result may take to come here
-TASKS_PER_THREAD = (
-    2  # one that is being worked on and one that waits, so that no worker has to
-)
+# One that is being worked on and one that waits, so that no worker has to
+TASKS_PER_THREAD = 2
 PACKAGES = (
     "colmap-affrect",
     "distributed",

@@ -58,9 +58,8 @@ CONTRADICTED: Mapping[str, tuple[Sequence[str], str, str]] = {
 }
 """What may be wrong of a camera: its sources, where its number is from, and what helps. What the
 user gives is usually held; that of a database only has a prior."""
-MAX_EXIF_ERROR = (
-    1.27  # of a focal length: three standard deviations of what EXIF usually has
-)
+# Of a focal length: three standard deviations of what EXIF usually has
+MAX_EXIF_ERROR = 1.27
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
 REPORTED_PACKAGES = (

@@ -58,9 +58,8 @@ class PairMatches:
     indices: Indices  # (M, 2) int64, strictly rising in column 0
     scores: Singles  # (M,) float32 in [0, 1], larger is better
     num_keypoints1: int  # number of features of the first image
-    level: int = (
-        0  # of escalation, whose features were looked at together with those of level 0
-    )
+    # Of escalation, whose features were looked at together with those of level 0
+    level: int = 0
     of_some: bool = False  # only of the features with the largest responses
 
 

@@ -80,9 +80,8 @@ class Workspace:
         self.cameras = (
             path / "cameras.json"
         )  # what is known of the database's, and from where
-        self.is_changed = (
-            False  # the database, by another program, and is to be mapped so
-        )
+        # The database, by another program, and is to be mapped so
+        self.is_changed = False
         self._record: dict[str, Any] | None = None
 
     @classmethod

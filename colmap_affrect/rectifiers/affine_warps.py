@@ -24,9 +24,8 @@ from colmap_affrect.rectifiers import base
 from colmap_affrect.rectifiers.regions import Region
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
-GAP_BLOCKS = (
-    5  # parts of a region that are closer than this are warped together; judged
-)
+# Parts of a region that are closer than this are warped together; judged
+GAP_BLOCKS = 5
 
 
 class IdentityOptions(base.RectifierOptions):

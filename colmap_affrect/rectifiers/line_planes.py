@@ -27,9 +27,8 @@ from colmap_affrect.rectifiers.regions import homography_rectification
 
 MAP_SIZE_PX = 160  # longer side of the maps of where segments lie
 REACH = 0.04  # longer sides; a segment tells of a plane about so far around it
-MIN_DENSITY = (
-    0.3  # of segments, in units of a single long one that runs through the place
-)
+# Of segments, in units of a single long one that runs through the place
+MIN_DENSITY = 0.3
 PAIRS = tuple(itertools.combinations(range(3), 2))  # of directions, which span a plane
 
 

@@ -38,9 +38,8 @@ class Page:
     image_path: Path | None  # their folder; without it there are no thumbnails
     views: Sequence[View3D]  # models, which the script draws
     inlier_matrix: str = ""  # base64: (N, N) uint16 numbers of inliers
-    tie_points: Mapping[str, Any] | None = (
-        None  # what the tool for tie points begins with
-    )
+    # What the tool for tie points begins with
+    tie_points: Mapping[str, Any] | None = None
     can_mark: bool = False  # whether the page has that tool
 
 

@@ -12,9 +12,8 @@ from colmap_affrect.project.stores import GuidedPair
 
 MAX_NUM_PAIRS = 12  # in a page; more nobody looks at
 MAX_NUM_ORDINARY = 3  # pairs of each sort that nothing speaks against
-MIN_AGREEMENT = (
-    0.5  # share of the inliers; a model contradicts a pair where most disagree
-)
+# Share of the inliers; a model contradicts a pair where most disagree
+MIN_AGREEMENT = 0.5
 
 
 class Reason(Enum):

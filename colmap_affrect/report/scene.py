@@ -17,24 +17,18 @@ from colmap_affrect.report.upright import upright_of_run
 
 # What is in the view, and how it is drawn, was chosen by eye.
 MAX_NUM_POINTS = 20_000  # that are drawn of a model; a page stays below some MB
-POINT_PERCENTILE = (
-    90.0  # share of the points, by distance from their median, that is in the view
-)
-RADIUS_MARGIN = (
-    1.15  # radius of the view per distance of the farthest camera or point from it
-)
-MIN_COMMON_UP = (
-    1e-6  # length of the mean up vector that gives one; cameras held in all ways: none
-)
-CAMERA_DEPTH = (
-    0.07  # depth of the pyramids that stand for cameras, in radii of the view
-)
-MAX_HALF_WIDTH = (
-    0.8  # half width of a pyramid per depth; wider cameras would hide the model
-)
-DARKEST = (
-    60  # gray value of black points: colours have to show on light and on dark ground
-)
+# Share of the points, by distance from their median, that is in the view
+POINT_PERCENTILE = 90.0
+# Radius of the view per distance of the farthest camera or point from it
+RADIUS_MARGIN = 1.15
+# Length of the mean up vector that gives one; cameras held in all ways: none
+MIN_COMMON_UP = 1e-6
+# Depth of the pyramids that stand for cameras, in radii of the view
+CAMERA_DEPTH = 0.07
+# Half width of a pyramid per depth; wider cameras would hide the model
+MAX_HALF_WIDTH = 0.8
+# Gray value of black points: colours have to show on light and on dark ground
+DARKEST = 60
 COLOR_RANGE = 140  # gray value of white points less that of black ones
 NO_COLOR = 128  # gray value of all points of a model without colours
 

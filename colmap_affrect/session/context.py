@@ -259,9 +259,8 @@ class Context:
 
     workspace: Workspace  # the output folder
     resources: Resources = field(default_factory=Resources)  # weights and device
-    executor: Executor | None = (
-        None  # for images and pairs, e.g. a cluster; None: threads here
-    )
+    # For images and pairs, e.g. a cluster; None: threads here
+    executor: Executor | None = None
     progress: Progress = SILENT  # where to show progress
     deadline_s: float = (
         math.inf

@@ -50,16 +50,14 @@ from colmap_affrect.stages.stationary import StationaryFilter
 logger = logging.getLogger(__name__)
 
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
-MANY_MATCHES = (
-    300  # of the features matched first: photographs of different things have up to 76
-)
+# Of the features matched first: photographs of different things have up to 76
+MANY_MATCHES = 300
 NUM_TRIED = 40  # pairs matched by all features before many are
 MIN_GROWTH = 1.1  # of the matches that confirm each other, by all features; small scans have none
 NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
-BYTES_PER_FEATURE = (
-    870  # of a feature ready for matching, with descriptors of 128 and coarse ones
-)
+# Of a feature ready for matching, with descriptors of 128 and coarse ones
+BYTES_PER_FEATURE = 870
 
 Found = TypeVar("Found")
 
@@ -303,9 +301,8 @@ class Matching:
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     max_num_features: int = 0  # of each image, those of the largest responses; 0: all
-    num_comparisons: float = (
-        0  # about how many pairs of features there will be to compare
-    )
+    # About how many pairs of features there will be to compare
+    num_comparisons: float = 0
     num_kept: int = USUAL_IMAGES_IN_MEMORY
 
 

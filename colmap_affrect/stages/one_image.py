@@ -71,9 +71,8 @@ class ImageTask:
     photographs: Photographs  # where it and its masks are
     name: str  # of the photograph
     level: int = 0  # of escalation: above 0 only the features that its rectifier adds
-    intrinsics: Array | None = (
-        None  # (3, 3) in pixel-centre px as stored; None: COLMAP's guess
-    )
+    # (3, 3) in pixel-centre px as stored; None: COLMAP's guess
+    intrinsics: Array | None = None
     camera_size: tuple[int, int] | None = None  # (width, height) of its camera, if any
 
 

@@ -28,9 +28,8 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
-MAX_MOTION_FRAC = (
-    0.005  # of the longer side; less is no motion: scans are not cut to the pixel
-)
+# Of the longer side; less is no motion: scans are not cut to the pixel
+MAX_MOTION_FRAC = 0.005
 NUM_CELLS = 48  # cells along the longer side
 MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
@@ -42,12 +41,10 @@ MIN_FRAC = 0.001
 shrunk before features are found in them."""
 CONNECTED = 1  # cells by which those are grown that are looked at together
 MIN_EVIDENCE = 3.0  # nats, twenty to one, that a place stands still to the pixel
-MAX_SHARE_OF_PHOTOGRAPH = (
-    0.5  # where more of what is matched never moves, the camera stands still
-)
-MIN_MOVING = (
-    15  # matches of a pair that move together elsewhere, which may make a model
-)
+# Where more of what is matched never moves, the camera stands still
+MAX_SHARE_OF_PHOTOGRAPH = 0.5
+# Matches of a pair that move together elsewhere, which may make a model
+MIN_MOVING = 15
 MAX_SHARE_BESIDE = 0.2
 """Of all cells. Matches from beside one place to beside another, or from one to another, are left
 out only where these cells are so few: one in 25 of the scene's goes with them then, and of a
