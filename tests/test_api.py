@@ -364,6 +364,7 @@ def test_a_report_without_models_says_why_there_is_no_reconstruction(
     assert "no pair of images is verified" in Text(report._repr_html_()).words[0]
 
 
+@pytest.mark.long
 def test_stage_by_stage_makes_the_model_of_a_run(photos: Path, tmp_path: Path) -> None:
     recipe = "unrectified-rootsift"
     folder = tmp_path / "stages"

@@ -9,12 +9,12 @@ stays true; EXIF is gone. Usage:
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
+from machine import parser_of
 from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]
@@ -62,13 +62,16 @@ LOOKS: tuple[Callable[[Picture, np.random.Generator], Picture], ...] = (
 
 def main() -> None:
     """Change all photographs of a folder."""
-    source, target = map(Path, sys.argv[1:3])
+    parser = parser_of(__doc__)
+    parser.add_argument("source", type=Path, help="folder of the photographs")
+    parser.add_argument("target", type=Path, help="folder for the changed ones")
+    arguments = parser.parse_args()
+    target = arguments.target
     target.mkdir(parents=True, exist_ok=True)
-    for number, path in enumerate(sorted(source.iterdir())):
+    for number, path in enumerate(sorted(arguments.source.iterdir())):
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        turn = number + number // len(
-            LOOKS
-        )  # every second photograph has all looks, too
+        # Every second photograph has all looks, too.
+        turn = number + number // len(LOOKS)
         look = LOOKS[turn % len(LOOKS)]
         changed = look(picture, np.random.default_rng(number))
         cv2.imwrite(

@@ -470,6 +470,7 @@ def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:
     assert (done.code, done.stdout) == (0, "rectified: no weights are needed\n")
 
 
+@pytest.mark.long
 def test_what_is_printed_may_end_early() -> None:
     command = f"{sys.executable} -m colmap_affrect recipes on-demand | head -n 1"
     done = subprocess.run(

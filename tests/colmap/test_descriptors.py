@@ -56,6 +56,7 @@ def colmap_matches(path: Path) -> Matches:
         return {(int(i), int(j)) for i, j in database.read_matches(1, 2)}
 
 
+@pytest.mark.long
 def test_colmap_matches_what_float_descriptors_match(tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", 2)
     colmap_affrect.extract_features(tmp_path / "a.db", tmp_path / "photos")

@@ -31,6 +31,8 @@ from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.progress import SILENT
 from colmap_affrect.session.context import Resources
 
+pytestmark = pytest.mark.long
+
 CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
 NUM_IMAGES = 3
 GIVEN = (*NAMES[:NUM_IMAGES], "broken.png")
@@ -242,7 +244,6 @@ def test_fewer_than_two_images_are_refused(tmp_path) -> None:
     assert "none of the 2 images can be used" in recipe.failed
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("no_page")
 def test_all_methods_take_the_cameras_of_a_database(scene, compared, tmp_path) -> None:
     database = tmp_path / "given.db"
@@ -307,7 +308,6 @@ def killed(scene: Path, tmp_path: Path) -> Iterator[Path]:
     return out
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("no_page")
 def test_killed_comparison_goes_on_and_ends_as_an_undisturbed_one(
     scene, options, compared, killed
@@ -318,7 +318,6 @@ def test_killed_comparison_goes_on_and_ends_as_an_undisturbed_one(
     assert replace(method.seeds[0], wall_s={}) == replace(expected.seeds[0], wall_s={})
 
 
-@pytest.mark.long
 def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) -> None:
     """The methods are finished there: it only prints."""
     ended = run_in_process_of_its_own(
@@ -377,7 +376,6 @@ def test_colmaps_sift_has_the_masks_of_alpha_channels(tmp_path: Path) -> None:
         assert read_mask(Path(folder) / "whole.png.png").all()
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("no_page")
 def test_first_seed_of_a_recipe_with_levels_has_the_models_of_escalation(
     scene: Path, tmp_path: Path

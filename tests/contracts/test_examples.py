@@ -239,6 +239,7 @@ def test_new_extractor_and_matcher_are_chosen_by_name(tmp_path: Path) -> None:
     assert right.mean() > 0.8
 
 
+@pytest.mark.long
 def test_new_mapper_is_chosen_by_name(photos: Path, tmp_path: Path) -> None:
     options = RunOptions(
         recipe=load_recipe("unrectified-rootsift"), mapping=MAPPERS.options("plain")

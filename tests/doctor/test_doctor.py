@@ -185,6 +185,7 @@ def test_model_of_another_program_is_examined(tmp_path: Path, folders: Folders) 
     assert "camera 1 has no size, or no finite and positive focal length" in found.what
 
 
+@pytest.mark.long
 def test_folder_in_use_is_left_alone(folders: Folders) -> None:
     (folders.out / "features.h5").unlink()
     with Workspace(folders.out).locked():

@@ -34,6 +34,8 @@ from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.stages import verify as verification
 from colmap_affrect.stages.verify import extracted_px
 
+pytestmark = pytest.mark.long
+
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images"
 NAMES = ["view_1_tilt00.jpg", "view_2_tilt30.jpg", "view_6_tilt75.jpg"]
 EASY = (NAMES[0], NAMES[1])
@@ -190,7 +192,6 @@ strong_num_inliers = 1000000
 """
 
 
-@pytest.mark.long
 def test_levels_with_features_and_matching_of_their_own(
     photos: Path, tmp_path: Path
 ) -> None:
@@ -284,7 +285,6 @@ def test_photographs_that_are_likely_right_in_another_model_need_a_quarter(
     assert work.state.weights(models) == {EASY[0]: 0.25, EASY[1]: 0.25, NAMES[2]: 1.0}
 
 
-@pytest.mark.long
 def test_each_step_has_a_bar_that_ends_full(before: Workspace, tmp_path: Path) -> None:
     workspace = copy_of(before, tmp_path)
     shown = io.StringIO()
@@ -373,7 +373,6 @@ def killed_after(patch: pytest.MonkeyPatch, path: Path, number: int) -> None:
     patch.setattr(FileTransaction, "commit", killed)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "when", ["update_verified", "write_matches", "verify_pairs", 1, 2, 3]
 )

@@ -173,6 +173,7 @@ def test_positions_that_are_wrong_are_left_out_and_named(
     assert max(np.linalg.norm(center) for center in new.values()) < 300
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [4, 5, 6, 9, 30])
 def test_honest_positions_all_count(count: int) -> None:
     """Few places fit some similarity well by chance: the others are not wrong for that."""

@@ -219,6 +219,7 @@ except AffrectError as error:
 """
 
 
+@pytest.mark.long
 def test_full_disk_is_one_line_and_leaves_nothing(
     finished: tuple[Path, Path], targets: tuple[Path, Path]
 ) -> None:

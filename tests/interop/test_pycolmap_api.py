@@ -76,6 +76,7 @@ def test_database_is_that_of_a_run(photos: Path, tmp_path: Path) -> None:
         )
 
 
+@pytest.mark.long
 def test_images_and_pairs_are_added_call_by_call(photos: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.db"
     listed = tmp_path / "pairs.txt"
@@ -93,6 +94,7 @@ def test_images_and_pairs_are_added_call_by_call(photos: Path, tmp_path: Path) -
     assert verify.num_done == 5
 
 
+@pytest.mark.long
 def test_reader_options_and_camera_mode_are_those_of_pycolmap(
     photos: Path, tmp_path: Path
 ) -> None:

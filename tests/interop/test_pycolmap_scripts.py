@@ -65,6 +65,7 @@ def test_panorama_script_of_pycolmap_registers_all_images(
     assert equirectangular.num_reg_images() == 3
 
 
+@pytest.mark.long
 def test_panoramas_themselves_are_refused_with_advice(tmp_path: Path) -> None:
     write_panoramas(tmp_path, 1)
     spherical = panorama.PanoramaReconstructionOptions(

@@ -406,6 +406,7 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
     return {i.camera_id: replace(UNKNOWN, names=(i.name,)) for i in images}
 
 
+@pytest.mark.long
 def test_photographs_get_own_cameras_and_models_of_other_places_stay(
     tmp_path: Path,
 ) -> None:

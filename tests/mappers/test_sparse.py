@@ -199,6 +199,7 @@ def test_a_mark_that_is_far_off_is_named_as_the_worst(tmp_path: Path) -> None:
     assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 3.0
 
 
+@pytest.mark.long
 def test_photograph_in_a_wrong_place_is_placed_by_its_tie_points(
     tmp_path: Path,
 ) -> None:
@@ -218,6 +219,7 @@ def test_photograph_in_a_wrong_place_is_placed_by_its_tie_points(
     assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 3.0
 
 
+@pytest.mark.long
 def test_two_models_are_joined_by_seven_points(tmp_path: Path) -> None:
     truth = views(6)
     pairs = [*TRIANGLE, (3, 4), (4, 5), (3, 5)]

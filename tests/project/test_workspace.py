@@ -231,6 +231,7 @@ with Workspace(Path(sys.argv[1])).locked():
 """
 
 
+@pytest.mark.long
 def test_folder_in_use_by_another_process_is_refused_until_it_ends(
     tmp_path: Path,
 ) -> None:

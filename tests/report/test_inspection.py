@@ -76,6 +76,7 @@ def test_level_has_the_plan_and_the_features_of_extraction(
     assert f"{len(features)} features" in said
 
 
+@pytest.mark.long
 def test_levels_that_wait_for_weights_are_passed_over(
     photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

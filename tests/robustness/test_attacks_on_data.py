@@ -256,6 +256,7 @@ def test_text_model_that_contradicts_itself_is_named(name: str, tmp_path: Path) 
             use()  # type: ignore[no-untyped-call]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("times", [2, 20])
 def test_matches_that_are_given_several_times_count_once(
     photos: Path, tmp_path: Path, times: int

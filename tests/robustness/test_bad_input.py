@@ -108,6 +108,7 @@ def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:
     assert codes_of_missing(report) == {"a.png": "no_verified_pair"}
 
 
+@pytest.mark.long
 def test_pair_list_may_name_an_image_that_cannot_be_read(
     trio: Path, tmp_path: Path, call: Call
 ) -> None:
@@ -154,6 +155,7 @@ def test_cameras_that_cannot_be_used_are_refused_before_anything_is_recorded(
     assert call(*extract).code == 0
 
 
+@pytest.mark.long
 def test_damaged_features_are_made_again_with_overwrite(
     trio: Path, tmp_path: Path, call: Call
 ) -> None:
@@ -196,6 +198,7 @@ def write_bad_images(folder: Path) -> None:
     photo.save(folder / "z.gif")
 
 
+@pytest.mark.long
 def test_bad_images_are_named_and_the_others_registered(
     trio: Path, tmp_path: Path, call: Call
 ) -> None:

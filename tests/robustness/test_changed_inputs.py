@@ -303,6 +303,7 @@ def test_changed_photograph_of_a_users_database_is_named(tmp_path: Path) -> None
         )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", ["MatchStore.remove", "FeatureStore.remove"])
 def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
     tmp_path: Path, stage: Stage, monkeypatch: pytest.MonkeyPatch, step: str

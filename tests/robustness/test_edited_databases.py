@@ -131,6 +131,7 @@ INDICES = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", INDICES)
 def test_damaged_index_is_found_and_made_again(
     finished: Path, out: Path, again: Again, index: str
@@ -166,6 +167,7 @@ def test_damage_that_came_meanwhile_is_mended_by_the_next_command(
     assert not damage_of(path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("table", ["images", "frame_data", "keypoints"])
 def test_map_makes_a_damaged_database_again(
     finished: Path, out: Path, again: Again, table: str
@@ -179,6 +181,7 @@ def test_map_makes_a_damaged_database_again(
     )
 
 
+@pytest.mark.long
 def test_database_that_was_touched_or_left_by_a_killed_command_is_used(
     finished: Path, out: Path, again: Again
 ) -> None:

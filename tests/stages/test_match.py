@@ -117,6 +117,7 @@ def test_all_features_are_matched_where_the_strongest_do_not_tie_both_images(
     assert not_well_tied(store, [*pairs, ("e", "c")]) == [("f", "a")]
 
 
+@pytest.mark.long
 def test_all_features_are_matched_once_a_pair_that_tied_an_image_is_not_listed(
     photos: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,6 +149,7 @@ def test_all_features_are_matched_once_a_pair_that_tied_an_image_is_not_listed(
     assert database_content(out / "database.db")["raw matches"][a, c] == len(many)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("growth", "are_left"), [(1.1, False), (1e9, True)])
 def test_all_features_are_not_matched_where_a_sample_of_pairs_gains_nothing(
     photos: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, growth: float,

@@ -143,6 +143,7 @@ def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(
             )
 
 
+@pytest.mark.long
 def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from_there(
     finished: Finished, photos: Path, tmp_path: Path, call: Call
 ) -> None:
