@@ -105,6 +105,7 @@ import collections, ctypes, itertools, time
 from colmap_affrect import __main__, cli
 def tidy_up_for_ever():
     try:
+        print("working", flush=True)
         time.sleep(60)
     finally:
         print("tidying up", flush=True)
@@ -148,6 +149,7 @@ def test_native_code_that_does_not_return_is_left(number: signal.Signals, send) 
 @pytest.mark.parametrize("send", [os.kill, os.killpg])
 def test_second_interrupt_ends_a_command_that_tidies_up_at_once(send) -> None:
     with start_stuck("tidy_up_for_ever()") as process:
+        assert process.stdout.readline() == "working\n"
         send(process.pid, signal.SIGINT)
         assert process.stdout.readline() == "tidying up\n"
         begin = time.monotonic()
