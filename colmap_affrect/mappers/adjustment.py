@@ -6,7 +6,7 @@ few points are seen by many images, its focal lengths run away.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -201,14 +201,7 @@ class Adjuster:
         config = self._config(
             model, images, cameras & fixed, fix_gauge=image_ids is None
         )
-        options = self._options(model, cameras - fixed)
-        problem = pycolmap.create_default_ceres_bundle_adjuster(
-            options, config, model
-        ).problem
-        self._add_tie_points(problem, model)
-        for key in sorted(cameras - fixed):
-            if problem.has_parameter_block(model.cameras[key].params):
-                self._add_prior(problem, model.cameras[key])
+        problem = self._problem(model, config, cameras - fixed)
         solver = _solver_options(max_iterations, len(images))
         if early_stop:
             early_stop.noise_px = self.noise_px
@@ -235,17 +228,27 @@ class Adjuster:
         cameras = {model.images[image_id].camera_id for image_id in images}
         config = self._config(model, images, cameras & self.constant, fix_gauge=False)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
-        options = self._options(model, cameras - self.constant)
+        problem = self._problem(model, config, cameras - self.constant)
+        wanted = pycolmap.BACovarianceOptions()
+        wanted.params = pycolmap.BACovarianceOptionsParams.POSES
+        return pycolmap.estimate_ba_covariance_from_problem(wanted, model, problem)
+
+    def _problem(
+        self,
+        model: pycolmap.Reconstruction,
+        config: pycolmap.BundleAdjustmentConfig,
+        free_cameras: Set[int],
+    ) -> Any:
+        """Return Ceres' problem, with tie points and the priors of the cameras that are free."""
+        options = self._options(model, free_cameras)
         problem = pycolmap.create_default_ceres_bundle_adjuster(
             options, config, model
         ).problem
         self._add_tie_points(problem, model)
-        for key in sorted(cameras - self.constant):
+        for key in sorted(free_cameras):
             if problem.has_parameter_block(model.cameras[key].params):
                 self._add_prior(problem, model.cameras[key])
-        wanted = pycolmap.BACovarianceOptions()
-        wanted.params = pycolmap.BACovarianceOptionsParams.POSES
-        return pycolmap.estimate_ba_covariance_from_problem(wanted, model, problem)
+        return problem
 
     def _options(
         self, model: pycolmap.Reconstruction, free_cameras: Iterable[int]
