@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import tomli_w
 from pydantic import BaseModel, ConfigDict
 
-from colmap_affrect.errors import WorkspaceError, damage
+from colmap_affrect.errors import WorkspaceError, clipped, damage
 from colmap_affrect.options import flat
 from colmap_affrect.project.regular_files import read_regular_text, sha256_of_regular
 
@@ -81,6 +81,7 @@ Stage = Literal[
     "copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"
 ]
 STAGES: tuple[str, ...] = get_args(Stage)
+MAX_VALUE = 160  # characters of a value that is told; levels of recipes have thousands
 FORMAT_VERSION = 13  # counts up when a stage records other options than before
 MADE_FROM = "made_from"  # digests of given files
 MAPPED = (
@@ -200,5 +201,6 @@ def first_difference(
         ):  # of a level that waits
             continue
         if before != after and not (key in PLACES and before and after):
-            return f"{key}={before!r}, and it is {after!r} now"
+            was = clipped(repr(before), MAX_VALUE)
+            return f"{key}={was}, and it is {clipped(repr(after), MAX_VALUE)} now"
     return ""

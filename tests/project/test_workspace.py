@@ -11,6 +11,7 @@ import pytest
 
 from colmap_affrect.errors import OptionError, StoreError, WorkspaceError
 from colmap_affrect.project.record import STAGES as ALL_STAGES
+from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.workspace import Workspace
 
 STAGES = tuple(stage for stage in ALL_STAGES if stage != "copy")
@@ -312,3 +313,11 @@ def test_branch_begins_after_the_raw_matches(
     branch.record_options("match", {"by": "other options"}, overwrite=True)
     assert not branch.matches.exists()
     assert finished.matches.read_bytes() == b"matches.h5"
+
+
+def test_a_long_value_that_differs_is_told_by_its_beginning_and_end() -> None:
+    levels = [{"rectifier": "asift", "number": number} for number in range(100)]
+    why = first_difference({"escalation": levels}, {"escalation": []})
+    assert why.startswith("escalation=[{'rectifier': 'asift', 'number': 0}")
+    assert why.endswith("'number': 99}], and it is [] now")
+    assert len(why) < 250
