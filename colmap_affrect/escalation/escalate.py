@@ -46,7 +46,7 @@ from colmap_affrect.stages.verify import update_verified
 
 logger = logging.getLogger(__name__)
 
-PAIRS_AT_ONCE = 50  # matched between two looks at the clock
+PAIRS_AT_ONCE = 50  # resources: matched between two looks at the clock
 
 
 def escalate(context: Context, options: EscalateOptions | None = None) -> StageReport:
@@ -60,9 +60,7 @@ def escalate(context: Context, options: EscalateOptions | None = None) -> StageR
         What was done; ``num_done`` counts the pairs that were matched again now.
     """
     escalation, report = begin(context, options)
-    while step := escalation.next_step():
-        report = escalation.taken(step, report)
-    return escalation.ended(report)
+    return escalation.final_report(escalation.take_steps(report))
 
 
 def begin(
@@ -200,16 +198,32 @@ class Escalation:
             return Plan()
         return next_step(self.state.situation(weights, models), self.context.effort)
 
-    def taken(self, step: Step, report: StageReport) -> StageReport:
-        """Take a step, and return the report with its pairs and seconds."""
-        start = time.perf_counter()
-        self.match_at(step.pairs, step.level)
-        wall_s = report.wall_s + time.perf_counter() - start
-        return StageReport("escalate", wall_s, report.num_done + len(step.pairs))
+    def take_steps(
+        self, report: StageReport, before_each: Callable[[], None] = lambda: None
+    ) -> StageReport:
+        """Take steps until none is left.
 
-    def ended(self, report: StageReport) -> StageReport:
+        Args:
+            report: of what was done before.
+            before_each: called before each step.
+
+        Returns:
+            The report with the pairs and seconds of the steps.
+        """
+        step = self.next_step()
+        while step:
+            before_each()
+            start = time.perf_counter()
+            self.match_at(step.pairs, step.level)
+            wall_s = report.wall_s + time.perf_counter() - start
+            num_done = report.num_done + len(step.pairs)
+            report = StageReport("escalate", wall_s, num_done)
+            step = self.next_step()
+        return report
+
+    def final_report(self, report: StageReport) -> StageReport:
         """Return the report with what could not be tried, which is logged, too."""
-        warnings = self.waiting()
+        warnings = self._missing_weights()
         if self.is_over_time:
             warnings["time"] = (
                 "it is over; the same command without --max-time tries more"
@@ -220,8 +234,8 @@ class Escalation:
             "escalate", report.wall_s, report.num_done, warnings=warnings
         )
 
-    def waiting(self) -> dict[str, str]:
-        """Say what levels that lack weights may tie, if anything is left to tie."""
+    def _missing_weights(self) -> dict[str, str]:
+        """Say for which images levels that lack weights would be tried."""
         how = self.context.resources.how_to_complete(self.context.extraction)
         if not how:
             return {}
@@ -242,23 +256,36 @@ class Escalation:
         """
         if pairs:
             self.matches.keep(step=Begun(level, tuple(pairs)), has_stepped=True)
-        learned = self.matches.learned(pairs)
-        known = {
-            pair: one for pair, one in learned.items() if one.matches.level == level
-        }
-        if known:
-            states = self.state.states()
-            trials = [
-                Trial(one.matches, one.worth, states[pair])
-                for pair, one in known.items()
-            ]
-            self._keep(trials, level)
+        known = self._use_learned_matches(pairs, level)
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
         self.write()
         self.matches.keep(step=None, has_stepped=True)
 
-    def plan_learning(self) -> bool:
+    def _use_learned_matches(self, pairs: Sequence[Pair], level: int) -> set[Pair]:
+        """Use the learned matches of a level that are there already, where they are better.
+
+        Args:
+            pairs: of image names.
+            level: number of the level in the recipe.
+
+        Returns:
+            The pairs that have such matches.
+        """
+        learned = list[Learned]()
+        for one in self.matches.learned(pairs).values():
+            if one.matches.level == level:
+                learned.append(one)
+        if not learned:
+            return set()
+        states = self.state.states()
+        trials = list[Trial]()
+        for one in learned:
+            trials.append(Trial(one.matches, one.worth, states[one.matches.names]))
+        self._keep(trials, level)
+        return {one.matches.names for one in learned}
+
+    def plan_learned_matching(self) -> bool:
         """Put on record which pairs are to be matched by a learned level, beside what is there.
 
         An interrupted run resumes with these: images that get features change the database.
@@ -281,8 +308,8 @@ class Escalation:
             self.matches.keep(learning=Begun(step.level, tuple(step.pairs)))
         return bool(step.pairs)
 
-    def learn(self) -> int:
-        """Match the pairs of :meth:`plan_learning` that have no learned matches yet.
+    def match_learned(self) -> int:
+        """Match the pairs of :meth:`plan_learned_matching` that have no learned matches yet.
 
         Returns:
             How many were matched; some may be left where the time that the user gave is over.
@@ -301,13 +328,13 @@ class Escalation:
         return num_matched
 
     @property
-    def is_learned(self) -> bool:
-        """Whether all pairs of :meth:`plan_learning` have learned matches."""
+    def has_all_learned_matches(self) -> bool:
+        """Whether all pairs of :meth:`plan_learned_matching` have learned matches."""
         planned = self.matches.state.learning
-        return (
-            planned is not None
-            and min(self.matches.learned_levels(planned.pairs).values()) >= 0
-        )
+        if planned is None:
+            return False
+        levels = self.matches.learned_levels(planned.pairs)
+        return min(levels.values()) >= 0
 
     def write(self) -> None:
         """Bring the database up to what is stored, and verify what is new."""
@@ -315,23 +342,31 @@ class Escalation:
 
     def _match_with(self, pairs: Sequence[Pair], level: int, keep: Keep) -> None:
         """Give images the features of a level that they lack, and match pairs with these."""
-        features = self.context.features
-        chosen = self.context.extraction.levels[level]
-        missing = list[tuple[str, int]]()
-        for name in sorted({name for pair in pairs for name in pair}):
-            there = features.level_ranges(name)
-            missing += [
-                (name, k) for k in sorted({chosen.base, level}) if k not in there
-            ]
-        left = (
-            f" (at most about {self.left_s / 60:.0f} min)" if self.left_s >= 60 else ""
-        )
-        title = f"escalate, {chosen.name}{left}"
+        missing = self._missing_features(pairs, level)
+        title = f"escalate, {self.context.extraction.levels[level].name}"
+        if self.left_s >= 60.0:
+            title += f" (at most about {self.left_s / 60:.0f} min)"
         num_steps = len(missing) + len(pairs)
         with self.context.progress.stage(title, num_steps, "steps") as advance:
             self._extend(missing, advance)
             if pairs:
                 self._match_again(pairs, level, keep, advance)
+
+    def _missing_features(
+        self, pairs: Sequence[Pair], level: int
+    ) -> list[tuple[str, int]]:
+        """Return the images without features of a level or its base, each with the level."""
+        names = set[str]()
+        for pair in pairs:
+            names.update(pair)
+        wanted = sorted({self.context.extraction.levels[level].base, level})
+        missing = list[tuple[str, int]]()
+        for name in sorted(names):
+            there = self.context.features.level_ranges(name)
+            for number in wanted:
+                if number not in there:
+                    missing.append((name, number))
+        return missing
 
     def _extend(
         self, missing: Sequence[tuple[str, int]], advance: Callable[[int], None]
@@ -391,9 +426,8 @@ class Escalation:
 
     def _keep_learned(self, batch: Sequence[Trial], _: int) -> None:
         """Write learned matches beside those in use."""
-        self.matches.keep_learned(
-            [Learned(trial.found, trial.worth) for trial in batch]
-        )
+        learned = [Learned(trial.found, trial.worth) for trial in batch]
+        self.matches.keep_learned(learned)
 
     def _measured_worths(self, batch: Sequence[Trial]) -> dict[Pair, Worth]:
         """Return what the best measured matches are worth of pairs that use learned ones."""

@@ -153,7 +153,8 @@ def spent(context: Context) -> Row:
         },
         "hope": round(
             max(
-                situation.best_at(k, math.inf).all_photographs for k in situation.usable
+                situation.best_step(k, math.inf).all_photographs
+                for k in situation.usable
             ),
             3,
         ),

@@ -75,7 +75,7 @@ def matched(
     )
     escalation, _ = begin(Context(workspace), recipe.escalate)
     escalation.matches.keep(learning=Begun(1, tuple(escalation.state.pairs)))
-    assert escalation.learn() == len(escalation.state.pairs)
+    assert escalation.match_learned() == len(escalation.state.pairs)
     return workspace
 
 
@@ -397,19 +397,19 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     pairs = list(escalation.state.pairs)
     context.matches.keep(learning=None)
     monkeypatch.setattr(SetState, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
-    assert not escalation.plan_learning()  # all have learned matches
+    assert not escalation.plan_learned_matching()  # all have learned matches
     context.matches.remove(pairs=pairs)
     match(context)
     escalation.write()
-    assert escalation.plan_learning()
+    assert escalation.plan_learned_matching()
     monkeypatch.setattr(SetState, "weights", lambda *_: {})
-    assert escalation.plan_learning()
-    assert not escalation.is_learned
+    assert escalation.plan_learned_matching()
+    assert not escalation.has_all_learned_matches
     monkeypatch.setattr(Escalation, "is_over_time", True)
-    assert escalation.learn() == 0
+    assert escalation.match_learned() == 0
     monkeypatch.setattr(Escalation, "is_over_time", False)
-    assert escalation.learn() == len(pairs)
-    assert escalation.is_learned
+    assert escalation.match_learned() == len(pairs)
+    assert escalation.has_all_learned_matches
 
 
 def test_matches_of_pairs_that_are_removed_take_learned_ones_along(
