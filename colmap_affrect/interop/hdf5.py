@@ -35,7 +35,8 @@ from colmap_affrect.colmap.database import (
     write_descriptors,
 )
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
+from colmap_affrect.colmap.image_import import import_images
+from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.colmap.verification import (
     VerificationOptions,
     verified_pairs,
