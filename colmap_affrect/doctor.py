@@ -40,7 +40,7 @@ Read = TypeVar("Read")
 Severity = Literal["error", "warning", "note"]
 """A program fails, or results are wrong; something is missing from results; worth knowing."""
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
-MAX_ITEMS_SHOWN = 5
+MAX_ITEMS_SHOWN = 5  # display
 HARMLESS = WARNED | {
     "camera-panorama"
 }  # problems of databases that may be of use to COLMAP

@@ -24,7 +24,7 @@ from colmap_affrect.project.paths import GivenPath
 from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.tables import read_table
 
-SIGMA_PX = 3.0  # standard deviation of a mark by hand
+SIGMA_PX = 3.0  # standard deviation of a mark by hand; judged
 COLUMNS = {
     "point": ("point", "marker", "label"),
     "photograph": ("photograph", "photo", "image", "camera"),
@@ -32,6 +32,7 @@ COLUMNS = {
     "y": ("py", "y"),
 }
 """What a table of tie points may call its columns; x and y beside px and py are those of points."""
+# COLMAP's kinds of keypoints
 SIZE_COLUMNS = {4: [2], 6: [2, 5]}
 """Columns of keypoints that hold a radius, or the diagonal of a shape, by the number of columns."""
 Marks = Mapping[str, Mapping[str, Array]]

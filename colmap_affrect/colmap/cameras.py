@@ -123,7 +123,7 @@ def _split(text: object) -> object:
     return numbers
 
 
-MOST = 1e7  # px, or mm: nothing can be computed with cameras of larger numbers
+MOST = 1e7  # px, or mm: nothing can be computed with cameras of larger numbers; damage
 Positive = Annotated[float, pydantic.Field(gt=0.0, le=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, pydantic.Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 

@@ -60,7 +60,8 @@ Problems = dict[
     str, list[str]
 ]  # by kind the images, pairs or cameras concerned, if any
 
-MATRICES = {  # columns that hold so many float64 or nothing, by table
+# Columns that hold so many float64 or nothing, by table; format
+MATRICES = {
     "two_view_geometries": {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
     "pose_priors": {"position": 3, "position_covariance": 9, "gravity": 3},
     "rig_sensors": {"sensor_from_rig": 7},
@@ -69,17 +70,23 @@ MATRICES = {  # columns that hold so many float64 or nothing, by table
 PACKED_CAMERA = struct.Struct(
     "<IiQQBQ"
 )  # id, model, size, prior, and how many parameters follow
-KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
-MAX_OUTSIDE = 0.01  # of the longer side: so far some programs find, or move, what is at the border
-MAX_OUTSIDE_PX = 2.0  # more than that
-MIN_NORMALISED = 3  # keypoints, none further from the corner than ...
-# ... so many px: their unit is a side of the image, or half of one
+# Numbers of COLMAP's keypoints: x, y; with scale and orientation; with an affine shape
+KEYPOINT_COLUMNS = (2, 4, 6)
+# Of the longer side: so far some programs find, or move, what is at the border; judged
+MAX_OUTSIDE = 0.01
+MAX_OUTSIDE_PX = 2.0  # more than that; judged
+# Keypoints, none further from the corner than ...; theory: one or two may be there by chance
+MIN_NORMALISED = 3
+# ... so many px: their unit is a side of the image, or half of one; theory
 MAX_NORMALISED = 2.0
-# Keypoints that should fill an image, of each of so many images ...
+# Keypoints that should fill an image, of each of so many images ...;
+# theory: so many fill more by chance
 MIN_IN_A_CORNER = 100
-MIN_IMAGES_IN_A_CORNER = 3  # ... or more; none of them reaches further than ...
-IN_A_CORNER = 0.6  # ... so many sides from the upper left corner
-# One place has a few keypoints, of several orientations or shapes
+MIN_IMAGES_IN_A_CORNER = 3  # ... or more; none of them reaches further than ...; theory
+# ... so many sides from the upper left corner;
+# theory: those of images at half their size reach one half
+IN_A_CORNER = 0.6
+# One place has a few keypoints, of several orientations or shapes; judged
 MIN_AT_ONE_PLACE = 10
 
 

@@ -36,7 +36,7 @@ from colmap_affrect.images.exif import (
 from colmap_affrect.images.photographs import CameraOptions, photograph_files
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
 
-# Longer by shorter side of a photograph that no panorama is; judged: the longest film is 617 (2.8)
+# Longer by shorter side of a photograph that no panorama is; theory: the longest film is 617 (2.8)
 MAX_ASPECT = 4.0
 # Longer side in px of the photograph that COLMAP is asked about; any, as it gives a ratio (theory)
 PROBE_SIZE_PX = 8

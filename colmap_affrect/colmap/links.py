@@ -15,7 +15,7 @@ from colmap_affrect.colmap.tables import (
 
 Value = TypeVar("Value", bound=Hashable)
 
-SENSOR_IMU = 1
+SENSOR_IMU = 1  # COLMAP's number of the kind of sensor
 SENSOR_NAMES = {SENSOR_CAMERA: "camera", SENSOR_IMU: "IMU"}
 IDS = {
     "cameras": "camera_id",
@@ -29,7 +29,7 @@ IDS = {
     "two_view_geometries": "pair_id",
 }
 """The column of each table that tells its rows apart."""
-MAX_ID = MAX_NUM_IMAGES - 1
+MAX_ID = MAX_NUM_IMAGES - 1  # COLMAP's largest id of an image
 MAX_PAIR_ID = MAX_ID * MAX_NUM_IMAGES + MAX_ID
 
 Found = Mapping[

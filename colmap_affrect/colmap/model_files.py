@@ -28,9 +28,11 @@ from colmap_affrect.project.regular_files import (
 Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
 Poses = dict[str, Pose]  # poses by image name
 
-MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
-FAR = 1e12  # coordinates beyond it are no positions: nothing can be computed with them
-QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds
+# Of a photograph; the largest panoramas have a tenth of it; damage
+MAX_SIDE_PX = 1 << 24
+# Coordinates beyond it are no positions: nothing can be computed with them; damage
+FAR = 1e12
+QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds; numeric
 SUMMARY = (
     "summary.json"  # beside a model of ours; has the digests of its files as ``model``
 )

@@ -26,8 +26,8 @@ DAMAGED = (
 )  # what sqlite3 raises, also quoting odd bytes
 MAX_NUM_IMAGES = (
     2**31 - 1
-)  # an id of a pair is the smaller image id times this, plus the larger
-SENSOR_CAMERA = 0
+)  # COLMAP's: an id of a pair is the smaller image id times this, plus the larger
+SENSOR_CAMERA = 0  # COLMAP's number of the kind of sensor
 
 DIGESTED = (  # tables that decide what is mapped
     "cameras", "rigs", "rig_sensors", "frames", "frame_data", "images", "pose_priors", "keypoints",

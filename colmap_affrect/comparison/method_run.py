@@ -157,7 +157,7 @@ def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
 METHODS = "methods"  # folder of all methods
 RESULT_JSON = TypeAdapter(MethodResult)
 # Rough seconds of an image with its share of the pairs: a forecast begins with them, and goes on by
-# the pace of the methods that are done.
+# the pace of the methods that are done. Measured on two cores:
 SIFT_SECONDS = 0.5
 RECIPE_SECONDS = 1.5
 ESCALATION_SECONDS = 6.0
@@ -173,6 +173,7 @@ class CompareOptions(InputOptions):
     """The mapper and its options, the same for all methods."""
     methods: GivenMethods = DEFAULT_METHODS
     """``sift-colmap``, ``sift``, or recipes, as ``NAME`` or ``LABEL=NAME:OPTION=VALUE``."""
+    # Resource: three show how far results spread
     seeds: Annotated[tuple[int, ...], Field(strict=False)] = (0, 1, 2)
     """Of verification and mapping, which run once for each."""
     ground_truth_path: GivenPath | None = None

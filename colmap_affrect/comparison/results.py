@@ -21,7 +21,7 @@ and of the direction of the translation."""
 MAX_CORRECT_ERROR_DEG = 5.0
 """An image is registered correctly if its relative poses to at least half of the other registered
 images are off by at most this, in rotation and in translation direction. It is the limit of solved
-pairs in ``evaluation/truths``.
+pairs in ``evaluation/truths``, which is that of the paper.
 """
 
 

@@ -11,11 +11,11 @@ from colmap_affrect.comparison.results import MEASURES, Comparison, Span, measur
 from colmap_affrect.errors import such_as
 from colmap_affrect.project.report import by_story
 
-BYTES_PER_MB = 1_000_000
+BYTES_PER_MB = 1_000_000  # theory
 NOTHING = "-"  # where there is no number
-MIN_IMAGES = 3  # of a reconstruction; two images are a pair
-MAX_NAMES = 6  # of photographs in a sentence
-WIDTH = 88  # columns of text in the terminal
+MIN_IMAGES = 3  # of a reconstruction; two images are a pair; theory
+MAX_NAMES = 6  # of photographs in a sentence; display
+WIDTH = 88  # columns of text in the terminal; display
 
 
 def table(comparison: Comparison) -> dict[str, list[str]]:

@@ -25,7 +25,7 @@ from colmap_affrect.project.match_state import Worth
 from colmap_affrect.recipes import Level
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")
-# Seconds of one core by image, for the mapping that follows each step; judged by the times of runs
+# Seconds of one core by image, for the mapping that follows each step; measured on runs
 MAPPING_S = 1.0
 LEARNED = "learned"  # kind of the level that matches whole photographs by networks
 

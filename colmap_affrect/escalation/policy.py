@@ -30,8 +30,8 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
-# Images up to which learned matching takes all pairs of images to match again: 435 pairs, some
-# minutes of two cores; judged on the sets of tests/benchmarks/effort.py
+# Images up to which learned matching takes all pairs of images to match again; resource: these are
+# 435 pairs, some minutes of two cores
 SMALL = 30
 # Photographs expected of all that the budget allows, below which nothing is tried; judged on the
 # same sets, by where photographs right against seconds are flat

@@ -33,9 +33,10 @@ Truth = TrueHomography | TruePose | Correspondences
 Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 """Cameras and cam_from_world poses by the name of the image without suffix."""
 PAIR_LIST_SUFFIX = "_image_pairs.txt"  # of SVP
-CATEGORY_DEG = 10  # of rotation, in a category of SVP
+CATEGORY_DEG = 10  # of rotation, in a category of SVP; paper
 CALIBRATION_PREFIX = "calibration_"  # of IMC
-NUM_COVISIBILITY_LIMITS = 10  # of IMC: 0.0, 0.1, ... 0.9
+NUM_COVISIBILITY_LIMITS = 10  # of IMC: 0.0, 0.1, ... 0.9; paper
+# Format of our own
 ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
 """What is added to coordinates of ``pairs.json`` for pixel-centre px, by its ``pixel_origin``."""
 

@@ -54,7 +54,7 @@ from colmap_affrect.stages.one_image import prepare
 
 logger = logging.getLogger(__name__)
 
-NUM_DIGITS = 8  # of a digest in the name of a file of features
+NUM_DIGITS = 8  # of a digest in the name of a file of features; format
 
 
 @dataclass

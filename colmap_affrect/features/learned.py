@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 RADIUS_PX = 12.0
-"""Radius of all LAFs, of a sigma of 2 px: judged on photographs, the network finds a point again
+"""Radius of all LAFs, of a sigma of 2 px: measured on photographs, the network finds a point again
 within so much, so that the same point of several warps is recognized as one."""
 
 
@@ -33,13 +33,13 @@ class AlikedOptions(FeatureOptions):
 
     name: Literal["aliked"] = "aliked"
     in_color: ClassVar[bool] = True
-    bytes_per_px: ClassVar[int] = 1600
+    bytes_per_px: ClassVar[int] = 1600  # measured
     has_shapes: ClassVar[bool] = False
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of one view, by response, as its authors match them."""
     model: Literal["n16", "n16rot"] = "n16"
     """``n16rot`` was trained with rotated images."""
-    score_threshold: Annotated[float, within(0.001, 1.0)] = 0.2
+    score_threshold: Annotated[float, within(0.001, 1.0)] = 0.2  # paper
     """Least score; where nothing has it, all maxima above the mean score of the view stay."""
 
     @property

@@ -19,20 +19,20 @@ from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.options import within
 
 MIN_IMAGE_SIZE_PX = 8  # of the shorter side, which OpenCV's scale space needs
-SMALLEST_SUM = 1e-12  # of descriptors, which are divided by it
+SMALLEST_SUM = 1e-12  # of descriptors, which are divided by it; numeric
 
 
 class DogOptions(FeatureOptions):
     """OpenCV's difference-of-Gaussians detector."""
 
     name: str = "dog"
-    contrast_threshold: Annotated[float, within(0.0, 1.0)] = 0.013
+    contrast_threshold: Annotated[float, within(0.0, 1.0)] = 0.013  # judged
     """OpenCV's contrast threshold; lower finds fainter features (OpenCV and the paper: 0.04)."""
     edge_threshold: Annotated[float, within(1.0, 1e6)] = 10.0
     """OpenCV's edge threshold: largest ratio of the principal curvatures of a keypoint."""
-    num_octave_layers: Annotated[int, within(1, 10)] = 3
+    num_octave_layers: Annotated[int, within(1, 10)] = 3  # OpenCV's
     """Scales in an octave."""
-    sigma_px: Annotated[float, within(0.5, 10.0)] = 1.6
+    sigma_px: Annotated[float, within(0.5, 10.0)] = 1.6  # OpenCV's
     """Blur of the first scale."""
 
 

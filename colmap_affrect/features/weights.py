@@ -32,7 +32,7 @@ WEIGHTLESS_RECIPES = (
     "on-demand",
     "unrectified-rootsift",
 )  # work without weights
-TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
+TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read; resource
 
 
 @dataclass(frozen=True)

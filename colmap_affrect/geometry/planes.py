@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.conventions import grid_origin
 
-WINDOW_RADIUS_PX = 2  # a plane is fitted to 5 x 5 px (the authors' value)
-WINDOW_SIGMA_PX = 0.8  # of its Gaussian weights (the authors' value)
+WINDOW_RADIUS_PX = 2  # a plane is fitted to 5 x 5 px (the value of the paper's authors)
+WINDOW_SIGMA_PX = 0.8  # of its Gaussian weights (the value of the paper's authors)
 MIN_WEIGHT_FRAC = 0.5
-"""Share of the window's weight that known neighbours need; a mere line has 0.499 of it."""
+"""Share of the window's weight that known neighbours need; a mere line has 0.499 of it; theory."""
 MAX_SLANT_COS = np.cos(np.deg2rad(85.0))
-"""Cosine of the largest viewing angle of a plane; steeper neighbours are on another surface."""
-# Distance of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars 1997)
+"""Cosine of the largest viewing angle of a plane; steeper neighbours are on another
+surface; judged."""
+# Distance of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars 1997); paper
 SPIRAL_STEP = 3.6
 
 

@@ -36,14 +36,16 @@ from colmap_affrect.project.tables import read_table
 GEOREFERENCE = (
     "georeference.json"  # beside a model: what COLMAP's files have no place for
 )
-# Of known places across the line that fits them best, in units of its length
+# Of known places across the line that fits them best, in units of its length; numeric
 MIN_WIDTH = 0.01
 METRIC = ("x", "y", "z")
 ON_EARTH = ("latitude", "longitude", "altitude")
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-GPS_ERROR_M = 10.0  # a position on earth that is no further off is not left out
-TABLE_ERROR = 0.02  # the same of other positions, of how far they spread
-SHOWN = 12  # residuals in the summary, the largest first
+# A position on earth that is no further off is not left out;
+# theory: of receivers without corrections
+GPS_ERROR_M = 10.0
+TABLE_ERROR = 0.02  # the same of other positions, of how far they spread; judged
+SHOWN = 12  # residuals in the summary, the largest first; display
 
 Distance = Annotated[tuple[str, str, float], Field(strict=False)]  # a list, too
 Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point

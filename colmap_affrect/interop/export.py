@@ -37,12 +37,12 @@ logger = logging.getLogger(__name__)
 USUAL = ("ply", "text", "cameras")  # formats that need no photographs
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
-UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright
-# Of cameras from the middle, as instant-ngp's converter has it
+UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright; format
+# Of cameras from the middle, as instant-ngp's converter has it; format
 MEAN_DISTANCE_IN_CUBES = 1.32
 FLIP_Y_Z = np.diag(
     [1.0, -1.0, -1.0]
-)  # from COLMAP's camera to that of OpenGL and nerfstudio
+)  # from COLMAP's camera to that of OpenGL and nerfstudio; format
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ logger = logging.getLogger(__name__)
 
 Datasets = dict[str, NDArray[Any]]
 
-SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
+SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet; resource
 
 
 @documented

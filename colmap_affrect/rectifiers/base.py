@@ -94,7 +94,7 @@ class CoverOptions(AffineWarpOptions):
     """Shapes of a larger tilt neither vote nor count. Paper: 5.8."""
     covered_frac: Annotated[float, within(0.0, 1.0)] = 0.95
     """Share of the shapes that the balls must hold. Paper: 0.95."""
-    max_num_rectifications: Annotated[int, within(0, 192)] = 8
+    max_num_rectifications: Annotated[int, within(0, 192)] = 8  # resource
     """Upper bound on the covering maps."""
 
     def cover(self, metrics: Floats, votes: Floats | None = None) -> Cover:
