@@ -85,11 +85,13 @@ def extract_sift(
     """
     photographs = Photographs(image_path, masks)
     failures = {}
+    usable = list[str]()
     for name in image_names:
         why = photographs.why_impossible(name)
         if why:
             failures[name] = why
-    usable = [name for name in image_names if name not in failures]
+        else:
+            usable.append(name)
     with masks_for_colmap(photographs, usable) as mask_path:
         reader = pycolmap.ImageReaderOptions(
             mask_path=mask_path, camera_mask_path=masks.camera_path
@@ -145,11 +147,10 @@ def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
             raise AffrectError(
                 f"{name}: COLMAP matches no listed names with spaces; rename it"
             )
+    lines = [f"{first} {second}\n" for first, second in pairs]
     with temporary_folder(database_path.parent) as folder:
         list_path = folder / "pairs.txt"
-        replace_text(
-            list_path, "".join(f"{first} {second}\n" for first, second in pairs)
-        )
+        replace_text(list_path, "".join(lines))
         listed = pycolmap.ImportedPairingOptions(match_list_path=list_path)
         pycolmap.match_image_pairs(database_path, options, listed)
 
@@ -243,9 +244,8 @@ class MethodRun:
         if overwrite:
             remove_own([folder])
         asked = {**self.inputs, **self.method.options}
-        if (
-            self.method.escalates
-        ):  # verification with this seed decides what is matched again
+        if self.method.escalates:
+            # Verification with this seed decides what is matched again.
             asked["seed"] = self.options.seeds[0]
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
         with damage(record, "use --overwrite to redo the methods that are named"):
@@ -265,10 +265,10 @@ class MethodRun:
         self.keep(failed="")
         if not self.result.wall_s:  # time that a killed run took does not count
             watch = Stopwatch()
-            extract_and_match = (
-                self._match_recipe if self.method.recipe else self._match_sift
-            )
-            failures = extract_and_match(watch)
+            if self.method.recipe:
+                failures = self._match_recipe(watch)
+            else:
+                failures = self._match_sift(watch)
             self.keep(failures=failures, wall_s=watch.seconds)
         done = {result.seed: result for result in self.result.seeds}
         for seed in self.options.seeds:
@@ -369,11 +369,11 @@ class MethodRun:
         )
         with watch.step("verify"):
             verify_matches(context, self.verification.changed(random_seed=seed))
+        mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))
         with watch.step("map"):
             guide(context)
-            return map_images(
-                context, MAPPERS.make(self.mapping.changed(random_seed=seed))
-            )[1]
+            _, models = map_images(context, mapper)
+        return models
 
     def _models(
         self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
