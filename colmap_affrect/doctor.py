@@ -41,9 +41,8 @@ Severity = Literal["error", "warning", "note"]
 """A program fails, or results are wrong; something is missing from results; worth knowing."""
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 MAX_ITEMS_SHOWN = 5  # display
-HARMLESS = WARNED | {
-    "camera-panorama"
-}  # problems of databases that may be of use to COLMAP
+# Problems of databases that may be of use to COLMAP
+HARMLESS = WARNED | {"camera-panorama"}
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 

@@ -37,13 +37,11 @@ SIZE_COLUMNS = {4: [2], 6: [2, 5]}
 """Columns of keypoints that hold a radius, or the diagonal of a shape, by the number of columns."""
 Marks = Mapping[str, Mapping[str, Array]]
 """(2,) px from the upper left corner of the image, as COLMAP has them, by point and image name."""
-Indices = Mapping[
-    str, Mapping[str, int]
-]  # numbers of keypoints, by point and image name
+# Numbers of keypoints, by point and image name
+Indices = Mapping[str, Mapping[str, int]]
 Names = Annotated[tuple[str, str], Field(strict=False)]  # a list, too
-SizeOf = Callable[
-    [str], tuple[int, int] | None
-]  # (width, height) of a photograph by its name
+# (width, height) of a photograph by its name
+SizeOf = Callable[[str], tuple[int, int] | None]
 
 
 def unknown_size(_: str) -> None:

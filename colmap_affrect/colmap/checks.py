@@ -56,9 +56,8 @@ FATAL_AS_IT_IS = FATAL | {"no-frame"}
 """The same for a database that is mapped without a copy, which would get frames."""
 FATAL_BEFORE_MAPPING = FATAL - {"rig-without-pose"}
 """The same where nothing is mapped yet."""
-Problems = dict[
-    str, list[str]
-]  # by kind the images, pairs or cameras concerned, if any
+# By kind the images, pairs or cameras concerned, if any
+Problems = dict[str, list[str]]
 
 # Columns that hold so many float64 or nothing, by table; format
 MATRICES = {
@@ -67,9 +66,8 @@ MATRICES = {
     "rig_sensors": {"sensor_from_rig": 7},
 }
 
-PACKED_CAMERA = struct.Struct(
-    "<IiQQBQ"
-)  # id, model, size, prior, and how many parameters follow
+# Id, model, size, prior, and how many parameters follow
+PACKED_CAMERA = struct.Struct("<IiQQBQ")
 # Numbers of COLMAP's keypoints: x, y; with scale and orientation; with an affine shape
 KEYPOINT_COLUMNS = (2, 4, 6)
 # Of the longer side: so far some programs find, or move, what is at the border; judged
@@ -318,9 +316,8 @@ def _are_at_one_place(points: Floats, num_keypoints: int) -> bool:
     if len(points) < MIN_AT_ONE_PLACE:
         return False
     middle = len(points) // 2
-    median = np.partition(points, middle, axis=0)[
-        middle
-    ]  # what more than half have is the median
+    # What more than half have is the median
+    median = np.partition(points, middle, axis=0)[middle]
     num_there = int((points == median).all(axis=1).sum())
     return num_there >= max(MIN_AT_ONE_PLACE, num_keypoints // 2 + 1)
 

@@ -32,9 +32,8 @@ IDS = {
 MAX_ID = MAX_NUM_IMAGES - 1  # COLMAP's largest id of an image
 MAX_PAIR_ID = MAX_ID * MAX_NUM_IMAGES + MAX_ID
 
-Found = Mapping[
-    str, list[str]
-]  # by kind of problem the rows concerned; see checks.toml
+# By kind of problem the rows concerned; see checks.toml
+Found = Mapping[str, list[str]]
 
 
 class _Sensor(NamedTuple):

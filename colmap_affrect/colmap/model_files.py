@@ -112,9 +112,8 @@ def _image(reader: _Reader) -> str:
 
 
 def _point(reader: _Reader) -> None:
-    *_, length = reader.take(
-        "Q3d3BdQ"
-    )  # id, position, colour, error, length of the track
+    # Id, position, colour, error, length of the track
+    *_, length = reader.take("Q3d3BdQ")
     reader.skip(8 * length)
 
 
@@ -127,11 +126,8 @@ RECORDS: dict[
     "images.bin": _image,
     "points3D.bin": _point,
 }
-OLD_RECORDS = (
-    "cameras.bin",
-    "images.bin",
-    "points3D.bin",
-)  # of COLMAP before it knew rigs
+# Of COLMAP before it knew rigs
+OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")
 
 
 def _read_records(path: Path) -> list[Any]:

@@ -20,13 +20,10 @@ from colmap_affrect.project.regular_files import (
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
 MAGIC = b"SQLite format 3\0"  # begins each file of SQLite's that is not empty
 HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
-DAMAGED = (
-    sqlite3.Error,
-    UnicodeDecodeError,
-)  # what sqlite3 raises, also quoting odd bytes
-MAX_NUM_IMAGES = (
-    2**31 - 1
-)  # COLMAP's: an id of a pair is the smaller image id times this, plus the larger
+# What sqlite3 raises, also quoting odd bytes
+DAMAGED = (sqlite3.Error, UnicodeDecodeError)
+# COLMAP's: an id of a pair is the smaller image id times this, plus the larger
+MAX_NUM_IMAGES = 2**31 - 1
 SENSOR_CAMERA = 0  # COLMAP's number of the kind of sensor
 
 DIGESTED = (  # tables that decide what is mapped

@@ -57,9 +57,8 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         )
         before = context.workspace.mapped_from()
         reports += _map_on(context, mapper, recipe)
-        has_mapped = (
-            context.workspace.mapped_from() != before
-        )  # perhaps there is no model
+        # Perhaps there is no model
+        has_mapped = context.workspace.mapped_from() != before
         goes_on = (
             has_mapped
             or restore_best(escalation)

@@ -275,9 +275,8 @@ def _load_imc_scene(lists_path: Path) -> Pairs:
     views = {}
     for path in sorted((root / "calibration").glob(f"{CALIBRATION_PREFIX}*.h5")):
         views[path.stem.removeprefix(CALIBRATION_PREFIX)] = read_calibration(path)
-    categories: dict[
-        Names, str
-    ] = {}  # covisibility; lists are cumulative, and the last counts
+    # Covisibility; lists are cumulative, and the last counts
+    categories: dict[Names, str] = {}
     for limit in range(NUM_COVISIBILITY_LIMITS):
         path = lists_path / f"keys-th-0.{limit}.npy"
         if limit == 0 and not path.exists():  # this list may be missing

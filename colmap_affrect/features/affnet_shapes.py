@@ -41,9 +41,8 @@ LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
 front, that patch has the block of rows and columns 0...3 in its middle; theory."""
 PAPER_CROP_PX = (-LEAD_PX) % STEP_PX  # puts the patches of all cells round whole blocks
-PAPER_LEAD_CELLS = (
-    LEAD_PX + PAPER_CROP_PX
-) // STEP_PX  # blocks before the first with a patch
+# Blocks before the first with a patch
+PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX
 # Cell i depends on rows 4 i - 11...4 i + 39; theory
 CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9
 # Rows of cells that are computed at once, to bound the memory; resource
@@ -123,9 +122,8 @@ class AffNet:
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
-        lafs = self.detect(image).lafs[
-            : self.options.max_num_keypoints
-        ]  # by falling response
+        # By falling response
+        lafs = self.detect(image).lafs[: self.options.max_num_keypoints]
         shapes = _shapes(self._patch_outputs(image, lafs))
         is_finite = np.isfinite(shapes).all(axis=(1, 2))
         is_valid = is_finite & (determinants(shapes) > 0)

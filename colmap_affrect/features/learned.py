@@ -84,9 +84,8 @@ class Aliked(FeatureExtractor):
         with torch.inference_mode():
             pixels = _pixels(image).to(self.device)
             feature_map, score_map = self.network.extract_dense_map(pixels)
-            (normalized,), (scores,), _ = self.network.dkd(
-                score_map
-            )  # positions in [-1, 1]
+            # Positions in [-1, 1]
+            (normalized,), (scores,), _ = self.network.dkd(score_map)
             last_pixel = normalized.new_tensor([image.shape[1] - 1, image.shape[0] - 1])
             points = (normalized + 1) / 2 * last_pixel
             kept = np.flatnonzero(in_mask(is_allowed, _array(points)))

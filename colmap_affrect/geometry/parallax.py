@@ -109,9 +109,8 @@ def _rotation_ratios(
 
     def errors_of(rotations: Array) -> Array:
         """Return (L, S, N) px for (L, S, 3, 3) rotations."""
-        rows = rotations.reshape(
-            len(lenses), -1, 3
-        )  # one product is ten times as fast as many
+        # One product is ten times as fast as many
+        rows = rotations.reshape(len(lenses), -1, 3)
         rotated = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
         depths = np.maximum(rotated[..., 2, :], MIN_DEPTH)
         scales = focals2[:, None, None] / depths

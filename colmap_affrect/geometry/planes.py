@@ -68,9 +68,8 @@ def normals_from_depth(depth: Floats, camera_matrix: Floats) -> Array:
     offsets = range(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1)
     total_weight = 0.0
     moments = np.zeros((6, height, width))  # sums of w times 1, x, y, x x, x y, y y
-    change_moments = np.zeros(
-        (3, height, width)
-    )  # sums of w times the change times 1, x, y
+    # Sums of w times the change times 1, x, y
+    change_moments = np.zeros((3, height, width))
     for dy in offsets:
         top = dy + WINDOW_RADIUS_PX
         for dx in offsets:
@@ -141,9 +140,8 @@ class PlaneClusters:
     """Directions that many normals share."""
 
     normals: Array  # (K, 3) unit normals in order of choice; K may be 0
-    labels: NDArray[
-        np.int32
-    ]  # (h, w) the nearest of them for each pixel, -1 where none is near
+    # (h, w) the nearest of them for each pixel, -1 where none is near
+    labels: NDArray[np.int32]
 
 
 def cluster_normals(

@@ -31,9 +31,8 @@ MIN_DISTINCT_RATIO = 0.5
 theory."""
 # Shapes of unit area that are this close are equal; float32 rounding is less; numeric
 SHAPE_STEP = 1e-4
-GRID_TILTS = np.geomspace(
-    2.0, 6.21970, 6
-)  # candidates for 1.7-balls up to tilt 5.8 (the paper)
+# Candidates for 1.7-balls up to tilt 5.8 (the paper)
+GRID_TILTS = np.geomspace(2.0, 6.21970, 6)
 GRID_NUM_ANGLES = 32  # candidates of each tilt (the paper)
 NEAR_OPTIMAL_RINGS = ((2.61757, 0.398032, 8), (5.18168, 0.198314, 16))
 """Tilts, steps of the angle in radians and numbers of maps (Rodriguez, Delon, Morel 2018, constants
@@ -182,9 +181,8 @@ class Cover:
     """Covering centres of a set of shapes and the centre nearest to each shape."""
 
     centers: Array  # (K, 2) rows (tilt, angle_rad) in order of choice; K may be 0
-    labels: NDArray[
-        np.int32
-    ]  # (N,) index of the nearest centre, IDENTITY_LABEL, UNCOVERED_LABEL
+    # (N,) index of the nearest centre, IDENTITY_LABEL, UNCOVERED_LABEL
+    labels: NDArray[np.int32]
 
 
 def cover_shapes(

@@ -40,9 +40,8 @@ DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstr
 UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright; format
 # Of cameras from the middle, as instant-ngp's converter has it; format
 MEAN_DISTANCE_IN_CUBES = 1.32
-FLIP_Y_Z = np.diag(
-    [1.0, -1.0, -1.0]
-)  # from COLMAP's camera to that of OpenGL and nerfstudio; format
+# From COLMAP's camera to that of OpenGL and nerfstudio; format
+FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -120,9 +119,8 @@ def _write(
     source: Source, output_path: Path, formats: Sequence[str]
 ) -> dict[str, Path]:
     """Write formats into a folder, all or none; return what was written by format."""
-    chosen = [
-        name for name in FORMATS if name in formats
-    ]  # in the order in which they are made
+    # In the order in which they are made
+    chosen = [name for name in FORMATS if name in formats]
     targets = dict.fromkeys(output_path / FORMATS[name].leaves for name in chosen)
     photographs = [image.name for image in source.images()]
     written = {}
@@ -236,9 +234,8 @@ def _undistorted(source: Source, folder: Path) -> Path:
         picture = path / "images" / image.name
         if not picture.is_file():
             raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
-        forget_orientation(
-            picture
-        )  # COLMAP takes over EXIF, by which others would turn it
+        # COLMAP takes over EXIF, by which others would turn it
+        forget_orientation(picture)
     return path
 
 
@@ -380,9 +377,8 @@ def _no_formula(text: str) -> str:
 class Format:
     """A format that models are exported to."""
 
-    write: Callable[
-        [Source, Path], Path
-    ]  # writes it into a folder, returns what it has written
+    # Writes it into a folder, returns what it has written
+    write: Callable[[Source, Path], Path]
     leaves: str  # what it leaves in the folder
 
 
