@@ -82,7 +82,9 @@ class Diagnosis(Summarized):
             what: is wrong with it.
             advice: what helps.
         """
-        self.findings.append(Finding(severity, str(where), what, advice))
+        self.findings.append(
+            Finding(severity=severity, where=str(where), what=what, advice=advice)
+        )
         self.findings.sort(key=lambda found: SEVERITIES.index(found.severity))
 
     @property

@@ -136,7 +136,16 @@ class PartError(AffrectError):
 def damage(
     path: Path, mend: str, error_class: type[AffrectError] = StoreError
 ) -> Iterator[None]:
-    """Say of a file that cannot be read in one line that it is damaged, and what mends it."""
+    """Say of a file that cannot be read in one line that it is damaged, and what mends it.
+
+    Args:
+        path: of the file, which the context reads.
+        mend: what to do about it, to end the line.
+        error_class: of the error.
+
+    Raises:
+        AffrectError: of that class, where reading ends with one of ``DAMAGE``.
+    """
     try:
         yield
     except AffrectError:

@@ -43,7 +43,12 @@ class Forecast:
         self._clock = clock
 
     def begin(self, name: str, total: int) -> None:
-        """A stage begins with so many units."""
+        """Note that a stage begins.
+
+        Args:
+            name: of the stage.
+            total: its units, images or pairs.
+        """
         is_known = self._costs.pop(name, None) is not None
         self._cost = is_known * COSTS.get(name, 0.0) * total
         self._start_s = self._clock()
@@ -115,7 +120,16 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """Show one stage of ``total`` units for as long as the context lasts."""
+        """Show one stage for as long as the context lasts.
+
+        Args:
+            name: of the stage.
+            total: how many units it has.
+            unit: what these are, in the plural.
+
+        Yields:
+            What is called with the number of units that are done since.
+        """
         forecast = self.forecast
         stream = self.stream
         title = self.title + name
@@ -134,7 +148,8 @@ class Progress:
         def advance_lines(count: int) -> None:
             nonlocal num_lines
             text = left(count)
-            if (wanted := done * self.num_plain_lines // total) > num_lines:
+            wanted = done * self.num_plain_lines // total
+            if wanted > num_lines:
                 num_lines = wanted
                 print_line(text)
 
@@ -187,7 +202,13 @@ def _is_notebook() -> bool:
 
 
 def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
-    """Print what people or programs read; see :mod:`colmap_affrect.errors`."""
+    """Print what people or programs read; see :mod:`colmap_affrect.errors`.
+
+    Args:
+        text: what is printed, its control characters made harmless.
+        file: where; None is the standard output.
+        end: what follows the text.
+    """
     print(shown(str(text)), file=file, end=end)
 
 

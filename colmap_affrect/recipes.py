@@ -133,7 +133,15 @@ class ExtractionOptions(Options):
             features = item.features or self.features
             size_px = item.max_image_size_px or self.max_image_size_px
             base = _base_of(features, size_px, found)
-            found.append(Level(item.rectifier, features, size_px, item.matching, base))
+            found.append(
+                Level(
+                    rectifier=item.rectifier,
+                    features=features,
+                    max_image_size_px=size_px,
+                    matching=item.matching,
+                    base=base,
+                )
+            )
         return tuple(found)
 
     @property

@@ -248,7 +248,9 @@ def read_marks(
     full_names = _full_names(names)
     headers = [*chain(*COLUMNS.values()), "z"]
     marks = defaultdict[str, dict[str, Array]](dict)
-    for place, row in read_table(path, where, headers, key="", usual=tuple(COLUMNS)):
+    for place, row in read_table(
+        path=path, where=where, columns=headers, key="", usual=tuple(COLUMNS)
+    ):
         point = _cell(row, "point")
         photograph = _cell(row, "photograph")
         if not point or not photograph:

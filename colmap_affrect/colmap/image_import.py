@@ -205,7 +205,9 @@ def _record(
         if _values(made) == _values(camera):
             return record
     source: Source = "given" if camera.has_prior_focal_length else "guess"
-    return CameraRecord(names, source, focal_of(camera), size=size)
+    return CameraRecord(
+        names=names, source=source, focal_px=focal_of(camera), size=size
+    )
 
 
 def _values(camera: pycolmap.Camera) -> tuple[object, ...]:

@@ -135,14 +135,26 @@ def _members(connection: sqlite3.Connection) -> list[_Member]:
     references = rows_of(connection, "rig_id ref_sensor_type ref_sensor_id", "rigs")
     for rig_id, kind, number in references:
         members.append(
-            _Member(int(rig_id), _Sensor(int(kind), int(number)), True, True)
+            _Member(
+                rig_id=int(rig_id),
+                sensor=_Sensor(int(kind), int(number)),
+                is_reference=True,
+                has_pose=True,
+            )
         )
     others = rows_of(
         connection, "rig_id sensor_type sensor_id sensor_from_rig", "rig_sensors"
     )
     for rig_id, kind, number, pose in others:
         sensor = _Sensor(int(kind), int(number))
-        members.append(_Member(int(rig_id), sensor, False, bool(pose)))
+        members.append(
+            _Member(
+                rig_id=int(rig_id),
+                sensor=sensor,
+                is_reference=False,
+                has_pose=bool(pose),
+            )
+        )
     return members
 
 

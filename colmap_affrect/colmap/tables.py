@@ -140,7 +140,9 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
     cameras = {}
     rows = rows_of(connection, "camera_id width height model params", "cameras")
     for camera_id, width, height, model, params in rows:
-        cameras[int(camera_id)] = Camera(int(width), int(height), int(model), params)
+        cameras[int(camera_id)] = Camera(
+            width=int(width), height=int(height), model=int(model), params=params
+        )
     frame_images = set[int]()
     for image_id, kind in rows_of(connection, "data_id sensor_type", "frame_data"):
         if kind == SENSOR_CAMERA:

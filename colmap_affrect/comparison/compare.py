@@ -75,7 +75,11 @@ def compare(
     options = CompareOptions.with_keywords(options, keywords)
     require_bools(overwrite=overwrite)
     return _compare(
-        image_path, output_path, options, Progress.given(progress), again=overwrite
+        image_path=image_path,
+        output_path=output_path,
+        options=options,
+        progress=Progress.given(progress),
+        again=overwrite,
     )
 
 

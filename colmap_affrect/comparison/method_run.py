@@ -315,7 +315,12 @@ class MethodRun:
 
     def _match_recipe(self, watch: Stopwatch) -> dict[str, str]:
         """Extract, match and match again by a recipe; return why images cannot be used."""
-        context = Context(self.workspace, self.options.resources, None, self.progress)
+        context = Context(
+            workspace=self.workspace,
+            resources=self.options.resources,
+            executor=None,
+            progress=self.progress,
+        )
         inputs = self.options.inputs(self.image_path)
         recipe = self.method.recipe or Recipe()
         self.keep(lacks=context.resources.how_to_complete(recipe.extraction))
@@ -346,7 +351,16 @@ class MethodRun:
             copy_database(self.database, database_path)
             models = self._models(seed, new, watch, progress)
             verified = verified_pairs(database_path, self.verification.min_num_inliers)
-        largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
+        largest = (
+            models[0]
+            if models
+            else ModelSummary(
+                registered_names=(),
+                num_points3D=0,
+                mean_track_length=0.0,
+                mean_reprojection_error_px=0.0,
+            )
+        )
         return SeedResult(
             seed=seed,
             models=tuple(item.registered_names for item in models),
@@ -365,7 +379,10 @@ class MethodRun:
     ) -> Sequence[ModelSummary]:
         """Verify and map as a run does."""
         context = Context(
-            self.workspace.branch(folder), self.options.resources, None, progress
+            workspace=self.workspace.branch(folder),
+            resources=self.options.resources,
+            executor=None,
+            progress=progress,
         )
         with watch.step("verify"):
             verify_matches(context, self.verification.changed(random_seed=seed))

@@ -231,7 +231,10 @@ class Escalation:
         for what, text in warnings.items():
             logger.warning("%s: %s", what, text)
         return StageReport(
-            "escalate", report.wall_s, report.num_done, warnings=warnings
+            name="escalate",
+            wall_s=report.wall_s,
+            num_done=report.num_done,
+            warnings=warnings,
         )
 
     def _missing_weights(self) -> dict[str, str]:

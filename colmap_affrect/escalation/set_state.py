@@ -56,7 +56,14 @@ class SetState:
     def models(self) -> list[ModelSummary]:
         """Return what is known of the models before; an empty one where there are none."""
         models = read_summaries(self.context.workspace.sparse)
-        return models or [ModelSummary((), 0, 0.0, 0.0)]
+        return models or [
+            ModelSummary(
+                registered_names=(),
+                num_points3D=0,
+                mean_track_length=0.0,
+                mean_reprojection_error_px=0.0,
+            )
+        ]
 
     def weights(self, models: Sequence[ModelSummary]) -> dict[str, float]:
         """Return the images to match again, and how much more matches may bring to each.

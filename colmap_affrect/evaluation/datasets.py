@@ -85,7 +85,14 @@ def load_evd(folder: Path) -> Pairs:
             if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES):
                 names.add(file.stem)
     entries = [
-        _evd_entry(folder, n, f"1/{n}", f"2/{n}", f"h/{n}.txt") for n in sorted(names)
+        _evd_entry(
+            folder=folder,
+            name=n,
+            stem1=f"1/{n}",
+            stem2=f"2/{n}",
+            homography=f"h/{n}.txt",
+        )
+        for n in sorted(names)
     ]
     for file in sorted(folder.glob("H_*.txt")):
         parts = re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", file.stem)
@@ -175,7 +182,11 @@ def _posed_pairs(
         key2, path2 = images[name2]
         title = f"{key1} {key2}"
         pairs[title] = EvaluationPair(
-            title, (key1, key2), (path1, path2), truth, category(name1, name2)
+            name=title,
+            images=(key1, key2),
+            paths=(path1, path2),
+            truth=truth,
+            category=category(name1, name2),
         )
     if lacking:
         logger.warning(
@@ -208,7 +219,13 @@ def _load_svp_scene(list_path: Path) -> Pairs:
         angle_deg = np.rad2deg(pycolmap.Rotation3d(rotation).angle())
         return f"{CATEGORY_DEG * int(angle_deg // CATEGORY_DEG)}°"
 
-    return _posed_pairs(scene, folder / "images", views, listed, category)
+    return _posed_pairs(
+        scene=scene,
+        folder=folder / "images",
+        views=views,
+        listed=listed,
+        category=category,
+    )
 
 
 def read_views(folder: Path) -> Views:
@@ -285,7 +302,11 @@ def _load_imc_scene(lists_path: Path) -> Pairs:
             for key in np.load(path, allow_pickle=False).ravel().tolist():
                 categories[_split(str(key), views)] = f"0.{limit}"
     return _posed_pairs(
-        scene, root / "images", views, categories, lambda *names: categories[names]
+        scene=scene,
+        folder=root / "images",
+        views=views,
+        listed=categories,
+        category=lambda *names: categories[names],
     )
 
 
@@ -397,11 +418,11 @@ def _load(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Pairs:
 
     def pair(entry: _Entry) -> EvaluationPair:
         return EvaluationPair(
-            entry.name,
-            (entry.image1, entry.image2),
-            (folder / entry.image1, folder / entry.image2),
-            _truth(entry, folder, offset_px),
-            entry.category,
+            name=entry.name,
+            images=(entry.image1, entry.image2),
+            paths=(folder / entry.image1, folder / entry.image2),
+            truth=_truth(entry, folder, offset_px),
+            category=entry.category,
         )
 
     return list(map_ordered(pair, entries, available_cores()))

@@ -146,13 +146,13 @@ class RecipeRun:
         for level in self._extractor.extractors:
             chosen = self.recipe.extraction.levels[level]
             matching = Matching(
-                self._store,
-                chosen.matching or self.recipe.matching,
-                level,
-                chosen.base,
-                chosen.features.name,
-                self._options.resources,
-                self._options.max_num_keypoints or 0,
+                store=self._store,
+                options=chosen.matching or self.recipe.matching,
+                level=level,
+                base=chosen.base,
+                extractor=chosen.features.name,
+                resources=self._options.resources,
+                max_num_features=self._options.max_num_keypoints or 0,
             )
             matchers[level] = CachedMatcher(matching)
         results = []
@@ -353,7 +353,14 @@ def evaluate(
     with Workspace(output_path).locked():
         pairs = PROTOCOLS[protocol](dataset_path)
         runs = [
-            RecipeRun(method, pairs, output_path, inputs, options) for method in methods
+            RecipeRun(
+                method=method,
+                pairs=pairs,
+                output_path=output_path,
+                inputs=inputs,
+                options=options,
+            )
+            for method in methods
         ]
         for method in methods if overwrite else ():
             pattern = f"features/{method.folder_name}-{'?' * NUM_DIGITS}.h5"

@@ -249,18 +249,18 @@ class TrueHomography:
             The score; its error is :meth:`error_px`.
         """
         matrix, num_inliers = estimate_matrix(
-            cv2.findHomography,
-            (points1, points2),
-            cv2.RANSAC,
-            options.threshold_px,
-            options,
+            find=cv2.findHomography,
+            points=(points1, points2),
+            method=cv2.RANSAC,
+            threshold_px=options.threshold_px,
+            options=options,
         )
         error = self.error_px(matrix)
         is_correct = transfer_errors(self.matrix, points1, points2) < CORRECT_PX
         return PairScore(
-            error,
-            num_inliers,
-            int(is_correct.sum()),
+            error=error,
+            num_inliers=num_inliers,
+            num_correct=int(is_correct.sum()),
             solved=float(error < MAX_ERROR_PX),
             kind="homographies",
         )
@@ -327,10 +327,10 @@ class TruePose:
         _, translation = self.pose
         has_baseline = translation.any()  # else distances are not defined
         return PairScore(
-            rotation_deg,
-            num_inliers,
-            int((distances_px < CORRECT_PX).sum()) if has_baseline else 0,
-            direction_deg,
+            error=rotation_deg,
+            num_inliers=num_inliers,
+            num_correct=int((distances_px < CORRECT_PX).sum()) if has_baseline else 0,
+            direction_error_deg=direction_deg,
             solved=float(rotation_deg < MAX_ERROR_DEG),
             kind="poses",
         )
@@ -365,11 +365,11 @@ class Correspondences:
         estimates = []  # error, number of inliers, seed, distances; seeds differ
         for seed in range(options.random_seed, options.random_seed + NUM_ESTIMATES):
             matrix, num_inliers = estimate_matrix(
-                cv2.findFundamentalMat,
-                (points1, points2),
-                cv2.USAC_MAGSAC,
-                MAX_EPIPOLAR_NOISE_PX,
-                options.changed(random_seed=seed),
+                find=cv2.findFundamentalMat,
+                points=(points1, points2),
+                method=cv2.USAC_MAGSAC,
+                threshold_px=MAX_EPIPOLAR_NOISE_PX,
+                options=options.changed(random_seed=seed),
             )
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
             estimates.append(

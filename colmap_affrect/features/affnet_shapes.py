@@ -118,7 +118,12 @@ class AffNet:
             logs = self._mean_logs(image)
             textured = _textured_blocks(image, self.options.min_deviation)
             logs[~textured] = 0.0
-        return ShapeGrid(tilts.metrics_from_log(logs), textured, ORIGIN_PX, STEP_PX)
+        return ShapeGrid(
+            metrics=tilts.metrics_from_log(logs),
+            textured=textured,
+            origin_px=ORIGIN_PX,
+            step_px=STEP_PX,
+        )
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""

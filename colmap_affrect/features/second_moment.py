@@ -61,7 +61,10 @@ class SecondMoment:
         textured = square_gradients > self.options.min_gradient**2
         mean_log[~textured] = 0.0
         return ShapeGrid(
-            metrics_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX
+            metrics=metrics_from_log(mean_log),
+            textured=textured,
+            origin_px=grid_origin(STEP_PX),
+            step_px=STEP_PX,
         )
 
     def samples(self, image: GrayImage) -> ShapeSamples:

@@ -77,9 +77,8 @@ def _distances(points: Array, rows: Indices) -> Array:
 class NeighborLists:
     """Neighbours of each point, itself included, as compressed rows."""
 
-    starts: (
-        Indices  # (N + 1,) the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
-    )
+    # (N + 1,): the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
+    starts: Indices
     indices: Indices  # points
 
     def of(self, points: Integers) -> tuple[Indices, Indices]:

@@ -165,7 +165,12 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
         if fit.origin:
             content = dict(zip(ON_EARTH, fit.origin, strict=True))
             replace_text(folder / GEOREFERENCE, json.dumps(content, indent=1) + "\n")
-    return Alignment(float(scale), fit.residuals, fit.left_out, upright)
+    return Alignment(
+        scale=float(scale),
+        residuals=fit.residuals,
+        left_out=fit.left_out,
+        upright=upright,
+    )
 
 
 @dataclass(frozen=True)

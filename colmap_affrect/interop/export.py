@@ -269,7 +269,12 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
     try:
-        flat = Source(path, read_given_model(path / "sparse"), None, source.is_upright)
+        flat = Source(
+            path=path,
+            model=read_given_model(path / "sparse"),
+            image_path=None,
+            is_upright=source.is_upright,
+        )
     except (
         OptionError,
         StoreError,

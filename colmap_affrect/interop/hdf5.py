@@ -193,13 +193,22 @@ def import_h5(  # noqa: PLR0913 (all but three are keywords)
             "--match-list-path: only without --matches-path: it says what to match"
         )
     wanted = _Wanted(
-        as_path_or_none(matches_path, "matches_path"),
-        match_type,
-        as_path_or_none(match_list_path, "match_list_path"),
-        image_path,
-        None if skip_verification else VerificationOptions(random_seed=random_seed),
+        matches_path=as_path_or_none(matches_path, "matches_path"),
+        match_type=match_type,
+        match_list_path=as_path_or_none(match_list_path, "match_list_path"),
+        image_path=image_path,
+        verification=None
+        if skip_verification
+        else VerificationOptions(random_seed=random_seed),
     )
-    return _import(image_path, features_path, database_path, cameras, wanted, progress)
+    return _import(
+        image_path=image_path,
+        features_path=features_path,
+        database_path=database_path,
+        cameras=cameras,
+        wanted=wanted,
+        progress=progress,
+    )
 
 
 def _import(
@@ -427,7 +436,12 @@ def _match_groups(
         _, one_each = np.unique(indices[:, 0], return_index=True)
         scores = np.ones(len(one_each), np.float32)
         count = database.num_keypoints_for_image(id1)
-        pair = PairMatches((names[id1], names[id2]), indices[one_each], scores, count)
+        pair = PairMatches(
+            names=(names[id1], names[id2]),
+            indices=indices[one_each],
+            scores=scores,
+            num_keypoints1=count,
+        )
         yield pair_key(*pair.names), hloc_matches(pair)
 
 

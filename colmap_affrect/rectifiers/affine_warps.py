@@ -104,7 +104,15 @@ def plan_whole_image(
         matrix, canvas_size = fit_canvas(
             linear, image_corners(image_size), margin_px=0.0
         )
-        items.append(Rectification(matrix, canvas_size, None, tilt, angle))
+        items.append(
+            Rectification(
+                rectified_from_image=matrix,
+                canvas_size=canvas_size,
+                region=None,
+                tilt=tilt,
+                tilt_angle_rad=angle,
+            )
+        )
     return RectificationPlan(image_size, tuple(items))
 
 

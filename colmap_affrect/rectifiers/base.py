@@ -77,7 +77,13 @@ class AffineWarpOptions(RectifierOptions):
         )
         matrix, canvas_size = fit_canvas(linear, region.outline(), MARGIN_PX)
         return Rectification(
-            matrix, canvas_size, region.mask, tilt, angle_rad, region.origin, segment_id
+            rectified_from_image=matrix,
+            canvas_size=canvas_size,
+            region=region.mask,
+            tilt=tilt,
+            tilt_angle_rad=angle_rad,
+            region_origin=region.origin,
+            segment_id=segment_id,
         )
 
 

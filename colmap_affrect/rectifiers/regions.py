@@ -66,11 +66,11 @@ def homography_rectification(
     (mapped,) = transform_lafs(matrix, laf[None])
     tilt, angle_rad = tilts_from_metrics(unit_metrics(mapped[:, :2]))
     return Rectification(
-        matrix,
-        canvas_size,
-        region.mask,
-        float(tilt),
-        float(angle_rad),
-        region.origin,
-        segment_id,
+        rectified_from_image=matrix,
+        canvas_size=canvas_size,
+        region=region.mask,
+        tilt=float(tilt),
+        tilt_angle_rad=float(angle_rad),
+        region_origin=region.origin,
+        segment_id=segment_id,
     )

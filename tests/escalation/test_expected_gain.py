@@ -150,6 +150,12 @@ def test_while_there_is_no_model_strong_pairs_and_small_parts_count_too() -> Non
     assert (none, some) == (3, 1)
 
 
+def test_mapping_after_a_step_takes_a_second_for_each_image() -> None:
+    step = best(planner(INLIERS, {"d": 1.0}, {"bd": 8}))
+    pairs_s = len(step.pairs) * statistics_of(COVERS).pair_s
+    assert step.seconds == pytest.approx(6 * 1.0 + pairs_s)
+
+
 def test_what_joins_a_part_counts_for_all_of_its_images() -> None:
     apart = {"ab": 200, "cd": 90, "ac": 0}
     small = best(planner(apart, {"c": 1.0}, {"ac": 3}))

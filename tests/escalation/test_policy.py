@@ -9,11 +9,17 @@ from typing import Any
 import pytest
 
 from colmap_affrect.escalation import policy
-from colmap_affrect.escalation.expected_gain import PairState, kind_of, statistics_of
+from colmap_affrect.escalation.expected_gain import (
+    PairState,
+    Step,
+    kind_of,
+    statistics_of,
+)
 from colmap_affrect.escalation.policy import (
     EFFORTS,
     SMALL,
     Situation,
+    is_hopeful,
     learned_step,
     next_step,
     tried,
@@ -154,6 +160,19 @@ def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one(
         for name in ("low", "normal", "high")
     ]
     assert times == [0.0, 1000.0, 5000.0]
+    high = EFFORTS["high"]
+    assert high.budget_s(1.0, has_model=True) == 600.0
+    assert high.budget_s(1.0, has_model=False) == 3600.0
+
+
+def test_levels_that_are_expected_to_save_a_fifth_of_a_photograph_are_tried() -> None:
+    pairs = [("a", "b")]
+    with_model = situation()
+    assert not is_hopeful(Step(1, pairs, all_photographs=0.1), with_model)
+    assert is_hopeful(Step(1, pairs, all_photographs=0.4), with_model)
+    without_model = situation(registered=())
+    assert is_hopeful(Step(1, pairs, all_photographs=0.1), without_model)
+    assert not is_hopeful(Step(), without_model)
 
 
 def test_what_is_spent_is_counted_but_for_learned_matching_of_small_sets() -> None:
