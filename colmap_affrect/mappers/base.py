@@ -68,9 +68,8 @@ class MappingTask:
     cancellation: pycolmap.CancellationToken | None = None  # stops mapping from outside
     # pairs of image names that only affine frames verify which were not measured one by one
     unmeasured_pairs: frozenset[tuple[str, str]] = frozenset()
-    cameras: Mapping[int, CameraRecord] = field(
-        default_factory=dict
-    )  # what is known, by id
+    # What is known, by id
+    cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
     # what the straight lines of images say of their cameras, by image name; runs leave it empty,
     # as far as it is not measured that models of stored lines (FeatureStore.lines) are better
     lines: Mapping[str, LineCamera] = field(default_factory=dict)
@@ -121,9 +120,8 @@ class MappedModel:
     reconstruction: pycolmap.Reconstruction
     bridges: Mapping[str, Bridge] = field(default_factory=dict)
     """By the names of images that came in by one verified pair, not by tracks of three images."""
-    moves: tuple[
-        str, ...
-    ] = ()  # hypotheses that made the model, in the words of a report
+    # Hypotheses that made the model, in the words of a report
+    moves: tuple[str, ...] = ()
     finish: Callable[[], None] | None = None
     """Gives the reconstruction its last points and colours; called once, when images are scored."""
 

@@ -36,11 +36,12 @@ from colmap_affrect.project.report import Bridge
 # Judged on bridges of the benchmark scenes whose poses are known.
 # Of the longer side of an image: known depths so near are compared
 NEIGHBOR_RADIUS = 0.03
-# Known depths on a common plane may be so many times farther away
+# Known depths on a common plane may be so many times farther away; judged
 PLANE_RADIUS_FACTOR = 4.0
-MIN_AGREEING = 10  # depth ratios that agree with a scale
-MIN_AGREEING_SHARE = 0.5  # of all ratios: right pairs have 0.8, chance 0.25
-FOCAL_STEP = 0.02  # of the logarithm: relative poses are estimated once for such a step
+MIN_AGREEING = 10  # depth ratios that agree with a scale; judged
+MIN_AGREEING_SHARE = 0.5  # of all ratios: right pairs have 0.8, chance 0.25; measured
+# Of the logarithm: relative poses are estimated once for such a step; resource
+FOCAL_STEP = 0.02
 
 
 class _PosedModel:

@@ -17,7 +17,7 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.tie_points import TiePoints
 
-MAX_ITERATIONS = 20  # each point is a problem of its own, which few solve
+MAX_ITERATIONS = 20  # each point is a problem of its own, which few solve; resource
 
 
 def complete_points(
@@ -153,8 +153,7 @@ def _pose_parameters(model: pycolmap.Reconstruction) -> list[Array]:
     """Return the parameters of the poses of frames, and of the sensors in rigs, as the model's."""
     poses = [model.frames[key].rig_from_world for key in sorted(model.reg_frame_ids())]
     for rig_id in sorted(model.rigs):
-        rig = model.rigs[
-            rig_id
-        ]  # its sensors are copies there, and the model's by their ids
+        # Its sensors are copies there, and the model's by their ids
+        rig = model.rigs[rig_id]
         poses += [rig.sensor_from_rig(sensor) for sensor in rig.non_ref_sensors]
     return [pose.params for pose in poses if pose is not None]

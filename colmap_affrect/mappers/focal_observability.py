@@ -26,20 +26,21 @@ FACTORS = 1.25, 0.8
 """Other focal lengths that are tried: with these, poses are off by 5 degrees and more (judged)."""
 MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing (judged)
 MAX_GROWTH = 1.0  # as of known focal lengths: more makes no photograph surer (judged)
-# Of the logarithm of a given focal length while others are tried: nearly free
+# Of the logarithm of a given focal length while others are tried: nearly free; theory
 FREE_SIGMA = 1.0
-# Of the logarithm of a given focal length, from which on another one is named
+# Of the logarithm of a given focal length, from which on another one is named; display
 MIN_MOVE = 0.1
 # Of a trial: three times as many change growths by 4 % at most (measured)
 NUM_ITERATIONS = 100
-MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once, to save time
-# Larger models have points of many images, which tell focal lengths
+# More cameras than that are tried several at once, to save time; resource
+MAX_NUM_TRIALS = 12
+# Larger models have points of many images, which tell focal lengths; resource
 MAX_NUM_IMAGES = 100
-MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time
+MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time; resource
 MAX_NUM_OBSERVATIONS = 3_000
 """The same of a model of rigs: with the poses of the sensors as unknowns, too, each observation
-takes two or three times as long."""
-MIN_COST = 1e-9  # costs are divided by
+takes two or three times as long; resource."""
+MIN_COST = 1e-9  # costs are divided by; numeric
 
 
 class _FocalTrials:

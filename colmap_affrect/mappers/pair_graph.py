@@ -42,12 +42,13 @@ MAX_ERROR = 0.003
 """Of the longer side, of a match that a pose explains: 3 px in a photograph of 1000 (judged)."""
 MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
-MAX_MATCHES = 500  # inliers of a pair that are sampled for agreement and relative poses
-MAX_TRIALS = 1000  # of RANSAC, for a relative pose
-# The strongest of each image that models are scored by (judged)
+# Inliers of a pair that are sampled for agreement and relative poses; resource
+MAX_MATCHES = 500
+MAX_TRIALS = 1000  # of RANSAC, for a relative pose; resource
+# The strongest of each image that models are scored by (resource)
 MAX_PAIRS_OF_IMAGE = 15
 MIN_NUM_MATCHES = 15  # inliers of a pair; COLMAP's min_num_matches
-MIN_SHARE = 0.5  # of the inliers of a pair: fewer that agree contradict poses
+MIN_SHARE = 0.5  # of the inliers of a pair: fewer that agree contradict poses; theory
 
 
 @dataclass(frozen=True)

@@ -42,15 +42,15 @@ from colmap_affrect.mappers.tie_points import (
 MIN_TOLD = 0.03
 """Growth of the cost with another focal length, from which on a model tells the focal length: of
 parts of photographs it is 0.15."""
-# Strongest pairs of a frame that are compared with a pure rotation
+# Strongest pairs of a frame that are compared with a pure rotation; resource
 NUM_ROTATION_PAIRS = 4
-MAX_ROTATION_PAIRS = 300  # the same of a model, to save time
+MAX_ROTATION_PAIRS = 300  # the same of a model, to save time; resource
 MIN_MIRRORED_SHARE = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
-images a tenth by chance."""
-# Looked at, all of 45 photographs; of more some copies are missed
+images a tenth by chance; measured."""
+# Looked at, all of 45 photographs; of more some copies are missed; resource
 MAX_MIRRORED_PAIRS = 1000
-MIN_FOCAL_PX = 1e-9  # focal lengths are divided by
+MIN_FOCAL_PX = 1e-9  # focal lengths are divided by; numeric
 
 
 @dataclass(frozen=True)

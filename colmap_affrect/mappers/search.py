@@ -29,7 +29,7 @@ SHARED_SIGMA = 0.1
 SAME_FOCAL = 0.03
 """Largest difference of the logarithms of two focal lengths, of which bridges that were built with
 one are right with the other (judged)."""
-NUM_STARTS = 3  # models from which bridges are built in turn (judged)
+NUM_STARTS = 3  # models from which bridges are built in turn (resource)
 
 
 @dataclass(frozen=True)

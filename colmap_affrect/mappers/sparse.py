@@ -33,11 +33,13 @@ AGAIN = "after pairs were matched again"
 OWN_CAMERAS = "with a camera for each photograph"
 COLMAP_MODEL = "from COLMAP's model"
 
-NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from (judged)
+# Of COLMAP's models, the largest ones, that are gone on from; resource
+NUM_COLMAP_MODELS = 2
 FORWARD_MOTION = (
     "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 )
-LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
+# Images from which on COLMAP's own pipeline maps: the search would take too long; resource
+LARGE = 100
 
 logger = logging.getLogger(__name__)
 
@@ -46,11 +48,11 @@ class SparseOptions(PipelineOptions):
     """Incremental mapping with priors of the cameras, and bridges by single pairs."""
 
     name: Literal["sparse"] = "sparse"
-    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 40
-    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 4.0
+    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 40  # judged
+    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 4.0  # judged
     noise_px: Annotated[float, within(0.01, 100.0)] = NOISE_PX
     """Standard deviation of keypoints; larger errors count less and less."""
-    num_seeds: Annotated[int, within(1, 1000)] = 6
+    num_seeds: Annotated[int, within(1, 1000)] = 6  # resource
     """First pairs in a row that bring nothing, after which no others are tried."""
 
 

@@ -18,20 +18,21 @@ from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph, sampling_step
 from colmap_affrect.project.report import Residual
 
-AGREEING_PX = 4.0 * SIGMA_PX  # residuals up to which a tie point agrees with a pose
+# Residuals up to which a tie point agrees with a pose; theory
+AGREEING_PX = 4.0 * SIGMA_PX
 # Shares of tie points that agree (judged).
 AGREES_IF_RIGHT = 0.9  # with right poses: some marks are wrong
-AGREES_BY_CHANCE = 0.05  # with wrong poses
-# That must agree to register an image: three always do, the others are the test
+AGREES_BY_CHANCE = 0.05  # with wrong poses; judged
+# That must agree to register an image: three always do, the others are the test; theory
 MIN_NUM_POINTS = 4
 MAX_LOG_ODDS = 2.5
 """Of an image by its tie points. Measured: of images that six tie points alone register, twelve of
 thirteen are right."""
-NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P)
+NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P); theory
 # A tie point that one image alone sees has the median depth of the points near its mark (judged).
 NEIGHBOR_RADIUS = 0.1  # of the longer side of the image
-NUM_NEIGHBORS = 5
-# Of an image, among which neighbours are looked for, to save time
+NUM_NEIGHBORS = 5  # judged
+# Of an image, among which neighbours are looked for, to save time; resource
 MAX_NUM_OBSERVED = 2_000
 
 
