@@ -10,14 +10,14 @@ from dataclasses import replace
 from functools import partial
 
 from colmap_affrect.escalation.alternatives import (
+    adopt_chosen_models,
     choose_learned,
-    follow_keypoints,
-    forget_others,
-    is_to_be_looked_at,
     keep_best,
-    look_at_learned,
+    map_learned_matches,
+    needs_learned_models,
+    remove_alternatives,
     restore_best,
-    take_over_chosen,
+    update_keypoints_of_models,
 )
 from colmap_affrect.escalation.escalate import Escalation, begin
 from colmap_affrect.mappers.base import Mapper
@@ -43,13 +43,13 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         What each step did.
     """
     escalation, escalated = begin(context, recipe.escalate)
-    take_over_chosen(escalation)
+    adopt_chosen_models(escalation)
     reports = _map_first(context, mapper, recipe)
     escalated = _try_learned_matches(escalation, mapper, escalated)
     is_chosen = choose_learned(escalation, at_once=True)
     is_untouched = not is_chosen and not escalation.has_stepped
-    if is_untouched and context.matches.state.learning:
-        follow_keypoints(context)
+    if is_untouched and context.matches.state.learned_matching:
+        update_keypoints_of_models(context)
     goes_on = True
     while goes_on:
         escalated = escalation.take_steps(
@@ -64,7 +64,7 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
             or restore_best(escalation)
             or choose_learned(escalation, at_once=False)
         )
-    forget_others(context)
+    remove_alternatives(context)
     return [*reports, escalation.final_report(escalated)]
 
 
@@ -73,12 +73,12 @@ def _try_learned_matches(
 ) -> StageReport:
     """Match pairs of a small set by learned matching, once, and map with these matches alone."""
     context = escalation.context
-    if not is_to_be_looked_at(context) or not escalation.plan_learned_matching():
+    if not needs_learned_models(context) or not escalation.plan_learned_matching():
         return report
     start = time.perf_counter()
     num_matched = escalation.match_learned()
     if escalation.has_all_learned_matches:
-        look_at_learned(escalation, mapper)
+        map_learned_matches(escalation, mapper)
     wall_s = report.wall_s + time.perf_counter() - start
     return replace(report, wall_s=wall_s, num_done=report.num_done + num_matched)
 
@@ -89,7 +89,7 @@ def _map_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageRe
     state = matches.state
     if state.modelled == state.listed and model_folders(context.workspace.sparse):
         return []
-    forget_others(context)  # of other pairs
+    remove_alternatives(context)  # of other pairs
     reports = [guide(context, recipe.guided), map_images(context, mapper)[0]]
     matches.keep(modelled=state.listed)
     return reports

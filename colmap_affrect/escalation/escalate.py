@@ -160,7 +160,7 @@ class Escalation:
     def has_begun(self) -> bool:
         """Whether learned matching or a step has begun, perhaps in a run that was killed."""
         state = self.matches.state
-        return state.has_stepped or state.learning is not None
+        return state.has_stepped or state.learned_matching is not None
 
     @property
     def is_over_time(self) -> bool:
@@ -297,7 +297,7 @@ class Escalation:
             Whether there are any; none of sets that are large or need nothing, nor where no learned
             level can be used.
         """
-        if self.matches.state.learning:
+        if self.matches.state.learned_matching:
             return True
         models = self.state.models()
         weights = self.state.weights(models)
@@ -308,7 +308,7 @@ class Escalation:
             return False
         step = learned_step(situation)
         if step.pairs:
-            self.matches.keep(learning=Begun(step.level, tuple(step.pairs)))
+            self.matches.keep(learned_matching=Begun(step.level, tuple(step.pairs)))
         return bool(step.pairs)
 
     def match_learned(self) -> int:
@@ -317,7 +317,7 @@ class Escalation:
         Returns:
             How many were matched; some may be left where the time that the user gave is over.
         """
-        planned = self.matches.state.learning or Begun(0, ())
+        planned = self.matches.state.learned_matching or Begun(0, ())
         done = self.matches.learned_levels(planned.pairs)
         todo = [pair for pair in planned.pairs if done[pair] < 0]
         num_matched = 0
@@ -333,7 +333,7 @@ class Escalation:
     @property
     def has_all_learned_matches(self) -> bool:
         """Whether all pairs of :meth:`plan_learned_matching` have learned matches."""
-        planned = self.matches.state.learning
+        planned = self.matches.state.learned_matching
         if planned is None:
             return False
         levels = self.matches.learned_levels(planned.pairs)

@@ -121,8 +121,8 @@ class MappedModel:
     bridges: Mapping[str, Bridge] = field(default_factory=dict)
     """By the names of images that came in by one verified pair, not by tracks of three images."""
     # Hypotheses that made the model, in the words of a report
-    moves: tuple[str, ...] = ()
-    finish: Callable[[], None] | None = None
+    hypotheses: tuple[str, ...] = ()
+    add_last_points: Callable[[], None] | None = None
     """Gives the reconstruction its last points and colours; called once, when images are scored."""
 
 

@@ -84,14 +84,17 @@ def _failing(model: pycolmap.Reconstruction, max_error_px: float) -> set[int]:
     for point_id, point in model.points3D.items():
         if point.error * point.track.length() <= max_error_px:  # the sum: none is above
             continue
-        errors = [_error_px(model, point, element) for element in point.track.elements]
+        errors = [
+            _observation_error_px(model, point, element)
+            for element in point.track.elements
+        ]
         num_within = sum(error <= max_error_px for error in errors)
         if num_within < 2:
             found.add(point_id)
     return found
 
 
-def _error_px(
+def _observation_error_px(
     model: pycolmap.Reconstruction,
     point: pycolmap.Point3D,
     element: pycolmap.TrackElement,

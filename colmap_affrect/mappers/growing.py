@@ -84,7 +84,7 @@ class Grower:
             self._complete(mapper)
         return model
 
-    def finish(
+    def adjust_fully(
         self, model: pycolmap.Reconstruction, max_iterations: int = FINAL
     ) -> None:
         """Triangulate again and adjust a model, by default until it converges.

@@ -219,8 +219,8 @@ def _write_models(
     summaries = list[ModelSummary]()
     for index, model in enumerate(models):
         path = folder / str(index)
-        if model.mapped.finish:
-            model.mapped.finish()
+        if model.mapped.add_last_points:
+            model.mapped.add_last_points()
         write_model(model.mapped.reconstruction, path)
         summary = _summary(model, task)
         write_summary(summary, path)
@@ -316,7 +316,7 @@ def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
         bridges={name: bridge for name, bridge in bridges.items() if name in focals_px},
         taken_out={name: one.reasons for name, one in scored.taken_out.items()},
         focals_px=focals_px,
-        moves=scored.mapped.moves,
+        hypotheses=scored.mapped.hypotheses,
         tie_points=tie_points_of(task, graph).report(model),
         one_view=_same_viewpoint_names(model, graph, task),
     )

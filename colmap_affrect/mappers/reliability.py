@@ -59,7 +59,7 @@ def _log_ratio_reason(features: ReliabilityFeatures) -> Doubt:
     return Doubt("few_matches")
 
 
-def _agreement(features: ReliabilityFeatures) -> float:
+def _agreement_value(features: ReliabilityFeatures) -> float:
     return features.agreement
 
 
@@ -123,7 +123,7 @@ def _focal_spread_reason(features: ReliabilityFeatures) -> Doubt:
 
 TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
     "log-likelihood ratio": Term(_log_ratio, _log_ratio_reason),
-    "agreement": Term(_agreement, _agreement_reason),
+    "agreement": Term(_agreement_value, _agreement_reason),
     "three-view points": Term(_three_view_points, _three_view_points_reason),
     "focal observability": Term(_focal_observability, _focal_observability_reason),
     "given focal length": Term(_given_focal, _given_focal_reason),

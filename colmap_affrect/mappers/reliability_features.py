@@ -168,7 +168,7 @@ def features_of(
         bridge = bridges.get(image_id)
         found[names[image_id]] = ReliabilityFeatures(
             log_likelihood_ratio=log_ratio - context.priors[key].cost_of(camera),
-            agreement=_agreement(context, image_id),
+            agreement=_agreeing_share(context, image_id),
             num_three_view_points=num_three_view_points[image_id],
             focal_growth=growths.get(key, 1.0),
             focal_px=focal_px,
@@ -198,7 +198,7 @@ def _pair_log_ratio(context: _ModelContext, image_id: int) -> float:
     return total
 
 
-def _agreement(context: _ModelContext, image_id: int) -> float:
+def _agreeing_share(context: _ModelContext, image_id: int) -> float:
     """Return the share of the inliers of an image's pairs that agree with the model."""
     pairs = context.pairs_of[image_id]
     if not pairs:

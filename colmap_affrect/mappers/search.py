@@ -86,7 +86,7 @@ class Search:
                 break
         grower = self.grower(graph)
         for mapped in best.models:
-            grower.finish(mapped.reconstruction)
+            grower.adjust_fully(mapped.reconstruction)
         return best.models
 
     def extend_models(
@@ -104,13 +104,13 @@ class Search:
         first = pycolmap.Reconstruction(known[0].reconstruction)
         search = self._with_focals_of(first)
         grower = search.grower(graph)
-        grower.finish(first)
+        grower.adjust_fully(first)
         grown = search._grown(graph, graph.unexplained_by(first))
         models = [replace(known[0], reconstruction=first), *known[1:], *grown]
         models.sort(key=self._score, reverse=True)
         found = search.with_bridges(graph, models)
         for mapped in found:
-            grower.finish(mapped.reconstruction)
+            grower.adjust_fully(mapped.reconstruction)
         return found
 
     def with_bridges(
@@ -220,7 +220,7 @@ class Search:
             return _Attempt([], -math.inf, agrees=False)
         model = found[0].reconstruction
         if self.unknown:
-            self.grower(graph).finish(model, MEDIUM)
+            self.grower(graph).adjust_fully(model, MEDIUM)
         agrees = search._agrees(model)
         score = self.scorer.score(model)
         if agrees:  # with other focal lengths, bridges have a wrong length

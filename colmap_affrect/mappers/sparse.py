@@ -78,7 +78,7 @@ class SparseMapper(IncrementalMapper):
             show: Is told how many images have been registered so far.
 
         Returns:
-            The models; their last points come by ``finish``.
+            The models; their last points come by ``add_last_points``.
 
         Raises:
             AffrectError: When COLMAP ends with an error.
@@ -110,7 +110,7 @@ class SparseMapper(IncrementalMapper):
             found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
         best = _joined_by_tie_points(search, search.with_bridges(graph, found))
         if not task.extend:
-            return self._with_finish(best, task, graph, native)
+            return self._with_last_points(best, task, graph, native)
         for mapped in best:
             task.extend.restore(mapped.reconstruction)
             _extract_colors(mapped.reconstruction, task, native)
@@ -143,9 +143,9 @@ class SparseMapper(IncrementalMapper):
         for mapped in best:
             if not has_rigs(mapped.reconstruction):  # which tell the scale
                 mapped.reconstruction.normalize()  # as COLMAP does
-        return self._with_finish(best, task, graph, native)
+        return self._with_last_points(best, task, graph, native)
 
-    def _with_finish(
+    def _with_last_points(
         self,
         models: Sequence[MappedModel],
         task: MappingTask,
@@ -154,12 +154,15 @@ class SparseMapper(IncrementalMapper):
     ) -> list[MappedModel]:
         """Have models get the points of all tracks, and colours, once their images are scored."""
 
-        def finish(model: pycolmap.Reconstruction) -> None:
+        def add_last_points(model: pycolmap.Reconstruction) -> None:
             tie_points = tie_points_of(task, graph)
             complete_points(model, graph, native, self.options.noise_px, tie_points)
             _extract_colors(model, task, native)
 
-        return [replace(m, finish=partial(finish, m.reconstruction)) for m in models]
+        return [
+            replace(m, add_last_points=partial(add_last_points, m.reconstruction))
+            for m in models
+        ]
 
     def _search(
         self,
@@ -306,9 +309,11 @@ class _HypothesisTest:
     def _take(
         self, hypothesis: _Hypothesis, models: Sequence[MappedModel], score: float
     ) -> None:
-        before = self.best[0].moves if self.best else ()
-        moves = _without_duplicates((*before, hypothesis.name, *models[0].moves))
-        self.best = [replace(mapped, moves=moves) for mapped in models]
+        before = self.best[0].hypotheses if self.best else ()
+        hypotheses = _without_duplicates(
+            (*before, hypothesis.name, *models[0].hypotheses)
+        )
+        self.best = [replace(mapped, hypotheses=hypotheses) for mapped in models]
         self.score = score
 
     def _try_colmap(self) -> None:
@@ -326,7 +331,7 @@ class _HypothesisTest:
         found = list[MappedModel]()
         for mapped in models[:NUM_COLMAP_MODELS]:
             model = grower.restart_from(mapped.reconstruction)
-            grower.finish(model)
+            grower.adjust_fully(model)
             found.append(MappedModel(model))
         found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
         found = search.with_bridges(search.graph, found)
@@ -344,7 +349,7 @@ class _HypothesisTest:
         if model is None or self.own.scorer.score(model) <= self.score + MIN_SCORE_GAIN:
             return
         changed = replace(
-            first, reconstruction=model, moves=(*first.moves, OWN_CAMERAS)
+            first, reconstruction=model, hypotheses=(*first.hypotheses, OWN_CAMERAS)
         )
         self.best = with_own_images([changed, *self.best[1:]])
         self.search = self.own
@@ -368,8 +373,8 @@ def _joined_by_tie_points(
     return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 
 
-def _without_duplicates(moves: Sequence[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(moves))
+def _without_duplicates(hypotheses: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(hypotheses))
 
 
 def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
@@ -378,9 +383,9 @@ def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedMo
     found = list[MappedModel]()
     for mapped in previous:
         model = grower.restart_from(mapped.reconstruction)
-        grower.finish(model)
-        moves = _without_duplicates((*mapped.moves, AGAIN))
-        found.append(replace(mapped, reconstruction=model, moves=moves))
+        grower.adjust_fully(model)
+        hypotheses = _without_duplicates((*mapped.hypotheses, AGAIN))
+        found.append(replace(mapped, reconstruction=model, hypotheses=hypotheses))
     return with_own_images(found)
 
 
@@ -407,7 +412,7 @@ def _with_own_cameras(
             return None
     grower = own.grower(graph)
     changed = grower.restart_from(model)
-    grower.finish(changed)
+    grower.adjust_fully(changed)
     return changed
 
 
@@ -426,4 +431,4 @@ def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
     if not has_all or not quick.is_certain(model, search.graph):
         return []
     search.grower(graph).triangulate_all(model)  # its poses are right
-    return [replace(models[0], moves=(SOME_TRACKS,))]
+    return [replace(models[0], hypotheses=(SOME_TRACKS,))]

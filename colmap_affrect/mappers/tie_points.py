@@ -75,7 +75,7 @@ class TiePoints:
         found = list[ImageResidual]()
         for name, image_id, mark in self.observed(model):
             position = model.points3D[mark.point3D_id].xyz
-            error_px = _error_px(model, image_id, mark.xy, position)
+            error_px = _mark_error_px(model, image_id, mark.xy, position)
             found.append(ImageResidual(name, image_id, error_px))
         return found
 
@@ -112,12 +112,12 @@ class TiePoints:
                 position = triangulated(model, others)
                 if (
                     position is None
-                    or _max_error_px(model, others, position) > AGREEING_PX
+                    or _max_mark_error_px(model, others, position) > AGREEING_PX
                 ):
                     continue
                 num_points[image_id] += 1
                 num_far[image_id] += (
-                    _error_px(model, image_id, xy, position) > AGREEING_PX
+                    _mark_error_px(model, image_id, xy, position) > AGREEING_PX
                 )
         found = list[int]()
         for image_id, num in num_far.items():
@@ -215,7 +215,7 @@ def _position(
     return surroundings.position(image_id, xy)
 
 
-def _error_px(
+def _mark_error_px(
     model: pycolmap.Reconstruction, image_id: int, xy: Array, position: Array
 ) -> float:
     """Return a reprojection error, at most the diagonal of the image, also of points behind it."""
@@ -226,13 +226,13 @@ def _error_px(
     return diagonal if projected is None else min(diagonal, math.dist(projected, xy))
 
 
-def _max_error_px(
+def _max_mark_error_px(
     model: pycolmap.Reconstruction,
     marks: Mapping[int, Array],
     position: Array,
 ) -> float:
     return max(
-        _error_px(model, image_id, xy, position) for image_id, xy in marks.items()
+        _mark_error_px(model, image_id, xy, position) for image_id, xy in marks.items()
     )
 
 

@@ -24,7 +24,7 @@ SOURCES = {  # how a summary calls where focal lengths are from; others by their
 
 OF_LARGEST = (  # what ``report.json`` has of the largest model under its own name
     "registered_names", "probabilities", "unsure", "doubtful", "mean_track_length",
-    "mean_reprojection_error_px", "moves", "one_view",
+    "mean_reprojection_error_px", "hypotheses", "one_view",
 )  # fmt: skip
 
 SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
@@ -294,7 +294,7 @@ class ModelSummary:
     """Why images that were surely wrong were taken out."""
     focals_px: dict[str, float] = field(default_factory=dict)
     """Focal length of the camera of each image."""
-    moves: tuple[str, ...] = ()
+    hypotheses: tuple[str, ...] = ()
     """What made the model, by the sparse mapper."""
     tie_points: tuple[Residual, ...] = ()
     """Residuals of the tie points by hand, the worst first."""

@@ -86,7 +86,7 @@ def _models_before(
     models = list[MappedModel]()
     for folder, summary in zip(model_folders(sparse_path), summaries, strict=True):
         model = pycolmap.Reconstruction(str(folder))
-        models.append(MappedModel(model, summary.bridges, summary.moves))
+        models.append(MappedModel(model, summary.bridges, summary.hypotheses))
     return models
 
 

@@ -142,7 +142,7 @@ def spent(context: Context) -> Row:
     models = escalation.state.models()
     situation = escalation.state.situation(escalation.state.weights(models), models)
     names = [level.name for level in situation.levels]
-    looked_at = context.matches.state.looked_at
+    learned_models = context.matches.state.learned_models
     return {
         "first_model_s": round(situation.first_model_s, 1),
         "spent_s": round(situation.spent_s(), 1),
@@ -158,7 +158,7 @@ def spent(context: Context) -> Row:
             ),
             3,
         ),
-        "scores": vars(looked_at) if looked_at else None,
+        "scores": vars(learned_models) if learned_models else None,
     }
 
 

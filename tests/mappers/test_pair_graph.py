@@ -60,7 +60,7 @@ def test_a_model_of_some_tracks_gets_the_points_of_all(
     )
     assert len(model_poses(model.reconstruction)) == NUM_IMAGES
     assert model.reconstruction.num_points3D() > 2000
-    assert model.moves[-1] == SOME_TRACKS
+    assert model.hypotheses[-1] == SOME_TRACKS
 
 
 def test_pairs_leave_a_graph_and_what_the_mappers_see(path: Path) -> None:
