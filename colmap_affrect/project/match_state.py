@@ -19,7 +19,7 @@ Size = tuple[int, int]  # width and height in px
 Cell = tuple[int, int]  # column and row
 
 NOTHING_TO_GO_ON_FROM = 1.0
-"""Score of models below which not one relative pose is expected to be right."""
+"""Score of models below which not one relative pose is expected to be right; theory."""
 
 
 @dataclass(frozen=True)

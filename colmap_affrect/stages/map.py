@@ -22,7 +22,8 @@ from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 
-NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
+# Pairs that are named for each image that was not registered; display
+NUM_BEST_PAIRS = 3
 
 
 def map_images(
