@@ -26,9 +26,8 @@ OUTSIDE = {
 # What is logged is shown by the command line, or as the program says that uses the package.
 logging.getLogger("colmap_affrect").addHandler(logging.NullHandler())
 
-MAX_REASON = 200  # characters of what a reader says; display
-# Of a line that is shown, which may name anything that is in a file; display
-MAX_LINE = 2000
+MAX_REASON = 200  # characters of what a reader says
+MAX_LINE = 2000  # of a line that is shown, which may name anything that is in a file
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
     "photographs, --set max_image_size_px=1600, or --device cpu where that of a GPU is full"
@@ -136,16 +135,7 @@ class PartError(AffrectError):
 def damage(
     path: Path, mend: str, error_class: type[AffrectError] = StoreError
 ) -> Iterator[None]:
-    """Say of a file that cannot be read in one line that it is damaged, and what mends it.
-
-    Args:
-        path: of the file, which the context reads.
-        mend: what to do about it, to end the line.
-        error_class: of the error.
-
-    Raises:
-        AffrectError: of that class, where reading ends with one of ``DAMAGE``.
-    """
+    """Say of a file that cannot be read in one line that it is damaged, and what mends it."""
     try:
         yield
     except AffrectError:
@@ -180,8 +170,8 @@ def made_again(stage: str, folder: Path) -> str:
 
 # Everything that is shown goes through here: names come out of files, and may be made to mislead.
 
-MAX_NAMES = 3  # examples in a line; display
-EXIT_INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT; format
+MAX_NAMES = 3  # examples in a line
+EXIT_INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 INTERRUPTED = "interrupted; run the same command again to go on"
 
 

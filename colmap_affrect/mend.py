@@ -45,13 +45,9 @@ def watched(
 ) -> Iterator[None]:
     """Mend the database before a command works in a folder, keep it open, and seal it in the end.
 
-    A database of the user is refused where COLMAP could not use it.
-
-    Args:
-        context: of the folder.
-        follows: bring the database up to the last stage that was run; else the command does that.
-        maps: the command only maps, and takes a changed database as it is, with a warning.
-        discards: the command discards all that is there, so that nothing has to be mended.
+    ``follows``: bring it up to the last stage that was run; else the command does that. A command
+    that only ``maps`` takes a changed one as it is, with a warning; one that ``discards`` all there
+    is needs nothing mended. A database of the user is refused where COLMAP could not use it.
     """
     workspace = context.workspace
     path = context.workspace.database
@@ -107,8 +103,7 @@ def _why_lost(workspace: Workspace) -> str:
     if not begun or _stamp(path) in sealed:
         return ""
     try:
-        fault = damage_of(path)  # of an index perhaps, which rows do not show
-        if fault:
+        if fault := damage_of(path):  # of an index perhaps, which rows do not show
             return f"cannot be used ({fault})"
         if sealed:
             return "" if rows_digest(path) in sealed else CHANGED
@@ -133,8 +128,7 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
         else f"{workspace.features.name} and {workspace.matches.name}"
     )
     hint = ""
-    kept = _put_aside(workspace.database)
-    if kept:
+    if kept := _put_aside(workspace.database):
         again = f"map --from-database {shlex.quote(str(kept))} --output-path OTHER"
         hint = f"; 'colmap-affrect {again}' maps what was there"
     logger.warning(
@@ -158,10 +152,8 @@ def _put_aside(path: Path) -> Path | None:
     """Rename a database that others have changed, and return its new name, None if it is gone."""
     if not path.exists():
         return None
-    kept = path.with_name("database.changed.db")
-    numbers = count(1)
-    while kept.exists():
-        kept = path.with_name(f"database.changed{next(numbers)}.db")
+    names = (f"database.changed{number or ''}.db" for number in count())
+    kept = next(new for name in names if not (new := path.with_name(name)).exists())
     for file, target in zip(database_files(path), database_files(kept), strict=True):
         if file.exists():
             file.replace(target)

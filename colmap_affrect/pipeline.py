@@ -198,13 +198,7 @@ def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> 
 def one_stage(
     name: str, context: Context, *, overwrite: bool = False
 ) -> Iterator[Context]:
-    """Lock the folder of a context for one stage, and bring its database up to date before.
-
-    Args:
-        name: of the stage.
-        context: where it works.
-        overwrite: it discards what it has left before.
-    """
+    """Lock the folder of a context for one stage, and bring its database up to date before."""
     is_first = name == "extract"
     discards = is_first and overwrite
     with (
@@ -252,14 +246,7 @@ def extract(
 ) -> StageReport:
     """Extract features into ``features.h5``, cameras and keypoints into ``database.db``.
 
-    Args:
-        image_path: folder of the photographs.
-        output_path: folder of the results.
-        options: as of :func:`run`; those of later stages are kept for these.
-        executor: where images are worked on; by default in threads of this process.
-        overwrite: discard what is there.
-        progress: where to show it.
-        keywords: fields of ``options``.
+    Arguments are those of :func:`run`; options of later stages are kept for these.
 
     Returns:
         How many images were extracted, and why others were not.
@@ -479,19 +466,7 @@ def map_and_report(
     overwrite: bool = False,
     page: bool = True,
 ) -> RunReport:
-    """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``.
-
-    Args:
-        context: of the workspace.
-        mapper: what makes models.
-        extend: the finished model that new photographs are registered into; None for new models.
-        earlier: what earlier stages of the same command did.
-        overwrite: map again where nothing has changed.
-        page: whether to write ``report.html``.
-
-    Returns:
-        The report.
-    """
+    """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
     workspace = context.workspace
     options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))

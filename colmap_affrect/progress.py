@@ -14,11 +14,11 @@ from tqdm import tqdm
 from colmap_affrect.errors import OptionError, shown
 
 Advance = Callable[[int], None]  # report that so many more units are done
-NUM_PLAIN_LINES = 10  # display
+NUM_PLAIN_LINES = 10
 COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 """Of an image or a pair in a stage, in the time of an image in ``extract``: measured on runs
 of 8 to 1000 photographs, good for a factor of 2."""
-# Of a stage: before, it has loaded files and networks, and says too little; display
+# Of a stage: before, it has loaded files and networks, and says too little
 MIN_ELAPSED_S = 3.0
 
 
@@ -43,12 +43,7 @@ class Forecast:
         self._clock = clock
 
     def begin(self, name: str, total: int) -> None:
-        """Note that a stage begins.
-
-        Args:
-            name: of the stage.
-            total: its units, images or pairs.
-        """
+        """A stage begins with so many units."""
         is_known = self._costs.pop(name, None) is not None
         self._cost = is_known * COSTS.get(name, 0.0) * total
         self._start_s = self._clock()
@@ -120,16 +115,7 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """Show one stage for as long as the context lasts.
-
-        Args:
-            name: of the stage.
-            total: how many units it has.
-            unit: what these are, in the plural.
-
-        Yields:
-            What is called with the number of units that are done since.
-        """
+        """Show one stage of ``total`` units for as long as the context lasts."""
         forecast = self.forecast
         stream = self.stream
         title = self.title + name
@@ -148,8 +134,7 @@ class Progress:
         def advance_lines(count: int) -> None:
             nonlocal num_lines
             text = left(count)
-            wanted = done * self.num_plain_lines // total
-            if wanted > num_lines:
+            if (wanted := done * self.num_plain_lines // total) > num_lines:
                 num_lines = wanted
                 print_line(text)
 
@@ -202,13 +187,7 @@ def _is_notebook() -> bool:
 
 
 def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
-    """Print what people or programs read; see :mod:`colmap_affrect.errors`.
-
-    Args:
-        text: what is printed, its control characters made harmless.
-        file: where; None is the standard output.
-        end: what follows the text.
-    """
+    """Print what people or programs read; see :mod:`colmap_affrect.errors`."""
     print(shown(str(text)), file=file, end=end)
 
 
