@@ -54,7 +54,7 @@ DEVIATION_FLOOR = 0.01 * 255
 # Added to the deviation of the whole image (the value of the paper's authors)
 PAPER_DEVIATION_FLOOR = 1e-6
 MAX_NORMALIZED = 6.0
-"""Largest normalized value, as in the fully convolutional network of AffNet's authors."""
+"""Largest normalized value, as in the fully convolutional network of AffNet's authors; paper."""
 # Half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
 PATCH_SIGMAS = 12.0
 BATCH_SIZE = 256  # patches that go through the network at once; resource

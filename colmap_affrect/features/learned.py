@@ -35,7 +35,7 @@ class AlikedOptions(FeatureOptions):
     in_color: ClassVar[bool] = True
     bytes_per_px: ClassVar[int] = 1600  # measured
     has_shapes: ClassVar[bool] = False
-    max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
+    max_num_features: Annotated[int, within(1, 1_000_000)] = 2048  # paper
     """Most features of one view, by response, as its authors match them."""
     model: Literal["n16", "n16rot"] = "n16"
     """``n16rot`` was trained with rotated images."""

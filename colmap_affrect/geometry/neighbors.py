@@ -20,7 +20,7 @@ MAX_RELATIVE_ERROR = 0.5
 MIN_DISTANCE_PX = 4.0
 """Distance of a neighbour in both images. Nearer matches are of the same point, in several
 orientations or warps; judged."""
-# Matches that are compared with all others at a time, which bounds memory
+# Matches that are compared with all others at a time, which bounds memory; resource
 CHUNK_ROWS = 512
 
 

@@ -19,7 +19,8 @@ half a degree."""
 EXACT_RATIO = 0.9
 """Stationary matches whose motion is zero within the tolerance, as a share of all; judged: some
 keypoints are badly localized."""
-MAX_COMPARED = 300  # motions that are compared with each other, which bounds time
+# Motions that are compared with each other, which bounds time; resource
+MAX_COMPARED = 300
 MAX_SLOPE = 0.5
 """Difference of the motions of two points of one object, as a share of their distance; judged."""
 # Of a rotation to the motions that agree, each of which may make more agree; resource

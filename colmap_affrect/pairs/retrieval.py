@@ -22,7 +22,8 @@ NUM_WORDS = 256  # resource
 NUM_SAMPLED_IMAGES = 512
 NUM_SAMPLES = 1 << 15  # descriptors that the vocabulary is built from; resource
 NUM_ITERATIONS = 10  # resource
-VECTORS_AT_ONCE = 512  # compared with as many others at a time, which bounds memory
+# Compared with as many others at a time, which bounds memory; resource
+VECTORS_AT_ONCE = 512
 
 
 def build_vocabulary(samples: Singles, random: np.random.Generator) -> Singles:

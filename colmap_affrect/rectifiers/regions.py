@@ -13,7 +13,7 @@ from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 MARGIN_PX = 16.0  # surroundings of a region that its descriptors may see, in px of the warp; judged
 CANVAS_RATIO = 2.0
 """Area of the canvas of a homography, without margin, over that of the region (the authors'
-value)."""
+value); paper."""
 
 
 @dataclass(frozen=True)
