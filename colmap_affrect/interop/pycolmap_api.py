@@ -133,13 +133,7 @@ def extract_features(  # noqa: PLR0913 (arguments are those of pycolmap)
     )
     recipe, asked = translate.extraction_recipe(extraction_options)
     shown = _Cancellable(Progress.given(progress), cancellation_token)
-    with _context(
-        database_path=database_path,
-        device=device,
-        asked=asked,
-        weights_path=weights_path,
-        progress=shown,
-    ) as context:
+    with _context(database_path, device, asked, weights_path, shown) as context:
         report = extract(context, inputs, recipe, image_names=list(image_names))
     if report.failures:  # a script of pycolmap does not look at the report
         first, *_ = report.failures.values()
@@ -187,33 +181,18 @@ def _matching(kind: type) -> Callable[[Choose], Callable[..., Reports]]:
             )
             matching, asked = translate.matching_options(matching_options)
             shown = _Cancellable(Progress.given(progress), cancellation_token)
-            with _context(
-                database_path=database_path,
-                device=device,
-                asked=asked,
-                weights_path=weights_path,
-                progress=shown,
-            ) as context:
+            with _context(database_path, device, asked, weights_path, shown) as context:
                 names = _described(context)
                 if names:
                     pairs = choose(_Images(context, names), pairing)
                     return _match_descriptors(
-                        context=context,
-                        pairs=pairs,
-                        matching=matching,
-                        verification=verification,
-                        asked=asked,
+                        context, pairs, matching, verification, asked
                     )
                 context.workspace.require("extract")
                 write_images_and_keypoints(context)
                 pairs = choose(_Images(context, context.features.names()), pairing)
                 return _match(
-                    context=context,
-                    pairs=pairs,
-                    matching=matching,
-                    verification=verification,
-                    asked=asked,
-                    token=cancellation_token,
+                    context, pairs, matching, verification, asked, cancellation_token
                 )
 
         matched.__name__ = matched.__qualname__ = choose.__name__
@@ -315,25 +294,11 @@ def _match_descriptors(
         listed = _of_different_frames(path, listed)
     num = match_database(path, listed, nearest, progress=context.progress)
     between = time.perf_counter()
-    reports = [
-        StageReport(
-            name="match",
-            wall_s=between - begun,
-            num_done=num,
-            num_kept=len(listed) - num,
-        )
-    ]
+    reports = [StageReport("match", between - begun, num, len(listed) - num)]
     if not asked.get("skip_geometric_verification"):
         with context.progress.stage("verify", num, "pairs") as advance:
             verify_database(path, verification, advance=advance)
-        reports.append(
-            StageReport(
-                name="verify",
-                wall_s=time.perf_counter() - between,
-                num_done=num,
-                num_kept=0,
-            )
-        )
+        reports.append(StageReport("verify", time.perf_counter() - between, num, 0))
     return tuple(reports)
 
 
@@ -566,11 +531,6 @@ def _context(
     with Workspace.beside(
         as_path(database_path, "database_path")
     ).locked() as workspace:
-        context = Context(
-            workspace=workspace,
-            resources=resources,
-            executor=executor,
-            progress=progress,
-        )
+        context = Context(workspace, resources, executor, progress)
         with watched(context):
             yield context
