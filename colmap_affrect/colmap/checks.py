@@ -70,19 +70,19 @@ MATRICES = {
 PACKED_CAMERA = struct.Struct("<IiQQBQ")
 # Numbers of COLMAP's keypoints: x, y; with scale and orientation; with an affine shape
 KEYPOINT_COLUMNS = (2, 4, 6)
-# Of the longer side: so far some programs find, or move, what is at the border; judged
+# Longer sides that keypoints may be outside: some programs find, or move, what is at the border;
+# judged
 MAX_OUTSIDE = 0.01
-MAX_OUTSIDE_PX = 2.0  # more than that; judged
-# Keypoints, none further from the corner than ...; theory: one or two may be there by chance
+MAX_OUTSIDE_PX = 2.0  # beside that, in px; judged
+# Fewest keypoints that tell their unit; theory: one or two may be near the corner by chance
 MIN_NORMALISED = 3
-# ... so many px: their unit is a side of the image, or half of one; theory
+# Largest coordinate of keypoints whose unit is a side of the image, or half of one; theory
 MAX_NORMALISED = 2.0
-# Keypoints that should fill an image, of each of so many images ...;
-# theory: so many fill more by chance
+# Fewest keypoints that should fill an image; theory: so many are in no corner by chance
 MIN_IN_A_CORNER = 100
-MIN_IMAGES_IN_A_CORNER = 3  # ... or more; none of them reaches further than ...; theory
-# ... so many sides from the upper left corner;
-# theory: those of images at half their size reach one half
+# Fewest images whose keypoints tell that they were found in smaller ones; theory
+MIN_IMAGES_IN_A_CORNER = 3
+# How far these reach at most, in sides; theory: those of images at half their size reach one half
 IN_A_CORNER = 0.6
 # One place has a few keypoints, of several orientations or shapes; judged
 MIN_AT_ONE_PLACE = 10

@@ -57,7 +57,7 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         )
         before = context.workspace.mapped_from()
         reports += _map_on(context, mapper, recipe)
-        # Perhaps there is no model
+        # Nothing changes where no pair makes a model, or all are mapped.
         has_mapped = context.workspace.mapped_from() != before
         goes_on = (
             has_mapped
