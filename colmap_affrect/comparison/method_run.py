@@ -297,7 +297,10 @@ class MethodRun:
             if not usable:
                 raise AffrectError(f"COLMAP cannot use any of the {len(names)} images")
             failures |= extract_sift(
-                self.database, self.image_path, usable, self.options.masks
+                database_path=self.database,
+                image_path=self.image_path,
+                image_names=usable,
+                masks=self.options.masks,
             )
             advance(len(names))
         known = set(image_ids(self.database))
@@ -437,4 +440,9 @@ class MethodRun:
             may_share=self.options.inputs(self.image_path).may_share,
         )
         with watch.step("map"), progress.stage("map", num_images, "images") as advance:
-            return map_database(mapper, task, folder / "sparse", advance)
+            return map_database(
+                mapper=mapper,
+                task=task,
+                sparse_path=folder / "sparse",
+                next_image=advance,
+            )

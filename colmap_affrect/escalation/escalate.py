@@ -149,7 +149,12 @@ class Escalation:
         """The recipe, prepared for all images when it is needed first."""
         context = self.context
         names = context.features.names()
-        return prepare(context.extraction, context.resources, names, context.progress)
+        return prepare(
+            options=context.extraction,
+            resources=context.resources,
+            image_names=names,
+            progress=context.progress,
+        )
 
     @property
     def has_stepped(self) -> bool:
@@ -398,7 +403,12 @@ class Escalation:
         context = self.context
         size_px = context.extraction.levels[level].max_image_size_px
         graph = context.graph
-        verifier = PairVerifier(graph.ids, graph.cameras, context.verification, size_px)
+        verifier = PairVerifier(
+            ids=graph.ids,
+            cameras=graph.cameras,
+            options=context.verification,
+            extracted_px=size_px,
+        )
         states = self.state.states()
 
         def trial_of(found: PairMatches) -> Trial:

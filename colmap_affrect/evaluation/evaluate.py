@@ -304,10 +304,10 @@ class RecipeRun:
             sides.append(Side(camera, colmap_keypoints(lafs[number])))
         indices = np.arange(len(lafs[0]))
         geometry = estimate_geometry(
-            (sides[0], sides[1]),
-            np.stack([indices, indices], axis=1),
-            VerificationOptions(random_seed=0),
-            self.recipe.extraction.levels[level].max_image_size_px,
+            sides=(sides[0], sides[1]),
+            matches=np.stack([indices, indices], axis=1),
+            options=VerificationOptions(random_seed=0),
+            extracted_px=self.recipe.extraction.levels[level].max_image_size_px,
         )
         return len(geometry.inlier_matches)
 

@@ -266,8 +266,12 @@ def _interpolated(
     num_rows, num_columns, num_channels = values.shape
     scale_x, shift_x = level_from_image[0, [0, 2]]
     scale_y, shift_y = level_from_image[1, [1, 2]]
-    row_weights = _linear_weights(scale_y, shift_y, cells[0], num_rows)
-    column_weights = _linear_weights(scale_x, shift_x, cells[1], num_columns)
+    row_weights = _linear_weights(
+        scale=scale_y, shift=shift_y, num_cells=cells[0], num_values=num_rows
+    )
+    column_weights = _linear_weights(
+        scale=scale_x, shift=shift_x, num_cells=cells[1], num_values=num_columns
+    )
     channels = []
     for number in range(num_channels):
         channels.append(row_weights @ values[:, :, number] @ column_weights.T)

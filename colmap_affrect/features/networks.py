@@ -123,7 +123,9 @@ def load_extractor(
     """
     aliked = feature.ALIKED(key, detection_threshold=score_threshold)
     computed = {"dkd.hw_grid": aliked.dkd.hw_grid}  # is in no file
-    return _ready(_with_state(aliked, path, key, computed), device)
+    return _ready(
+        _with_state(network=aliked, path=path, name=key, computed=computed), device
+    )
 
 
 def hardtfeat() -> OnPatches:

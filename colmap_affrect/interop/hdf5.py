@@ -231,7 +231,9 @@ def _import(
         keys = keys_of(features, names, image_path)
         refuse_colliding_keys(list(keys))
         with _matches(wanted, features, keys) as found:
-            rejected = import_images(new, image_path, names, cameras)
+            rejected = import_images(
+                path=new, image_path=image_path, names=names, options=cameras
+            )
             lost = sorted(keys.keys() & set(rejected))
             if lost:
                 raise ImageError(
@@ -239,7 +241,7 @@ def _import(
                     f"mode {cameras.mode} allows): {such_as(lost)}"
                 )
             unkept = _fill(new, features, keys, progress)
-            _fill_matches(new, found, wanted, progress)
+            _fill_matches(path=new, given=found, wanted=wanted, progress=progress)
         counts, num_verified = _verified(new, wanted, progress)
         _, problems = check_database(new)
     without = sorted(set(names) - set(rejected) - keys.keys())
@@ -304,7 +306,9 @@ def _fill(
         images = {image.name: image for image in database.read_all_images()}
         with progress.stage("keypoints", len(keys), "images") as advance:
             for name, key in keys.items():
-                _write_keypoints(database, images[name], features, key)
+                _write_keypoints(
+                    database=database, image=images[name], source=features, key=key
+                )
                 if not _keep_descriptors(
                     database, images[name].image_id, features, key
                 ):
@@ -414,9 +418,13 @@ def export_h5(
         matches = _match_groups(database, known, pair_ids)
         with new_results(features_path, matches_path, names=names) as made:
             with progress.stage("features", len(names), "images") as advance:
-                _write_file(made[0], features_path, features, advance)
+                _write_file(
+                    new=made[0], path=features_path, groups=features, advance=advance
+                )
             with progress.stage("matches", len(pair_ids), "pairs") as advance:
-                _write_file(made[1], matches_path, matches, advance)
+                _write_file(
+                    new=made[1], path=matches_path, groups=matches, advance=advance
+                )
         counts = (database.num_keypoints(), len(pair_ids), database.num_matches())
     without = [image.name for image in images if image.name not in names]
     left_out = {"images without keypoints are left out": without}

@@ -66,7 +66,12 @@ class LinePlanes(WithInputs):
             (third,) = {0, 1, 2} - {first, second}
             for sign in (-1.0, 1.0):  # a camera between two walls sees both sides
                 normal = sign * explanation.rotation[third]
-                items += self._warps(labels == label, normal, camera, len(items))
+                items += self._warps(
+                    is_of_plane=labels == label,
+                    normal=normal,
+                    camera=camera,
+                    first_number=len(items),
+                )
         return RectificationPlan(photograph.size, tuple(items))
 
     def _warps(
