@@ -306,7 +306,7 @@ class InitialCameras:
         found = self._exif_focal(names)
         if found.focal_px:
             source: Source = "exif-rescaled" if found.is_rescaled else "exif"
-            return StartFocal(source, found.focal_px, found.why)
+            return StartFocal(source=source, px=found.focal_px, why=found.why)
         if self.options.focal_mm:
             film_widths = self.options.focal_mm / self.options.film_width_mm
             return StartFocal("given", film_widths * max(size))

@@ -186,7 +186,7 @@ def _data(connection: sqlite3.Connection) -> list[_Datum]:
     rows = rows_of(connection, "frame_id data_id sensor_type sensor_id", "frame_data")
     for frame_id, data_id, kind, number in rows:
         sensor = _Sensor(int(kind), int(number))
-        data.append(_Datum(int(frame_id), int(data_id), sensor))
+        data.append(_Datum(frame_id=int(frame_id), data_id=int(data_id), sensor=sensor))
     return data
 
 

@@ -168,12 +168,16 @@ MEASURES = {
     "num_sure": Measure("sure", _num_sure),
     "num_doubtful": Measure("doubtful", _num_doubtful),
     "verified_pairs": Measure("pairs", lambda seed: seed.verified_pairs),
-    "points3D": Measure("points", _of_model("points3D"), 0),
-    "mean_track_length": Measure("track", _of_model("mean_track_length"), 2),
-    "mean_reprojection_error_px": Measure(
-        "px", _of_model("mean_reprojection_error_px"), 2
+    "points3D": Measure(title="points", value=_of_model("points3D"), digits=0),
+    "mean_track_length": Measure(
+        title="track", value=_of_model("mean_track_length"), digits=2
     ),
-    "median_rotation_error_deg": Measure("degrees", _median_rotation_error_deg, 2),
+    "mean_reprojection_error_px": Measure(
+        title="px", value=_of_model("mean_reprojection_error_px"), digits=2
+    ),
+    "median_rotation_error_deg": Measure(
+        title="degrees", value=_median_rotation_error_deg, digits=2
+    ),
 }
 """Numbers of every seed, by their names in JSON."""
 

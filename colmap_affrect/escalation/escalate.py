@@ -77,7 +77,9 @@ def begin(
     escalation = Escalation(context, options)
     if escalation.has_begun:
         escalation.write()
-    return escalation, StageReport("escalate", time.perf_counter() - start, 0)
+    return escalation, StageReport(
+        name="escalate", wall_s=time.perf_counter() - start, num_done=0
+    )
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,9 @@ def matched_again(context: Context) -> Tried:
         return Tried()
     situation = state.situation(weights, models)
     effort = escalation.matches.state.effort or context.effort
-    return Tried(effort, tuple(tried(situation)), tuple(untried(situation)))
+    return Tried(
+        effort=effort, tried=tuple(tried(situation)), untried=tuple(untried(situation))
+    )
 
 
 @dataclass(frozen=True)
@@ -222,7 +226,7 @@ class Escalation:
             self.match_at(step.pairs, step.level)
             wall_s = report.wall_s + time.perf_counter() - start
             num_done = report.num_done + len(step.pairs)
-            report = StageReport("escalate", wall_s, num_done)
+            report = StageReport(name="escalate", wall_s=wall_s, num_done=num_done)
             step = self.next_step()
         return report
 
@@ -289,7 +293,11 @@ class Escalation:
         states = self.state.states()
         trials = list[Trial]()
         for one in learned:
-            trials.append(Trial(one.matches, one.worth, states[one.matches.names]))
+            trials.append(
+                Trial(
+                    found=one.matches, worth=one.worth, before=states[one.matches.names]
+                )
+            )
         self._keep(trials, level)
         return {one.matches.names for one in learned}
 
@@ -412,7 +420,11 @@ class Escalation:
         states = self.state.states()
 
         def trial_of(found: PairMatches) -> Trial:
-            return Trial(found, self._worth(found, verifier), states[found.names])
+            return Trial(
+                found=found,
+                worth=self._worth(found, verifier),
+                before=states[found.names],
+            )
 
         def write(batch: Sequence[Trial]) -> None:
             keep(batch, level)

@@ -311,7 +311,9 @@ class StepPlanner:
                 continue
             known = self._of_measured(state) if level.features.has_shapes else state
             chance = statistics.chance(terms(known, wins, losses))
-            candidates.append(Candidate(pair, chance, connections))
+            candidates.append(
+                Candidate(pair=pair, chance=chance, connections=connections)
+            )
         candidates.sort(key=lambda one: (-one.photographs, one.pair))
         return candidates
 

@@ -311,7 +311,7 @@ def tried(situation: Situation) -> list[MatchedAgain]:
         if pairs:
             kind = kind_of(situation.levels[number])
             core_s = situation.seconds_spent_at(number)
-            found.append(MatchedAgain(kind, len(pairs), core_s))
+            found.append(MatchedAgain(kind=kind, num_pairs=len(pairs), core_s=core_s))
     return found
 
 
@@ -324,5 +324,9 @@ def untried(situation: Situation) -> list[MatchedAgain]:
         step = situation.best_step(number, math.inf)
         if is_hopeful(step, situation):
             kind = kind_of(situation.levels[number])
-            found.append(MatchedAgain(kind, step.num_pairs, step.all_seconds))
+            found.append(
+                MatchedAgain(
+                    kind=kind, num_pairs=step.num_pairs, core_s=step.all_seconds
+                )
+            )
     return found

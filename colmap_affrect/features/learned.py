@@ -98,7 +98,7 @@ class Aliked(FeatureExtractor):
             responses = _array(scores[rows])
         radii_px = np.full(len(keypoints), RADIUS_PX)
         lafs = lafs_from_keypoints(keypoints, radii_px, np.zeros(len(keypoints)))
-        return LocalFeatures(lafs, responses, descriptors)
+        return LocalFeatures(lafs=lafs, responses=responses, descriptors=descriptors)
 
 
 def _pixels(image: GrayImage | ColorImage) -> Tensor:

@@ -82,7 +82,11 @@ class RootSift(FeatureExtractor):
             ordered.angles_rad[kept],
         )
         described = descriptors[ordered.order[kept]].astype(np.float32)
-        return LocalFeatures(lafs, ordered.responses[kept], root_normalized(described))
+        return LocalFeatures(
+            lafs=lafs,
+            responses=ordered.responses[kept],
+            descriptors=root_normalized(described),
+        )
 
 
 def root_normalized(descriptors: Floats) -> Singles:
@@ -166,5 +170,7 @@ def detect_dog(
     radii_px = MEASUREMENT_SIGMAS * ordered.sigmas_px[kept]
     lafs = lafs_from_keypoints(ordered.points[kept], radii_px, np.zeros(len(kept)))
     return LocalFeatures(
-        lafs, ordered.responses[kept], np.zeros((len(kept), 0), np.float32)
+        lafs=lafs,
+        responses=ordered.responses[kept],
+        descriptors=np.zeros((len(kept), 0), np.float32),
     )

@@ -301,7 +301,11 @@ def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
             "the known places do not fit the model in any scale and rotation"
         )
     residuals = residuals_of(new_from_old, before, after).tolist()
-    return _Fit(new_from_old, dict(zip(names, residuals, strict=True)), origin)
+    return _Fit(
+        new_from_old=new_from_old,
+        residuals=dict(zip(names, residuals, strict=True)),
+        origin=origin,
+    )
 
 
 def _scale(places: Places, distances: Sequence[tuple[str, str, float]]) -> _Fit:

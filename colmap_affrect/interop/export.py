@@ -112,7 +112,9 @@ def _source(model_path: Path, image_path: Path | None) -> Source:
     photographs = (
         image_path or Workspace(resolved(model_path).parent.parent).photographs()
     )
-    return Source(model_path, read_finished_model(model_path), photographs)
+    return Source(
+        path=model_path, model=read_finished_model(model_path), image_path=photographs
+    )
 
 
 def _write(

@@ -294,7 +294,7 @@ def _matches(
         except OptionError as error:
             raise StoreError(f"{features.path}: {error}") from error
 
-    yield GivenMatches(features.path, tuple(pairs), matched_pairs)
+    yield GivenMatches(path=features.path, pairs=tuple(pairs), read=matched_pairs)
 
 
 def _fill(

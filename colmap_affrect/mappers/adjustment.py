@@ -196,7 +196,10 @@ class Adjuster:
             model.images[image_id].camera_id for image_id in others
         } | self.constant
         config = self._config(
-            model, images, cameras & fixed, fix_gauge=image_ids is None
+            model=model,
+            image_ids=images,
+            fixed_cameras=cameras & fixed,
+            fix_gauge=image_ids is None,
         )
         problem = self._problem(model, config, cameras - fixed)
         solver = _solver_options(max_iterations, len(images))
@@ -223,7 +226,12 @@ class Adjuster:
         """
         images = sorted(model.reg_image_ids())
         cameras = {model.images[image_id].camera_id for image_id in images}
-        config = self._config(model, images, cameras & self.constant, fix_gauge=False)
+        config = self._config(
+            model=model,
+            image_ids=images,
+            fixed_cameras=cameras & self.constant,
+            fix_gauge=False,
+        )
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
         problem = self._problem(model, config, cameras - self.constant)
         wanted = pycolmap.BACovarianceOptions()

@@ -240,9 +240,9 @@ def camera_prior(
     focal = product(usual, told) if told else usual
     focal = LogNormal(focal.focal * longer_px, max(focal.sigma, LINES_SIGMA))
     return CameraPrior(
-        focal.focal,
-        focal.sigma,
-        _principal_point(camera, record, lines),
+        focal_px=focal.focal,
+        sigma=focal.sigma,
+        principal_point=_principal_point(camera, record, lines),
         given_starts_px=_starts(focal),
     )
 
@@ -390,11 +390,11 @@ def focal_contradictions(
         if by_lines.sigma < KNOWN_SIGMA and abs(difference) > tolerated:
             found.append(
                 FocalContradiction(
-                    record.names,
-                    record.source,
-                    said_px,
-                    by_lines.focal * longer_px,
-                    by_lines.sigma,
+                    names=record.names,
+                    source=record.source,
+                    said_px=said_px,
+                    lines_px=by_lines.focal * longer_px,
+                    lines_sigma=by_lines.sigma,
                 )
             )
     return found

@@ -46,15 +46,20 @@ def complete_points(
     triangulator.complete_all_tracks(finding)
     triangulator.merge_all_tracks(finding)
     by_hand = {mark.point3D_id for _, _, mark in tie_points.observed(model)}
-    _refine(model, by_hand, pycolmap.LossFunctionType.CAUCHY, noise_px)
+    _refine(
+        model=model,
+        held=by_hand,
+        loss=pycolmap.LossFunctionType.CAUCHY,
+        noise_px=noise_px,
+    )
     max_error_px = mapping.filter_max_reproj_error
     failing = _failing(model, max_error_px) - by_hand
     if failing:
         _refine(
-            model,
-            model.point3D_ids() - failing,
-            pycolmap.LossFunctionType.TRIVIAL,
-            noise_px,
+            model=model,
+            held=model.point3D_ids() - failing,
+            loss=pycolmap.LossFunctionType.TRIVIAL,
+            noise_px=noise_px,
         )
     refined = model.point3D_ids() - by_hand
     manager.filter_points3D(max_error_px, mapping.filter_min_tri_angle, refined)

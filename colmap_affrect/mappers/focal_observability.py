@@ -65,13 +65,20 @@ class _FocalTrials:
         self.priors = priors
         self.refining = refining
         self.fixed = fixed
-        adjuster = Adjuster(priors, NOISE_PX, refining, fixed)
+        adjuster = Adjuster(
+            priors=priors, noise_px=NOISE_PX, refining=refining, constant=fixed
+        )
         self.cost = max(adjuster.adjust(model, NUM_ITERATIONS), MIN_COST)
 
     def growth(self, camera_ids: Sequence[int]) -> float:
         """Return the part by which the cost grows, with the factor for which that is least."""
         fixed = self.fixed.union(camera_ids)
-        adjuster = Adjuster(self.priors, NOISE_PX, self.refining, fixed)
+        adjuster = Adjuster(
+            priors=self.priors,
+            noise_px=NOISE_PX,
+            refining=self.refining,
+            constant=fixed,
+        )
         least = math.inf
         for factor in FACTORS:
             trial = pycolmap.Reconstruction(self.model)
@@ -144,9 +151,13 @@ def fitting_focals(
     constant = frozenset(key for key in given if task.cameras[key].is_fixed)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
     fixed = with_fewer_points(model)
-    fixed_cost = Adjuster(priors, NOISE_PX, refining, constant).adjust(fixed, FINAL)
+    fixed_cost = Adjuster(
+        priors=priors, noise_px=NOISE_PX, refining=refining, constant=constant
+    ).adjust(fixed, FINAL)
     free = with_fewer_points(model)
-    free_cost = Adjuster(free_priors, NOISE_PX, refining).adjust(free, FINAL)
+    free_cost = Adjuster(
+        priors=free_priors, noise_px=NOISE_PX, refining=refining
+    ).adjust(free, FINAL)
     num = num_independent(fixed)
     gain = (fixed_cost - free_cost) * (num / max(1, fixed.compute_num_observations()))
     if gain < 0.5 * len(given) * np.log(max(2, num)):

@@ -93,7 +93,13 @@ class IncrementalMapper:
         native = self.native(task, random_seed)
         if task.image_path is None:
             native.extract_colors = False
-        run = _PipelineRun(task, native, output_path, show, task.database_path)
+        run = _PipelineRun(
+            task=task,
+            options=native,
+            output_path=output_path,
+            show=show,
+            database_path=task.database_path,
+        )
         try:
             models = run_cancellable(run.models, task.cancellation)
         except InterruptedError as error:

@@ -221,7 +221,12 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
     )
     with_matches = _probability(log_odds + mendable) * share_of_directions
     gain = with_matches - probability
-    return Confidence(probability, _main_reasons(losses), gain, share_of_directions)
+    return Confidence(
+        probability=probability,
+        reasons=_main_reasons(losses),
+        gain=gain,
+        noise_share=share_of_directions,
+    )
 
 
 def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:

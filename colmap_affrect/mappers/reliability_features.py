@@ -251,7 +251,11 @@ def _direction_sigmas_deg(
     fixed = frozenset(key for key in recorded if context.task.cameras[key].is_fixed)
     refining = pycolmap.BundleAdjustmentOptions()
     adjuster = Adjuster(
-        context.priors, NOISE_PX, refining, fixed, tie_points=tie_points
+        priors=context.priors,
+        noise_px=NOISE_PX,
+        refining=refining,
+        constant=fixed,
+        tie_points=tie_points,
     )
     return direction_sigmas_deg(context.model, adjuster)
 

@@ -225,7 +225,7 @@ class Search:
         score = self.scorer.score(model)
         if agrees:  # with other focal lengths, bridges have a wrong length
             score += MIN_SCORE_GAIN
-        return _Attempt(found, score, agrees)
+        return _Attempt(models=found, score=score, agrees=agrees)
 
     def _agrees(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether unknown focal lengths ended near those with which a model was made."""

@@ -270,7 +270,7 @@ class _HypothesisTest:
         self.by_colmap = by_colmap
         self.search = search
         self.own = own
-        if any(SHIFTED_AXES in mapped.moves for mapped in task.previous_models):
+        if any(SHIFTED_AXES in mapped.hypotheses for mapped in task.previous_models):
             self._begin_with_shifted_axes()
         self.best = _restarted(self.search, task.previous_models)
         self.score = search.best_score(self.best)

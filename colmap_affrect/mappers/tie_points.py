@@ -76,7 +76,9 @@ class TiePoints:
         for name, image_id, mark in self.observed(model):
             position = model.points3D[mark.point3D_id].xyz
             error_px = _mark_error_px(model, image_id, mark.xy, position)
-            found.append(ImageResidual(name, image_id, error_px))
+            found.append(
+                ImageResidual(point=name, image_id=image_id, error_px=error_px)
+            )
         return found
 
     def report(self, model: pycolmap.Reconstruction) -> tuple[Residual, ...]:
@@ -86,7 +88,13 @@ class TiePoints:
             self.residuals(model), key=lambda residual: -residual.error_px
         ):
             name = model.images[residual.image_id].name
-            found.append(Residual(residual.point, name, round(residual.error_px, 2)))
+            found.append(
+                Residual(
+                    point=residual.point,
+                    image=name,
+                    error_px=round(residual.error_px, 2),
+                )
+            )
         return tuple(found)
 
     def positions(self, model: pycolmap.Reconstruction) -> dict[str, Array]:

@@ -92,7 +92,9 @@ class DepthPlanes(WithInputs):
         outside = None
         if self.options.keep_original == "outside":
             outside = ~_union(segments, photograph.size)
-        return RectificationPlan(photograph.size, tuple(items), outside)
+        return RectificationPlan(
+            image_size=photograph.size, items=tuple(items), original_region=outside
+        )
 
 
 def planar_segments(
