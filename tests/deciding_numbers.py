@@ -22,6 +22,7 @@ import tokenize
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -189,6 +190,7 @@ def is_of_options(node: ast.ClassDef) -> bool:
     return any(name.endswith("Options") for name in names)
 
 
+@cache
 def all_numbers() -> list[Number]:
     """Return the numbers of the package, by file and line."""
     found = list[Number]()
