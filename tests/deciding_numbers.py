@@ -18,7 +18,6 @@ from __future__ import annotations
 import ast
 import re
 import sys
-import tokenize
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -120,11 +119,6 @@ class Module:
         text = path.read_text(encoding="utf-8")
         self._tree = ast.parse(text)
         self._lines = text.splitlines()
-        self._comments = dict[int, str]()
-        with tokenize.open(path) as file:
-            for token in tokenize.generate_tokens(file.readline):
-                if token.type == tokenize.COMMENT:
-                    self._comments[token.start[0]] = token.string.lstrip("# ")
 
     def numbers(self) -> Iterator[Number]:
         """Yield constants of the module, and defaults of options."""
@@ -138,9 +132,10 @@ class Module:
                         yield self._number(f"{found.name}.{name}", node, below)
 
     def _number(self, name: str, node: Assignment, below: str) -> Number:
-        beside = range(node.lineno, (node.end_lineno or node.lineno) + 1)
-        texts = [self._comments.get(line, "") for line in beside]
-        texts += [below, self._above(node.lineno), name.partition(".")[2]]
+        last_line = self._lines[(node.end_lineno or node.lineno) - 1]
+        beside = last_line.encode()[node.end_col_offset :].decode()
+        field = name.partition(".")[2]  # presets of COLMAP are called so
+        texts = [beside, self._above(node.lineno), below, field]
         where = f"{self.path.relative_to(ROOT)}:{node.lineno}"
         return Number(where, name, ast.unparse(node.value), " ".join(texts))
 
@@ -152,7 +147,7 @@ class Module:
         line -= 1
         while line > 0 and self._lines[line - 1].strip():
             if self._lines[line - 1].lstrip().startswith("#"):
-                block.insert(0, self._comments[line])
+                block.insert(0, self._lines[line - 1].lstrip("# "))
             elif block:
                 texts += block if is_own or block[-1].endswith(":") else []
                 block.clear()
