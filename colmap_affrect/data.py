@@ -201,7 +201,16 @@ class Rectification:
 
 
 def in_mask(mask: Mask, points: Floats, origin: tuple[int, int] = (0, 0)) -> Mask:
-    """Tell which (N, 2) points, rounded to pixels, an (h, w) mask holds that begins at origin."""
+    """Tell which points, rounded to pixels, a mask holds.
+
+    Args:
+        mask: (h, w) of a part of an image.
+        points: (N, 2) pixel-centre px of the image.
+        origin: (x, y) of the first pixel of the mask.
+
+    Returns:
+        (N,) bool.
+    """
     height, width = mask.shape
     columns, rows = (np.rint(points).astype(int) - origin).T
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)

@@ -12,8 +12,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 ATTRIBUTES = "\n\nAttributes:\n"
-MAX_WIDTH = 88  # of what is said of a field
-INDENT = 8
+MAX_WIDTH = 88  # of what is said of a field; display
+INDENT = 8  # display
 
 
 @cache

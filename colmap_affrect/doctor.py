@@ -40,10 +40,9 @@ Read = TypeVar("Read")
 Severity = Literal["error", "warning", "note"]
 """A program fails, or results are wrong; something is missing from results; worth knowing."""
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
-MAX_ITEMS_SHOWN = 5
-HARMLESS = WARNED | {
-    "camera-panorama"
-}  # problems of databases that may be of use to COLMAP
+MAX_ITEMS_SHOWN = 5  # display
+# Problems of databases that may be of use to COLMAP
+HARMLESS = WARNED | {"camera-panorama"}
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
@@ -83,7 +82,9 @@ class Diagnosis(Summarized):
             what: is wrong with it.
             advice: what helps.
         """
-        self.findings.append(Finding(severity, str(where), what, advice))
+        self.findings.append(
+            Finding(severity=severity, where=str(where), what=what, advice=advice)
+        )
         self.findings.sort(key=lambda found: SEVERITIES.index(found.severity))
 
     @property

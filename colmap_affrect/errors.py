@@ -26,8 +26,9 @@ OUTSIDE = {
 # What is logged is shown by the command line, or as the program says that uses the package.
 logging.getLogger("colmap_affrect").addHandler(logging.NullHandler())
 
-MAX_REASON = 200  # characters of what a reader says
-MAX_LINE = 2000  # of a line that is shown, which may name anything that is in a file
+MAX_REASON = 200  # characters of what a reader says; display
+# Of a line that is shown, which may name anything that is in a file; display
+MAX_LINE = 2000
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
     "photographs, --set max_image_size_px=1600, or --device cpu where that of a GPU is full"
@@ -170,8 +171,8 @@ def made_again(stage: str, folder: Path) -> str:
 
 # Everything that is shown goes through here: names come out of files, and may be made to mislead.
 
-MAX_NAMES = 3  # examples in a line
-EXIT_INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
+MAX_NAMES = 3  # examples in a line; display
+EXIT_INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT; format
 INTERRUPTED = "interrupted; run the same command again to go on"
 
 

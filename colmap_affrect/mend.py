@@ -17,7 +17,7 @@ from colmap_affrect.colmap.checks import (
     FATAL_BEFORE_MAPPING,
     refuse_unusable,
 )
-from colmap_affrect.colmap.initial_cameras import record_cameras
+from colmap_affrect.colmap.image_import import record_cameras
 from colmap_affrect.colmap.tables import damage_of, rows_digest
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.project.atomic_files import replace_text

@@ -47,15 +47,14 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.parts_of_others import PartOfOthers, methods_of, told_of
 
-EffortName = Literal[
-    "low", "normal", "high"
-]  # how much is tried for photographs in need
+# How much is tried for photographs in need
+EffortName = Literal["low", "normal", "high"]
 EFFORT_NAMES: tuple[EffortName, ...] = get_args(EffortName)
 PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
 MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
-MAX_KNOWN = 40  # names in a message
-MAX_VALUE = 200  # characters of a value in a message
-MAX_COMMENT = 96  # width of comments in printed options
+MAX_KNOWN = 40  # names in a message; display
+MAX_VALUE = 200  # characters of a value in a message; display
+MAX_COMMENT = 96  # width of comments in printed options; display
 CUSTOM = "custom"  # name of options that are no preset
 
 

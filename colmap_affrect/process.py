@@ -24,7 +24,7 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.parallel.subprocesses import end_with
 
-# That a command has to end after Ctrl-C or SIGTERM, before it is killed
+# That a command has to end after Ctrl-C or SIGTERM, before it is killed; resource
 PATIENCE_S = 4.0
 WITHOUT_MEMORY = " (perhaps for want of memory)"
 KEPT = (

@@ -14,11 +14,11 @@ from tqdm import tqdm
 from colmap_affrect.errors import OptionError, shown
 
 Advance = Callable[[int], None]  # report that so many more units are done
-NUM_PLAIN_LINES = 10
+NUM_PLAIN_LINES = 10  # display
 COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 """Of an image or a pair in a stage, in the time of an image in ``extract``: measured on runs
 of 8 to 1000 photographs, good for a factor of 2."""
-# Of a stage: before, it has loaded files and networks, and says too little
+# Of a stage: before, it has loaded files and networks, and says too little; display
 MIN_ELAPSED_S = 3.0
 
 

@@ -118,7 +118,7 @@ class ExtractionOptions(Options):
     """Features of the image and its warps."""
     depth: DepthOptions = DepthOptions()
     """Depth maps, for rectifiers that read them."""
-    max_image_size_px: ImageSize = 2400
+    max_image_size_px: ImageSize = 2400  # resource
     """Larger images are shrunk to this longer side before extraction, which bounds memory. COLMAP's
     limit for SIFT is 3200."""
     stretch_contrast: bool = True
@@ -133,7 +133,15 @@ class ExtractionOptions(Options):
             features = item.features or self.features
             size_px = item.max_image_size_px or self.max_image_size_px
             base = _base_of(features, size_px, found)
-            found.append(Level(item.rectifier, features, size_px, item.matching, base))
+            found.append(
+                Level(
+                    rectifier=item.rectifier,
+                    features=features,
+                    max_image_size_px=size_px,
+                    matching=item.matching,
+                    base=base,
+                )
+            )
         return tuple(found)
 
     @property
@@ -178,6 +186,7 @@ class ExtractionOptions(Options):
 class EscalateOptions(Options):
     """Which pairs are escalated: those of images that a model lost, or is not sure of."""
 
+    # COLMAP's init_min_num_inliers: such a pair may begin a model
     strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
     """Pairs with as many need nothing more, where their images have ``guided.min_num_tracks``."""
 

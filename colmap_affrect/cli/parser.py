@@ -221,7 +221,7 @@ GIVEN_MATCHES = "--matches-path@given --match-type --match-list-path@given"
 BY_HAND = "--tie-points --reject-pair --leave-out"
 MODEL = f"--extend --refine-existing {BY_HAND} --random-seed --json --no-page"
 
-MAX_UNGROUPED = 12  # flags of a command that help lists in one go
+MAX_UNGROUPED = 12  # flags of a command that help lists in one go; display
 GROUPS = {
     "": "protocol --image-path --dataset-path --output-path --mask-path --camera-mode --recipe "
         "--methods --recipes --seeds --effort --max-time --overwrite --features-path "

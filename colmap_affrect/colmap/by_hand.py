@@ -24,7 +24,7 @@ from colmap_affrect.project.paths import GivenPath
 from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.tables import read_table
 
-SIGMA_PX = 3.0  # standard deviation of a mark by hand
+SIGMA_PX = 3.0  # standard deviation of a mark by hand; judged
 COLUMNS = {
     "point": ("point", "marker", "label"),
     "photograph": ("photograph", "photo", "image", "camera"),
@@ -32,17 +32,16 @@ COLUMNS = {
     "y": ("py", "y"),
 }
 """What a table of tie points may call its columns; x and y beside px and py are those of points."""
+# COLMAP's kinds of keypoints
 SIZE_COLUMNS = {4: [2], 6: [2, 5]}
 """Columns of keypoints that hold a radius, or the diagonal of a shape, by the number of columns."""
 Marks = Mapping[str, Mapping[str, Array]]
 """(2,) px from the upper left corner of the image, as COLMAP has them, by point and image name."""
-Indices = Mapping[
-    str, Mapping[str, int]
-]  # numbers of keypoints, by point and image name
+# Numbers of keypoints, by point and image name
+Indices = Mapping[str, Mapping[str, int]]
 Names = Annotated[tuple[str, str], Field(strict=False)]  # a list, too
-SizeOf = Callable[
-    [str], tuple[int, int] | None
-]  # (width, height) of a photograph by its name
+# (width, height) of a photograph by its name
+SizeOf = Callable[[str], tuple[int, int] | None]
 
 
 def unknown_size(_: str) -> None:
@@ -249,7 +248,9 @@ def read_marks(
     full_names = _full_names(names)
     headers = [*chain(*COLUMNS.values()), "z"]
     marks = defaultdict[str, dict[str, Array]](dict)
-    for place, row in read_table(path, where, headers, key="", usual=tuple(COLUMNS)):
+    for place, row in read_table(
+        path=path, where=where, columns=headers, key="", usual=tuple(COLUMNS)
+    ):
         point = _cell(row, "point")
         photograph = _cell(row, "photograph")
         if not point or not photograph:

@@ -41,9 +41,8 @@ class CameraRecord:
     focal_px: float  # in px of the stored file; the mean of two
     why: str = ""  # what was decided and for what reason, one clause
     size: tuple[int, int] = (0, 0)  # (width, height) of its images in px
-    given: tuple[
-        Given, ...
-    ] = ()  # what of the intrinsics is the user's, to be left as it is
+    # What of the intrinsics is the user's, to be left as it is
+    given: tuple[Given, ...] = ()
     # By EXIF, where nothing tells the size of the sensor, and so the px
     lens_mm: float = 0.0
     uncropped_px: float = 0.0  # what EXIF says of a crop, if it was not scaled; else 0
@@ -123,7 +122,7 @@ def _split(text: object) -> object:
     return numbers
 
 
-MOST = 1e7  # px, or mm: nothing can be computed with cameras of larger numbers
+MOST = 1e7  # px, or mm: nothing can be computed with cameras of larger numbers; damage
 Positive = Annotated[float, pydantic.Field(gt=0.0, le=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, pydantic.Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 

@@ -9,8 +9,9 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.parallel.executor import return_freed_memory
 
 Result = TypeVar("Result")
-POLL_S = 0.2
-LEAVE_AFTER_S = 3.0  # that a call has to end after it was cancelled; some never look
+POLL_S = 0.2  # resource: how long it takes at most to notice
+# That a call has to end after it was cancelled; some never look; resource
+LEAVE_AFTER_S = 3.0
 
 
 def run_cancellable(

@@ -56,30 +56,35 @@ FATAL_AS_IT_IS = FATAL | {"no-frame"}
 """The same for a database that is mapped without a copy, which would get frames."""
 FATAL_BEFORE_MAPPING = FATAL - {"rig-without-pose"}
 """The same where nothing is mapped yet."""
-Problems = dict[
-    str, list[str]
-]  # by kind the images, pairs or cameras concerned, if any
+# By kind the images, pairs or cameras concerned, if any
+Problems = dict[str, list[str]]
 
-MATRICES = {  # columns that hold so many float64 or nothing, by table
+# Columns that hold so many float64 or nothing, by table; format
+MATRICES = {
     "two_view_geometries": {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
     "pose_priors": {"position": 3, "position_covariance": 9, "gravity": 3},
     "rig_sensors": {"sensor_from_rig": 7},
 }
 
-PACKED_CAMERA = struct.Struct(
-    "<IiQQBQ"
-)  # id, model, size, prior, and how many parameters follow
-KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
-MAX_OUTSIDE = 0.01  # of the longer side: so far some programs find, or move, what is at the border
-MAX_OUTSIDE_PX = 2.0  # more than that
-MIN_NORMALISED = 3  # keypoints, none further from the corner than ...
-# ... so many px: their unit is a side of the image, or half of one
+# Id, model, size, prior, and how many parameters follow
+PACKED_CAMERA = struct.Struct("<IiQQBQ")
+# Numbers of COLMAP's keypoints: x, y; with scale and orientation; with an affine shape
+KEYPOINT_COLUMNS = (2, 4, 6)
+# Longer sides that keypoints may be outside: some programs find, or move, what is at the border;
+# judged
+MAX_OUTSIDE = 0.01
+MAX_OUTSIDE_PX = 2.0  # beside that, in px; judged
+# Fewest keypoints that tell their unit; theory: one or two may be near the corner by chance
+MIN_NORMALISED = 3
+# Largest coordinate of keypoints whose unit is a side of the image, or half of one; theory
 MAX_NORMALISED = 2.0
-# Keypoints that should fill an image, of each of so many images ...
+# Fewest keypoints that should fill an image; theory: so many are in no corner by chance
 MIN_IN_A_CORNER = 100
-MIN_IMAGES_IN_A_CORNER = 3  # ... or more; none of them reaches further than ...
-IN_A_CORNER = 0.6  # ... so many sides from the upper left corner
-# One place has a few keypoints, of several orientations or shapes
+# Fewest images whose keypoints tell that they were found in smaller ones; theory
+MIN_IMAGES_IN_A_CORNER = 3
+# How far these reach at most, in sides; theory: those of images at half their size reach one half
+IN_A_CORNER = 0.6
+# One place has a few keypoints, of several orientations or shapes; judged
 MIN_AT_ONE_PLACE = 10
 
 
@@ -311,9 +316,8 @@ def _are_at_one_place(points: Floats, num_keypoints: int) -> bool:
     if len(points) < MIN_AT_ONE_PLACE:
         return False
     middle = len(points) // 2
-    median = np.partition(points, middle, axis=0)[
-        middle
-    ]  # what more than half have is the median
+    # What more than half have is the median
+    median = np.partition(points, middle, axis=0)[middle]
     num_there = int((points == median).all(axis=1).sum())
     return num_there >= max(MIN_AT_ONE_PLACE, num_keypoints // 2 + 1)
 

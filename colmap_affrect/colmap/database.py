@@ -24,8 +24,9 @@ from colmap_affrect.project.stores import FeatureStore
 
 logger = logging.getLogger(__name__)
 
-BYTES_PER_ROW = 4096
-BYTES_OF_EMPTY_DATABASE = 1 << 19  # what :func:`require_database_space` reckons with
+BYTES_PER_ROW = 4096  # format: a page of SQLite
+# What :func:`require_database_space` reckons with; measured
+BYTES_OF_EMPTY_DATABASE = 1 << 19
 
 
 @contextmanager
@@ -285,9 +286,9 @@ def write_keypoints(
         database.write_keypoints(image_id, keypoints)
 
 
-DESCRIPTOR_SIZE = 128
-DESCRIPTOR_NORM = 512
-# Added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0
+DESCRIPTOR_SIZE = 128  # COLMAP's SIFT
+DESCRIPTOR_NORM = 512  # COLMAP's SIFT
+# Added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0; judged
 SIGNED_SHIFT = 0.30
 
 

@@ -3,11 +3,10 @@
 pycolmap reads the images, and their positions by GPS. Which cameras they have is decided here.
 """
 
-import logging
 import tempfile
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path, PurePosixPath
 
@@ -21,20 +20,10 @@ from colmap_affrect.colmap.cameras import (
     Given,
     GivenCamera,
     Source,
-    read_camera_records,
     read_given_cameras,
-    write_camera_records,
 )
-from colmap_affrect.colmap.cancellable import run_cancellable
-from colmap_affrect.colmap.database import (
-    camera_matrix,
-    cameras_of_images,
-    image_ids,
-    open_database,
-    require_database_space,
-    write_frame,
-)
-from colmap_affrect.errors import OptionError, lacks_memory, such_as
+from colmap_affrect.colmap.database import camera_matrix
+from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
@@ -44,21 +33,31 @@ from colmap_affrect.images.exif import (
     exif_focal,
     read_camera_tags,
 )
-from colmap_affrect.images.photographs import (
-    CameraOptions,
-    photograph_files,
-    require_folder,
-)
-from colmap_affrect.images.reading import IMAGE_SUFFIXES, why_unusable
-from colmap_affrect.project.outputs import database_files, remove_own, temporary_folder
+from colmap_affrect.images.photographs import CameraOptions, photograph_files
+from colmap_affrect.images.reading import IMAGE_SUFFIXES
 
-MAX_LINES = 5  # that are logged; report.json says all
-MAX_ASPECT = 4.0  # longer by shorter side of a photograph, that of film for panoramas
-
-logger = logging.getLogger(__name__)
+# Longer by shorter side of a photograph that no panorama is; theory: the longest film is 617 (2.8)
+MAX_ASPECT = 4.0
+# Longer side in px of the photograph that COLMAP is asked about; any, as it gives a ratio (theory)
+PROBE_SIZE_PX = 8
 
 Size = tuple[int, int]
 Group = tuple[object, ...]  # images of one group share a camera
+
+
+@dataclass(frozen=True)
+class StartFocal:
+    """The focal length that a camera starts with, and its source.
+
+    Attributes:
+        source: who knows it; "guess" if nobody does.
+        px: in px of the stored file; None for the guess, and where it is among given parameters.
+        why: what was decided and for what reason, one clause.
+    """
+
+    source: Source
+    px: float | None = None
+    why: str = ""
 
 
 class InitialCameras:
@@ -120,18 +119,25 @@ class InitialCameras:
         OptionError names the option, or file and line, and what to do. Returns a line where images
         are to share a camera that cannot, for their sizes; else an empty one.
         """
-        unknown = [n for n in self._given if n and not (self.image_path / n).is_file()]
+        unknown = list[str]()
+        for name in self._given:
+            if name and not (self.image_path / name).is_file():
+                unknown.append(name)
         self._refuse(unknown, names, str(self.image_path))
         for same in self.groups(names).values():
             given = self._given_of(same)
             for name in same:
-                size = self.size(name)
-                if given.size and size and size != given.size:
-                    raise OptionError(
-                        f"{given.where}: is {_px(given.size)}, {name} is {_px(size)}; give "
-                        "photographs of that size, or leave the model out"
-                    )
+                self._check_size(name, given)
         return self._several_sizes(names)
+
+    def _check_size(self, name: str, given: GivenCamera) -> None:
+        """Refuse an image of another size than that of its camera in a given model."""
+        size = self.size(name)
+        if given.size and size and size != given.size:
+            raise OptionError(
+                f"{given.where}: is {_px(given.size)}, {name} is {_px(size)}; give "
+                "photographs of that size, or leave the model out"
+            )
 
     def _several_sizes(self, names: Sequence[str]) -> str:
         """Say which images have several sizes that are to share a camera, the first ones found.
@@ -148,23 +154,26 @@ class InitialCameras:
                 continue
             sizes[together].add(size)
             first = firsts.setdefault(together, name)
-            if size == self.size(first):
+            first_size = self.size(first) or size
+            if size == first_size:
                 continue
-            both = f"{first} is {_px(self.size(first) or size)}, {name} is {_px(size)}"
-            if (
-                self.given(first).params
-                and self.given(first).params == self.given(name).params
-            ):
-                raise OptionError(
-                    f"{self._who(first)}: {both}, and the given parameters are of one size; give "
-                    "those of each size as params in a table (--cameras-path), or leave them out"
-                )
+            both = f"{first} is {_px(first_size)}, {name} is {_px(size)}"
+            self._refuse_params_of_one_size(first, name, both)
             note = note or both
-        most = max(map(len, sizes.values()), default=0)
         if not note:
             return ""
+        most = max(map(len, sizes.values()))
         have = f"images that should share a camera have {most} sizes, and those of each share one"
         return f"{note}; {have}"
+
+    def _refuse_params_of_one_size(self, first: str, second: str, both: str) -> None:
+        """Refuse the same given parameters for images of two sizes, which ``both`` tells."""
+        params = self.given(first).params
+        if params and params == self.given(second).params:
+            raise OptionError(
+                f"{self._who(first)}: {both}, and the given parameters are of one size; give "
+                "those of each size as params in a table (--cameras-path), or leave them out"
+            )
 
     def _who(self, name: str) -> str:
         """Return what says that an image shares a camera with others."""
@@ -172,9 +181,18 @@ class InitialCameras:
         return self.given(name).where if mode == "auto" else f"--camera-mode {mode}"
 
     def check_known(self, names: Sequence[str], where: str) -> None:
-        """Refuse cameras of images that are not among some, unless a model has more images."""
-        known = set(names)
-        self._refuse([n for n in self._given if n and n not in known], names, where)
+        """Refuse cameras of images that are not known, unless a model has more images.
+
+        Args:
+            names: of the images that are known.
+            where: names the file or folder that has them, for the message.
+
+        Raises:
+            OptionError: a camera is given for another image.
+        """
+        known = {"", *names}
+        unknown = [name for name in self._given if name not in known]
+        self._refuse(unknown, names, where)
 
     def _refuse(self, unknown: Sequence[str], names: Sequence[str], where: str) -> None:
         """Refuse cameras of unknown images; a model may have more images."""
@@ -192,29 +210,36 @@ class InitialCameras:
         names: defaultdict[int, list[str]] = defaultdict(list)
         for image in database.read_all_images():
             names[image.camera_id].append(image.name)
-        records = {}
+        records = dict[int, CameraRecord]()
         for camera_id, same in sorted(names.items()):
             given = self._given_of(same)
-            before = database.read_camera(camera_id)
-            size = (before.width, before.height)
-            if not (
+            if (
                 given.params
                 or given.focal_px
                 or given.focal_mm
                 or self.options.focal_mm
             ):
-                continue
-            if given.size and tuple(given.size) != size:
-                raise OptionError(
-                    f"{given.where}: is {given.size[0]} x {given.size[1]} px, and {same[0]} is "
-                    f"{size[0]} x {size[1]} px in the database"
-                )
-            camera, records[camera_id] = self.camera(sorted(same), size)
-            if not given.params and given.model == CameraOptions().model:
-                camera = _with_focal(before, camera, has_center=given.cx is not None)
-            camera.camera_id = camera_id
-            database.update_camera(camera)
+                records[camera_id] = self._replace_camera(database, camera_id, same)
         return records
+
+    def _replace_camera(
+        self, database: pycolmap.Database, camera_id: int, names: Sequence[str]
+    ) -> CameraRecord:
+        """Write what the user gives into one camera of a database, and return its record."""
+        given = self._given_of(names)
+        before = database.read_camera(camera_id)
+        size = (before.width, before.height)
+        if given.size and tuple(given.size) != size:
+            raise OptionError(
+                f"{given.where}: is {_px(given.size)}, and {names[0]} is "
+                f"{_px(size)} in the database"
+            )
+        camera, record = self.camera(sorted(names), size)
+        if not given.params and given.model == CameraOptions().model:
+            camera = _with_focal(before, camera, has_center=given.cx is not None)
+        camera.camera_id = camera_id
+        database.update_camera(camera)
+        return record
 
     def _given_of(self, names: Sequence[str]) -> GivenCamera:
         named = [self._given[name] for name in names if name in self._given]
@@ -231,69 +256,61 @@ class InitialCameras:
     def camera(
         self, names: Sequence[str], size: Size
     ) -> tuple[pycolmap.Camera, CameraRecord]:
-        """Return the camera that images of one size share, and what is known of it."""
+        """Return the camera that images of one size share, and what is known of it.
+
+        Args:
+            names: of the images.
+            size: their (width, height) in px of the stored files.
+
+        Returns:
+            The camera, whose id is not set, and its record.
+
+        Raises:
+            OptionError: the user says different things of these images.
+        """
         given = self._given_of(names)
-        longer = max(size)
+        start = self._start_focal(given, names, size)
         camera = pycolmap.Camera.create_from_model_name(
-            1, given.model, self.options.default_focal_length_factor * longer, *size
+            1,
+            given.model,
+            self.options.default_focal_length_factor * max(size),
+            *size,
         )
-        source, why = self._set_focal(camera, given, names)
-        parts: list[Given] = ["focal"] if source == "given" else []
-        if given.params:
-            camera.params = list(given.params)
-        elif (
-            given.cx is not None
-            and given.cy is not None
-            and len(camera.principal_point_idxs())
-        ):
-            camera.principal_point_x = given.cx
-            camera.principal_point_y = given.cy
-        if given.params or given.cx is not None:
-            parts.append("principal-point")
-        if given.params or (parts and not len(camera.extra_params_idxs())):
-            parts.append("distortion")
-        camera.has_prior_focal_length = source in TRUSTED
-        focal = _focal(camera)
-        low, high = PLAUSIBLE_FOCALS
-        if longer > MAX_ASPECT * min(size):
-            why = "a panorama, which no camera model fits? give the photographs that it is made of"
-        if source == "given" and focal and not low <= focal / longer <= high:
-            why = f"{focal / longer:.2g} longer sides; is it in px of the stored files?"
+        _set_intrinsics(camera, given, start)
+        focal_px = focal_of(camera)
         record = CameraRecord(
-            tuple(sorted(names)), source, focal, why, size, tuple(parts)
+            names=tuple(sorted(names)),
+            source=start.source,
+            focal_px=focal_px,
+            why=_implausible(start.source, focal_px, size) or start.why,
+            size=size,
+            given=_given_parts(camera, given, start.source),
         )
-        if source == "guess":
+        if start.source == "guess":
             found = self._exif_focal(names)
             record = replace(
                 record, lens_mm=found.lens_mm, uncropped_px=found.uncropped_px
             )
         return camera, record
 
-    def _set_focal(
-        self, camera: pycolmap.Camera, given: GivenCamera, names: Sequence[str]
-    ) -> tuple[Source, str]:
+    def _start_focal(
+        self, given: GivenCamera, names: Sequence[str], size: Size
+    ) -> StartFocal:
+        """Return the focal length of the best source: the user for the images, EXIF, the user."""
         if given.params:
-            return "given", ""
-        source: Source = "given"
-        focal = given.focal_px
-        why = ""
+            return StartFocal("given")
         if given.focal_mm and given.plate_width_mm:
-            focal = given.focal_mm / given.plate_width_mm * camera.width
-        if not focal:
-            found = self._exif_focal(names)
-            source = "exif-rescaled" if found.is_rescaled else "exif"
-            focal = found.focal_px
-            why = found.why
-        if not focal and self.options.focal_mm:
-            source = "given"
-            why = ""
-            longer = max(camera.width, camera.height)
-            focal = self.options.focal_mm / self.options.film_width_mm * longer
-        if not focal:
-            return "guess", why
-        for index in camera.focal_length_idxs():
-            camera.params[index] = focal
-        return source, why
+            return StartFocal("given", given.focal_mm / given.plate_width_mm * size[0])
+        if given.focal_px:
+            return StartFocal("given", given.focal_px)
+        found = self._exif_focal(names)
+        if found.focal_px:
+            source: Source = "exif-rescaled" if found.is_rescaled else "exif"
+            return StartFocal(source=source, px=found.focal_px, why=found.why)
+        if self.options.focal_mm:
+            film_widths = self.options.focal_mm / self.options.film_width_mm
+            return StartFocal("given", film_widths * max(size))
+        return StartFocal("guess", why=found.why)
 
     def _may_be_crop(self, tags: CameraTags) -> bool:
         """Tell whether a photograph that has kept its shape may be a crop, as others of its body.
@@ -305,25 +322,18 @@ class InitialCameras:
     @cached_property
     def _cropped_bodies(self) -> set[tuple[str, str, str]]:
         """Bodies of cameras of which photographs were cropped."""
-        all_tags = [
-            self._tags(name)
-            for name in photograph_files(self.image_path, IMAGE_SUFFIXES)
-        ]
-        return {
-            tags.body
-            for tags in all_tags
-            if tags and tags.was_cropped and any(tags.body)
-        }
+        bodies = set[tuple[str, str, str]]()
+        for name in photograph_files(self.image_path, IMAGE_SUFFIXES):
+            tags = self._tags(name)
+            if tags and tags.was_cropped and any(tags.body):
+                bodies.add(tags.body)
+        return bodies
 
     def _exif_focal(self, names: Sequence[str]) -> ExifFocal:
         """Return the focal length that EXIF gives images of one camera; first that has one."""
         if self.options.ignore_exif:
             return ExifFocal(None, why="EXIF is ignored")
-        found = []
-        for tags in filter(None, map(self._tags, names)):
-            make, model, _ = tags.body
-            width_mm = sensor_width_mm(make, model) if tags.focal_mm else None
-            found.append(exif_focal(tags, width_mm, has_crops=self._may_be_crop(tags)))
+        found = self._exif_focals(names)
         trusted = [focal for focal in found if focal.focal_px]
         if not trusted:
             return found[0] if found else ExifFocal(None, why="no readable header")
@@ -333,17 +343,75 @@ class InitialCameras:
             return ExifFocal(None, why=why)
         return trusted[0]
 
-    def matrix(self, name: str, names: Sequence[str]) -> Array | None:
-        """Return the (3, 3) intrinsics that an image will have, without distortion.
+    def _exif_focals(self, names: Sequence[str]) -> list[ExifFocal]:
+        """Return what EXIF says of each image whose header can be read."""
+        found = list[ExifFocal]()
+        for name in names:
+            tags = self._tags(name)
+            if tags:
+                make, model, _ = tags.body
+                width_mm = sensor_width_mm(make, model) if tags.focal_mm else None
+                has_crops = self._may_be_crop(tags)
+                found.append(exif_focal(tags, width_mm, has_crops=has_crops))
+        return found
 
-        They are in pixel-centre px; None for a file that cannot be read. Of all ``names`` some may
-        share its camera.
+    def matrix(self, name: str, names: Sequence[str]) -> Array | None:
+        """Return the intrinsics that an image will have, without distortion.
+
+        Args:
+            name: of the image.
+            names: of all images, of which some may share its camera.
+
+        Returns:
+            A (3, 3) matrix in pixel-centre px; None for a file that cannot be read.
         """
         size = self.size(name)
         if not size:
             return None
         same = self.groups(names).get(self.group(name), [name])
         return camera_matrix(self.camera(same, size)[0])
+
+
+def _set_intrinsics(
+    camera: pycolmap.Camera, given: GivenCamera, start: StartFocal
+) -> None:
+    """Set what is known of the intrinsics; a camera has COLMAP's guess of the others."""
+    if given.params:
+        camera.params = list(given.params)
+    elif start.px:
+        for index in camera.focal_length_idxs():
+            camera.params[index] = start.px
+    has_center = bool(len(camera.principal_point_idxs())) and not given.params
+    if has_center and given.cx is not None and given.cy is not None:
+        camera.principal_point_x = given.cx
+        camera.principal_point_y = given.cy
+    camera.has_prior_focal_length = start.source in TRUSTED
+
+
+def _given_parts(
+    camera: pycolmap.Camera, given: GivenCamera, source: Source
+) -> tuple[Given, ...]:
+    """Return what of the intrinsics is the user's."""
+    parts = list[Given]()
+    if source == "given":
+        parts.append("focal")
+    if given.params or given.cx is not None:
+        parts.append("principal-point")
+    if given.params or (parts and not len(camera.extra_params_idxs())):
+        parts.append("distortion")
+    return tuple(parts)
+
+
+def _implausible(source: Source, focal_px: float, size: Size) -> str:
+    """Say why a camera is implausible; empty if it is not."""
+    longer = max(size)
+    low, high = PLAUSIBLE_FOCALS
+    ratio = focal_px / longer
+    if source == "given" and focal_px and not low <= ratio <= high:
+        return f"{ratio:.2g} longer sides; is it in px of the stored files?"
+    if longer > MAX_ASPECT * min(size):
+        return "a panorama, which no camera model fits? give the photographs that it is made of"
+    return ""
 
 
 def _with_focal(
@@ -363,167 +431,25 @@ def _with_focal(
 def sensor_width_mm(make: str, model: str) -> float | None:
     """Return the longer side of the sensor of a camera model that COLMAP knows, else None.
 
-    COLMAP's table is only asked when an image is read, so it is given one of 8 px.
+    COLMAP's table is only asked when an image is read, so it is given a small one, with a focal
+    length of 1 mm.
     """
     exif = Image.Exif()
-    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = make, model
+    exif[ExifTags.Base.Make] = make
+    exif[ExifTags.Base.Model] = model
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = IFDRational(1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "one.jpg"
-        Image.new("L", (8, 8)).save(path, exif=exif)
+        Image.new("L", (PROBE_SIZE_PX, PROBE_SIZE_PX)).save(path, exif=exif)
         bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
     focal = bitmap.exif_focal_length() if bitmap else None
-    return 8.0 / focal if focal else None
+    return PROBE_SIZE_PX / focal if focal else None
 
 
 def _px(size: Sequence[int]) -> str:
     return f"{size[0]} x {size[1]} px"
 
 
-def _focal(camera: pycolmap.Camera) -> float:
+def focal_of(camera: pycolmap.Camera) -> float:
+    """Return the focal length of a camera in px, the mean of two; 0 without one."""
     return float(camera.mean_focal_length()) if len(camera.focal_length_idxs()) else 0.0
-
-
-def import_images(
-    path: Path, image_path: Path, names: Sequence[str], options: CameraOptions
-) -> list[str]:
-    """Add cameras, rigs, frames and images for the names that a database lacks.
-
-    Sizes and GPS priors are read by COLMAP, from the files as stored, not rotated. Images that
-    are added later share cameras as if all had been added at once. All of them are added, or none;
-    a new database appears with them. Returns the names of the images that COLMAP cannot read, or
-    whose size is not that of their camera.
-    """
-    initial = InitialCameras(image_path, options)
-    is_new = not path.exists()
-    if is_new:
-        remove_own(database_files(path))  # what is beside it, of one that was removed
-    with temporary_folder(path.parent) as folder:
-        new = folder / "new.db" if is_new else path
-        read = folder / "read.db"
-        known = set[str]() if is_new else set(image_ids(new))
-        missing = sorted(set(names) - known)
-        missing = [name for name in missing if not why_unusable(image_path / name)]
-        if missing:
-            require_database_space(new, 2 * len(missing))
-            with open_database(read) as found:  # which makes it
-                _read_images(read, image_path, missing)
-                with open_database(new) as database:
-                    known.update(_take_over(initial, found, database))
-        if not new.exists():
-            image_ids(new)  # makes an empty one
-        if is_new:
-            new.replace(path)
-    return sorted(set(names) - known)
-
-
-def _read_images(path: Path, image_path: Path, names: Sequence[str]) -> None:
-    """Let COLMAP read images into a database; OptionError where their folder is gone meanwhile."""
-    mode = pycolmap.CameraMode.PER_IMAGE
-    try:
-        run_cancellable(lambda _: pycolmap.import_images(path, image_path, mode, names))
-    except (RuntimeError, ValueError) as error:
-        if lacks_memory(error) or image_path.is_dir():
-            raise
-        require_folder(image_path)  # it is gone, as with a drive
-
-
-def _take_over(
-    initial: InitialCameras, found: pycolmap.Database, database: pycolmap.Database
-) -> list[str]:
-    """Take over images that COLMAP has read into a database of their own: all of them, or none.
-
-    Returns:
-        The names of those that fit the cameras.
-    """
-    taken = list[str]()
-    images = sorted(found.read_all_images(), key=lambda image: image.name)
-    read = cameras_of_images(found)
-    sizes = {i.name: (read[i.image_id].width, read[i.image_id].height) for i in images}
-    priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
-    cameras = _known_cameras(initial, database)
-    rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
-    with pycolmap.DatabaseTransaction(database):
-        for group, names in initial.groups(list(sizes)).items():
-            if group not in cameras:
-                size = sizes[names[0]]
-                camera, _ = initial.camera([n for n in names if sizes[n] == size], size)
-                camera.camera_id = database.write_camera(camera)
-                cameras[group] = camera
-        for image in images:
-            camera = cameras[initial.group(image.name)]
-            if sizes[image.name] == (camera.width, camera.height):
-                written = pycolmap.Image(name=image.name, camera_id=camera.camera_id)
-                written.image_id = database.write_image(written)
-                taken.append(image.name)
-                write_frame(database, written, rigs)
-                if prior := priors.get(image.image_id):
-                    prior.corr_data_id = written.data_id
-                    database.write_pose_prior(prior)
-    return taken
-
-
-def _known_cameras(
-    initial: InitialCameras, database: pycolmap.Database
-) -> dict[Group, pycolmap.Camera]:
-    """Return the cameras of the database that new images of a group get."""
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    used: dict[Group, set[int]] = defaultdict(set)
-    for image in database.read_all_images():
-        used[initial.group(image.name)].add(image.camera_id)
-    return {group: cameras[min(ids)] for group, ids in used.items() if len(ids) == 1}
-
-
-def record_cameras(
-    cameras_of: Mapping[str, pycolmap.Camera],
-    records_path: Path,
-    initial: InitialCameras | None = None,
-    known: Mapping[int, CameraRecord] | None = None,
-) -> None:
-    """Put the cameras that are not on record yet on record, and log what is worth knowing of them.
-
-    Args:
-        cameras_of: the cameras of the database by image name.
-        records_path: the file of the records.
-        initial: what they were made from; None for cameras of another database.
-        known: the records of that one, if there are any.
-    """
-    before = read_camera_records(records_path)
-    known = before or known or {}
-    cameras = {camera.camera_id: camera for camera in cameras_of.values()}
-    names: dict[int, list[str]] = defaultdict(list)
-    for name, camera in cameras_of.items():
-        names[camera.camera_id].append(name)
-    records = {}
-    for camera_id, of_camera in names.items():
-        record = known.get(camera_id)
-        same = tuple(sorted(of_camera))
-        if record and set(record.names) <= set(same):
-            records[camera_id] = replace(record, names=same)
-        else:
-            records[camera_id] = _record(cameras[camera_id], same, initial)
-    if records != before:
-        write_camera_records(records_path, records)
-        reasons: defaultdict[str, list[str]] = defaultdict(list)
-        for key, record in records.items():
-            if record.why and record != before.get(key):
-                reasons[record.why] += record.names
-        for why, concerned in list(reasons.items())[:MAX_LINES]:
-            logger.info("cameras: %s: %s", such_as(concerned), why)
-
-
-def _record(
-    camera: pycolmap.Camera, names: tuple[str, ...], initial: InitialCameras | None
-) -> CameraRecord:
-    """Say what is known of a camera: as it was made here, or only by COLMAP's flag."""
-    size = (camera.width, camera.height)
-    if initial:
-        made, record = initial.camera(names, size)
-        if _values(made) == _values(camera):
-            return record
-    source: Source = "given" if camera.has_prior_focal_length else "guess"
-    return CameraRecord(names, source, _focal(camera), size=size)
-
-
-def _values(camera: pycolmap.Camera) -> tuple[object, ...]:
-    return camera.model_name, camera.params.tolist(), camera.has_prior_focal_length

@@ -15,7 +15,7 @@ from colmap_affrect.colmap.tables import (
 
 Value = TypeVar("Value", bound=Hashable)
 
-SENSOR_IMU = 1
+SENSOR_IMU = 1  # COLMAP's number of the kind of sensor
 SENSOR_NAMES = {SENSOR_CAMERA: "camera", SENSOR_IMU: "IMU"}
 IDS = {
     "cameras": "camera_id",
@@ -29,12 +29,11 @@ IDS = {
     "two_view_geometries": "pair_id",
 }
 """The column of each table that tells its rows apart."""
-MAX_ID = MAX_NUM_IMAGES - 1
+MAX_ID = MAX_NUM_IMAGES - 1  # COLMAP's largest id of an image
 MAX_PAIR_ID = MAX_ID * MAX_NUM_IMAGES + MAX_ID
 
-Found = Mapping[
-    str, list[str]
-]  # by kind of problem the rows concerned; see checks.toml
+# By kind of problem the rows concerned; see checks.toml
+Found = Mapping[str, list[str]]
 
 
 class _Sensor(NamedTuple):
@@ -136,14 +135,26 @@ def _members(connection: sqlite3.Connection) -> list[_Member]:
     references = rows_of(connection, "rig_id ref_sensor_type ref_sensor_id", "rigs")
     for rig_id, kind, number in references:
         members.append(
-            _Member(int(rig_id), _Sensor(int(kind), int(number)), True, True)
+            _Member(
+                rig_id=int(rig_id),
+                sensor=_Sensor(int(kind), int(number)),
+                is_reference=True,
+                has_pose=True,
+            )
         )
     others = rows_of(
         connection, "rig_id sensor_type sensor_id sensor_from_rig", "rig_sensors"
     )
     for rig_id, kind, number, pose in others:
         sensor = _Sensor(int(kind), int(number))
-        members.append(_Member(int(rig_id), sensor, False, bool(pose)))
+        members.append(
+            _Member(
+                rig_id=int(rig_id),
+                sensor=sensor,
+                is_reference=False,
+                has_pose=bool(pose),
+            )
+        )
     return members
 
 
@@ -175,7 +186,7 @@ def _data(connection: sqlite3.Connection) -> list[_Datum]:
     rows = rows_of(connection, "frame_id data_id sensor_type sensor_id", "frame_data")
     for frame_id, data_id, kind, number in rows:
         sensor = _Sensor(int(kind), int(number))
-        data.append(_Datum(int(frame_id), int(data_id), sensor))
+        data.append(_Datum(frame_id=int(frame_id), data_id=int(data_id), sensor=sensor))
     return data
 
 

@@ -28,9 +28,11 @@ from colmap_affrect.project.regular_files import (
 Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
 Poses = dict[str, Pose]  # poses by image name
 
-MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
-FAR = 1e12  # coordinates beyond it are no positions: nothing can be computed with them
-QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds
+# Of a photograph; the largest panoramas have a tenth of it; damage
+MAX_SIDE_PX = 1 << 24
+# Coordinates beyond it are no positions: nothing can be computed with them; damage
+FAR = 1e12
+QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds; numeric
 SUMMARY = (
     "summary.json"  # beside a model of ours; has the digests of its files as ``model``
 )
@@ -110,9 +112,8 @@ def _image(reader: _Reader) -> str:
 
 
 def _point(reader: _Reader) -> None:
-    *_, length = reader.take(
-        "Q3d3BdQ"
-    )  # id, position, colour, error, length of the track
+    # Id, position, colour, error, length of the track
+    *_, length = reader.take("Q3d3BdQ")
     reader.skip(8 * length)
 
 
@@ -125,11 +126,8 @@ RECORDS: dict[
     "images.bin": _image,
     "points3D.bin": _point,
 }
-OLD_RECORDS = (
-    "cameras.bin",
-    "images.bin",
-    "points3D.bin",
-)  # of COLMAP before it knew rigs
+# Of COLMAP before it knew rigs
+OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")
 
 
 def _read_records(path: Path) -> list[Any]:

@@ -23,9 +23,8 @@ MAPPER_OPTIONS = (
 """Our preset for few photographs: by its defaults ``colmap mapper`` finds less, or nothing."""
 
 LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)  # that COLMAP 3.8 has
-FILL = Path(__file__).with_name(
-    "colmap_3_8.sql"
-)  # makes the tables, from an attached ``new``
+# Makes the tables, from an attached ``new``
+FILL = Path(__file__).with_name("colmap_3_8.sql")
 
 
 def export_database(

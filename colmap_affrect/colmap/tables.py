@@ -20,14 +20,11 @@ from colmap_affrect.project.regular_files import (
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
 MAGIC = b"SQLite format 3\0"  # begins each file of SQLite's that is not empty
 HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
-DAMAGED = (
-    sqlite3.Error,
-    UnicodeDecodeError,
-)  # what sqlite3 raises, also quoting odd bytes
-MAX_NUM_IMAGES = (
-    2**31 - 1
-)  # an id of a pair is the smaller image id times this, plus the larger
-SENSOR_CAMERA = 0
+# What sqlite3 raises, also quoting odd bytes
+DAMAGED = (sqlite3.Error, UnicodeDecodeError)
+# COLMAP's: an id of a pair is the smaller image id times this, plus the larger
+MAX_NUM_IMAGES = 2**31 - 1
+SENSOR_CAMERA = 0  # COLMAP's number of the kind of sensor
 
 DIGESTED = (  # tables that decide what is mapped
     "cameras", "rigs", "rig_sensors", "frames", "frame_data", "images", "pose_priors", "keypoints",
@@ -143,7 +140,9 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
     cameras = {}
     rows = rows_of(connection, "camera_id width height model params", "cameras")
     for camera_id, width, height, model, params in rows:
-        cameras[int(camera_id)] = Camera(int(width), int(height), int(model), params)
+        cameras[int(camera_id)] = Camera(
+            width=int(width), height=int(height), model=int(model), params=params
+        )
     frame_images = set[int]()
     for image_id, kind in rows_of(connection, "data_id sensor_type", "frame_data"):
         if kind == SENSOR_CAMERA:

@@ -36,12 +36,15 @@ PLANAR = (  # pairs that a homography explains: their epipolar geometry is arbit
 )
 
 CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-MAX_FRAME_ANGLE_DEG = 20.0  # frames of right matches are off by 5 to 10 degrees
-CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0  # of frames that are turned at random
-# Frames that agree by chance nearly always, upright ones for one, say nothing
+# Frames of right matches are off by 5 to 10 degrees; measured
+MAX_FRAME_ANGLE_DEG = 20.0
+# Of frames that are turned at random; theory
+CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0
+# Frames that agree by chance nearly always, upright ones for one, say nothing; theory
 MAX_CHANCE = 0.99
-MIN_VARIETY = 0.05  # of elements of shapes of area one; below they have no direction
-# Of a decomposed homography, in units of the distance of its plane
+# Of elements of shapes of area one; below they have no direction; numeric
+MIN_VARIETY = 0.05
+# Of a decomposed homography, in units of the distance of its plane; numeric
 MIN_TRANSLATION = 1e-9
 
 

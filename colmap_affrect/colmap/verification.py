@@ -27,8 +27,8 @@ Frames = tuple[
 ]  # (N, 2, 3) LAFs of each image of a pair, in pixel-centre px
 Matches = NDArray[np.integer]  # (M, 2), rows of the features of each image of a pair
 
-PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many
-# Of the inliers on a line of writing; where more are, they made it
+PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many; resource
+# Of the inliers on a line of writing; where more are, they made it; judged
 MAX_WRITTEN_SHARE = 0.15
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
@@ -36,23 +36,23 @@ NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 class VerificationOptions(PresetOptions):
     """Two-view geometry, by default the sparse preset (names as in pycolmap)."""
 
-    max_error_px: Annotated[float, within(0.01, 1000.0)] = 3.0
+    max_error_px: Annotated[float, within(0.01, 1000.0)] = 3.0  # judged
     """Largest error of an inlier."""
     scale_max_error: bool = True
     """Whether ``max_error_px`` counts pixels of photographs as they were when features were
     extracted, shrunk to ``max_image_size_px`` of the recipe; else those of the files."""
-    min_num_inliers: Annotated[int, within(5, 1_000_000)] = 15
+    min_num_inliers: Annotated[int, within(5, 1_000_000)] = 15  # COLMAP's
     """Fewest inliers of a verified pair."""
     min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.0
     """Share of the raw matches; those that are wrong say little about the others."""
-    min_significance: Annotated[float, within(0.0, 1e9)] = 5.0
+    min_significance: Annotated[float, within(0.0, 1e9)] = 5.0  # theory
     """Chance would need 10 to the power of this many pairs to have one that looks as good: by the
     number of its inliers among so many raw matches, and by the share of them whose local affine
     frames agree with the geometry. With 5, all pairs of 450 unrelated photographs have about one. 0
     accepts what COLMAP accepts."""
-    max_num_trials: Annotated[int, within(1, 100_000_000)] = 10000
+    max_num_trials: Annotated[int, within(1, 100_000_000)] = 10000  # COLMAP's
     """Most samples that RANSAC draws for a pair."""
-    ransac_min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.10
+    ransac_min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.10  # resource
     """Smallest share of inliers that RANSAC draws enough samples for."""
     random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
     """Of the samples; -1: another one each time."""

@@ -35,8 +35,8 @@ from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Inputs
 
-NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
-PAIRS_PER_IMAGE = 4  # that take roughly as long as an image, for the forecast
+NUM_DIGITS = 16  # of the digests of photographs on record: messages name them; display
+PAIRS_PER_IMAGE = 4  # that take roughly as long as an image, for the forecast; measured
 
 
 @takes_fields_of(CompareOptions)
@@ -75,7 +75,11 @@ def compare(
     options = CompareOptions.with_keywords(options, keywords)
     require_bools(overwrite=overwrite)
     return _compare(
-        image_path, output_path, options, Progress.given(progress), again=overwrite
+        image_path=image_path,
+        output_path=output_path,
+        options=options,
+        progress=Progress.given(progress),
+        again=overwrite,
     )
 
 

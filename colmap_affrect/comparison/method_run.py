@@ -85,11 +85,13 @@ def extract_sift(
     """
     photographs = Photographs(image_path, masks)
     failures = {}
+    usable = list[str]()
     for name in image_names:
         why = photographs.why_impossible(name)
         if why:
             failures[name] = why
-    usable = [name for name in image_names if name not in failures]
+        else:
+            usable.append(name)
     with masks_for_colmap(photographs, usable) as mask_path:
         reader = pycolmap.ImageReaderOptions(
             mask_path=mask_path, camera_mask_path=masks.camera_path
@@ -145,11 +147,10 @@ def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
             raise AffrectError(
                 f"{name}: COLMAP matches no listed names with spaces; rename it"
             )
+    lines = [f"{first} {second}\n" for first, second in pairs]
     with temporary_folder(database_path.parent) as folder:
         list_path = folder / "pairs.txt"
-        replace_text(
-            list_path, "".join(f"{first} {second}\n" for first, second in pairs)
-        )
+        replace_text(list_path, "".join(lines))
         listed = pycolmap.ImportedPairingOptions(match_list_path=list_path)
         pycolmap.match_image_pairs(database_path, options, listed)
 
@@ -157,7 +158,7 @@ def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
 METHODS = "methods"  # folder of all methods
 RESULT_JSON = TypeAdapter(MethodResult)
 # Rough seconds of an image with its share of the pairs: a forecast begins with them, and goes on by
-# the pace of the methods that are done.
+# the pace of the methods that are done. Measured on two cores:
 SIFT_SECONDS = 0.5
 RECIPE_SECONDS = 1.5
 ESCALATION_SECONDS = 6.0
@@ -173,6 +174,7 @@ class CompareOptions(InputOptions):
     """The mapper and its options, the same for all methods."""
     methods: GivenMethods = DEFAULT_METHODS
     """``sift-colmap``, ``sift``, or recipes, as ``NAME`` or ``LABEL=NAME:OPTION=VALUE``."""
+    # Resource: three show how far results spread
     seeds: Annotated[tuple[int, ...], Field(strict=False)] = (0, 1, 2)
     """Of verification and mapping, which run once for each."""
     ground_truth_path: GivenPath | None = None
@@ -242,9 +244,8 @@ class MethodRun:
         if overwrite:
             remove_own([folder])
         asked = {**self.inputs, **self.method.options}
-        if (
-            self.method.escalates
-        ):  # verification with this seed decides what is matched again
+        if self.method.escalates:
+            # Verification with this seed decides what is matched again.
             asked["seed"] = self.options.seeds[0]
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
         with damage(record, "use --overwrite to redo the methods that are named"):
@@ -264,10 +265,10 @@ class MethodRun:
         self.keep(failed="")
         if not self.result.wall_s:  # time that a killed run took does not count
             watch = Stopwatch()
-            extract_and_match = (
-                self._match_recipe if self.method.recipe else self._match_sift
-            )
-            failures = extract_and_match(watch)
+            if self.method.recipe:
+                failures = self._match_recipe(watch)
+            else:
+                failures = self._match_sift(watch)
             self.keep(failures=failures, wall_s=watch.seconds)
         done = {result.seed: result for result in self.result.seeds}
         for seed in self.options.seeds:
@@ -296,7 +297,10 @@ class MethodRun:
             if not usable:
                 raise AffrectError(f"COLMAP cannot use any of the {len(names)} images")
             failures |= extract_sift(
-                self.database, self.image_path, usable, self.options.masks
+                database_path=self.database,
+                image_path=self.image_path,
+                image_names=usable,
+                masks=self.options.masks,
             )
             advance(len(names))
         known = set(image_ids(self.database))
@@ -314,7 +318,12 @@ class MethodRun:
 
     def _match_recipe(self, watch: Stopwatch) -> dict[str, str]:
         """Extract, match and match again by a recipe; return why images cannot be used."""
-        context = Context(self.workspace, self.options.resources, None, self.progress)
+        context = Context(
+            workspace=self.workspace,
+            resources=self.options.resources,
+            executor=None,
+            progress=self.progress,
+        )
         inputs = self.options.inputs(self.image_path)
         recipe = self.method.recipe or Recipe()
         self.keep(lacks=context.resources.how_to_complete(recipe.extraction))
@@ -345,7 +354,16 @@ class MethodRun:
             copy_database(self.database, database_path)
             models = self._models(seed, new, watch, progress)
             verified = verified_pairs(database_path, self.verification.min_num_inliers)
-        largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
+        largest = (
+            models[0]
+            if models
+            else ModelSummary(
+                registered_names=(),
+                num_points3D=0,
+                mean_track_length=0.0,
+                mean_reprojection_error_px=0.0,
+            )
+        )
         return SeedResult(
             seed=seed,
             models=tuple(item.registered_names for item in models),
@@ -364,15 +382,18 @@ class MethodRun:
     ) -> Sequence[ModelSummary]:
         """Verify and map as a run does."""
         context = Context(
-            self.workspace.branch(folder), self.options.resources, None, progress
+            workspace=self.workspace.branch(folder),
+            resources=self.options.resources,
+            executor=None,
+            progress=progress,
         )
         with watch.step("verify"):
             verify_matches(context, self.verification.changed(random_seed=seed))
+        mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))
         with watch.step("map"):
             guide(context)
-            return map_images(
-                context, MAPPERS.make(self.mapping.changed(random_seed=seed))
-            )[1]
+            _, models = map_images(context, mapper)
+        return models
 
     def _models(
         self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
@@ -419,4 +440,9 @@ class MethodRun:
             may_share=self.options.inputs(self.image_path).may_share,
         )
         with watch.step("map"), progress.stage("map", num_images, "images") as advance:
-            return map_database(mapper, task, folder / "sparse", advance)
+            return map_database(
+                mapper=mapper,
+                task=task,
+                sparse_path=folder / "sparse",
+                next_image=advance,
+            )

@@ -1,5 +1,6 @@
 """A comparison of methods as one page, ``report.html``."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,6 +8,7 @@ from colmap_affrect.comparison.results import (
     MAX_CORRECT_ERROR_DEG,
     Comparison,
     MethodResult,
+    SeedResult,
 )
 from colmap_affrect.comparison.tables import headline, notes, table
 from colmap_affrect.options import flat
@@ -112,21 +114,26 @@ def _mark(method: MethodResult, name: str) -> Mark:
     if len(registering) < len(method.seeds):
         state = "sometimes"
         text += f" with {len(registering)} of {len(method.seeds)} seeds"
-    num_correct = 0
-    num_wrong = 0
-    for seed in registering:
-        if seed.scores:
-            num_correct += name in seed.scores.correct_names
-            num_wrong += name in seed.scores.wrong_names
     doubt = method.usually_doubted.get(name)
-    kind = "shared"
-    if num_wrong:
-        kind = "wrong"
-        text += f", correctly with {num_correct}" if num_correct else ", wrongly"
-    elif num_correct:
-        text += ", correctly"
-    elif doubt:
+    kind, correctness = _correctness(registering, name)
+    if doubt and not correctness:
         kind = "uncertain"
+    text += correctness
     if doubt and kind != "shared":
         text += f", doubtful: {doubt}"
     return Mark(state, kind, text)
+
+
+def _correctness(seeds: Sequence[SeedResult], name: str) -> tuple[str, str]:
+    """Return the colour and the words for how a photograph compares with ground truth."""
+    num_correct = 0
+    num_wrong = 0
+    for seed in seeds:
+        if seed.scores:
+            num_correct += name in seed.scores.correct_names
+            num_wrong += name in seed.scores.wrong_names
+    if num_wrong and num_correct:
+        return "wrong", f", correctly with {num_correct}"
+    if num_wrong:
+        return "wrong", ", wrongly"
+    return "shared", ", correctly" if num_correct else ""

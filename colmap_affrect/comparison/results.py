@@ -21,7 +21,7 @@ and of the direction of the translation."""
 MAX_CORRECT_ERROR_DEG = 5.0
 """An image is registered correctly if its relative poses to at least half of the other registered
 images are off by at most this, in rotation and in translation direction. It is the limit of solved
-pairs in ``evaluation/truths``.
+pairs in ``evaluation/truths``, which is that of the paper.
 """
 
 
@@ -31,9 +31,8 @@ class PoseScores:
 
     correct_names: tuple[str, ...]  # registered correctly (``MAX_CORRECT_ERROR_DEG``)
     wrong_names: tuple[str, ...]  # the others
-    median_rotation_error_deg: (
-        float | None
-    )  # over the pairs of these images; None without pairs
+    # Over the pairs of these images; None without pairs
+    median_rotation_error_deg: float | None
 
 
 def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
@@ -56,9 +55,11 @@ def correct_images(errors: PairErrors) -> tuple[str, ...]:
         for name in pair:
             num_correct[name] = num_correct.get(name, 0) + is_correct
     num_others = len(num_correct) - 1
-    return tuple(
-        name for name in sorted(num_correct) if 2 * num_correct[name] >= num_others
-    )
+    correct = list[str]()
+    for name, count in sorted(num_correct.items()):
+        if 2 * count >= num_others:
+            correct.append(name)
+    return tuple(correct)
 
 
 def pose_scores(
@@ -81,9 +82,9 @@ def pose_scores(
     names = set(itertools.chain.from_iterable(errors))
     rotations_deg = [rotation_deg for rotation_deg, _ in errors.values()]
     return PoseScores(
-        correct,
-        tuple(sorted(names.difference(correct))),
-        median(rotations_deg) if errors else None,
+        correct_names=correct,
+        wrong_names=tuple(sorted(names.difference(correct))),
+        median_rotation_error_deg=median(rotations_deg) if errors else None,
     )
 
 
@@ -115,12 +116,10 @@ class SeedResult:
     mean_track_length: float  # images per point
     mean_reprojection_error_px: float
     sure: tuple[str, ...] = ()  # images of high confidence
-    doubtful: Mapping[str, str] = field(
-        default_factory=dict
-    )  # images of low confidence: why
-    wall_s: Mapping[str, float] = field(
-        default_factory=dict
-    )  # seconds of ``verify`` and ``map``
+    # Images of low confidence: why
+    doubtful: Mapping[str, str] = field(default_factory=dict)
+    # Seconds of ``verify`` and ``map``
+    wall_s: Mapping[str, float] = field(default_factory=dict)
     scores: PoseScores | None = None  # against ground truth; None where there is none
 
     @property
@@ -169,12 +168,16 @@ MEASURES = {
     "num_sure": Measure("sure", _num_sure),
     "num_doubtful": Measure("doubtful", _num_doubtful),
     "verified_pairs": Measure("pairs", lambda seed: seed.verified_pairs),
-    "points3D": Measure("points", _of_model("points3D"), 0),
-    "mean_track_length": Measure("track", _of_model("mean_track_length"), 2),
-    "mean_reprojection_error_px": Measure(
-        "px", _of_model("mean_reprojection_error_px"), 2
+    "points3D": Measure(title="points", value=_of_model("points3D"), digits=0),
+    "mean_track_length": Measure(
+        title="track", value=_of_model("mean_track_length"), digits=2
     ),
-    "median_rotation_error_deg": Measure("degrees", _median_rotation_error_deg, 2),
+    "mean_reprojection_error_px": Measure(
+        title="px", value=_of_model("mean_reprojection_error_px"), digits=2
+    ),
+    "median_rotation_error_deg": Measure(
+        title="degrees", value=_median_rotation_error_deg, digits=2
+    ),
 }
 """Numbers of every seed, by their names in JSON."""
 
@@ -194,17 +197,14 @@ class MethodResult:
     folder: str = ""  # of its results, relative to the folder of the comparison
     options: Mapping[str, Any] = field(default_factory=dict)
     failed: str = ""  # why it failed as a whole; empty if it did not
-    failures: Mapping[str, str] = field(
-        default_factory=dict
-    )  # images that cannot be used: why
+    # Images that cannot be used: why
+    failures: Mapping[str, str] = field(default_factory=dict)
     lacks: str = ""  # how to get the weights that it ran without
-    wall_s: Mapping[str, float] = field(
-        default_factory=dict
-    )  # of stages before all seeds
+    # Seconds of stages before all seeds
+    wall_s: Mapping[str, float] = field(default_factory=dict)
     peak_memory_bytes: int = 0
-    seeds: tuple[
-        SeedResult, ...
-    ] = ()  # in the order asked for; empty if the method failed
+    # In the order asked for; empty if the method failed
+    seeds: tuple[SeedResult, ...] = ()
 
     def span(self, measure: str) -> Span | None:
         """Return one of ``MEASURES`` over the seeds that have it; None without any."""
@@ -267,9 +267,11 @@ class MethodResult:
 def _in_most(names_by_seed: Sequence[Iterable[str]]) -> list[str]:
     """Return the sorted names that more than half of the seeds have."""
     counts = Counter(itertools.chain.from_iterable(names_by_seed))
-    return sorted(
-        name for name, count in counts.items() if 2 * count > len(names_by_seed)
-    )
+    names = list[str]()
+    for name, count in sorted(counts.items()):
+        if 2 * count > len(names_by_seed):
+            names.append(name)
+    return names
 
 
 @documented
@@ -294,9 +296,8 @@ class Comparison(Summarized):
 
     def summary(self) -> str:
         """Return the table of methods, and what it means."""
-        from colmap_affrect.comparison.tables import (
-            summary,
-        )  # which imports this module
+        # Imported here: that module imports this one.
+        from colmap_affrect.comparison.tables import summary
 
         return summary(self)
 
@@ -307,9 +308,8 @@ class Comparison(Summarized):
         def rank(method: MethodResult) -> tuple[float, float, float]:
             return (-method.trusted.mean, -method.registered.mean, method.total_s)
 
-        return sorted(
-            [method for method in self.methods if not method.failed], key=rank
-        )
+        finished = [method for method in self.methods if not method.failed]
+        return sorted(finished, key=rank)
 
     @property
     def has_ground_truth(self) -> bool:
@@ -329,14 +329,17 @@ class Comparison(Summarized):
     @property
     def only_registered_by(self) -> dict[str, str]:
         """Image name to the one method that usually registers it."""
-        registered_by = self.registered_by.items()
-        return {
-            name: methods[0] for name, methods in registered_by if len(methods) == 1
-        }
+        found = dict[str, str]()
+        for name, methods in self.registered_by.items():
+            if len(methods) == 1:
+                found[name] = methods[0]
+        return found
 
     @property
     def registered_by_none(self) -> tuple[str, ...]:
         """Images that no method usually registers."""
-        return tuple(
-            name for name, methods in self.registered_by.items() if not methods
-        )
+        names = list[str]()
+        for name, methods in self.registered_by.items():
+            if not methods:
+                names.append(name)
+        return tuple(names)

@@ -7,15 +7,21 @@ from dataclasses import asdict
 from itertools import zip_longest
 
 from colmap_affrect.comparison.methods import SIFT, SIFT_COLMAP, SIFT_SUMMARIES
-from colmap_affrect.comparison.results import MEASURES, Comparison, Span, measured
+from colmap_affrect.comparison.results import (
+    MEASURES,
+    Comparison,
+    MethodResult,
+    Span,
+    measured,
+)
 from colmap_affrect.errors import such_as
 from colmap_affrect.project.report import by_story
 
-BYTES_PER_MB = 1_000_000
+BYTES_PER_MB = 1_000_000  # theory
 NOTHING = "-"  # where there is no number
-MIN_IMAGES = 3  # of a reconstruction; two images are a pair
-MAX_NAMES = 6  # of photographs in a sentence
-WIDTH = 88  # columns of text in the terminal
+MIN_IMAGES = 3  # of a reconstruction; two images are a pair; theory
+MAX_NAMES = 6  # of photographs in a sentence; display
+WIDTH = 88  # columns of text in the terminal; display
 
 
 def table(comparison: Comparison) -> dict[str, list[str]]:
@@ -29,10 +35,12 @@ def table(comparison: Comparison) -> dict[str, list[str]]:
         spans = [method.span(key) for method in methods]
         if any(spans):
             columns[measure.title] = [span_text(span, measure.digits) for span in spans]
-    columns["seconds"] = [f"{method.total_s:,.1f}" for method in methods]
-    columns["MB"] = [
-        f"{method.peak_memory_bytes / BYTES_PER_MB:,.0f}" for method in methods
-    ]
+    columns["seconds"] = []
+    columns["MB"] = []
+    for method in methods:
+        megabytes = method.peak_memory_bytes / BYTES_PER_MB
+        columns["seconds"].append(f"{method.total_s:,.1f}")
+        columns["MB"].append(f"{megabytes:,.0f}")
     return columns
 
 
@@ -74,22 +82,27 @@ def headline(comparison: Comparison) -> list[str]:
     if most < MIN_IMAGES <= total:
         few = f"no method registers more than {most:g} of the {total} photographs"
         return [f"Nothing was reconstructed: {few}."]
-    named = {method.name: method for method in finished}
-    ours = [method for method in finished if method.name not in SIFT_SUMMARIES]
-    best = max(ours, key=lambda method: method.trusted.mean, default=None)
-    kinds = {SIFT_COLMAP: "COLMAP as it is", SIFT: "our mapper with SIFT"}
-    if best:
-        kinds[best.name] = "our features"
     trusted = "correct" if comparison.has_ground_truth else "sure"
     texts = ["Photographs that are registered:"]
-    for name, kind in kinds.items():
-        method = named.get(name)
-        if method:
-            registered = f"{span_text(method.registered)} of {total}"
-            texts.append(
-                f"{kind} ({name}): {registered}, {span_text(method.trusted)} of them {trusted}"
-            )
+    for kind, method in _by_kind(finished).items():
+        registered = f"{span_text(method.registered)} of {total}"
+        of_them = f"{span_text(method.trusted)} of them {trusted}"
+        texts.append(f"{kind} ({method.name}): {registered}, {of_them}")
     return texts
+
+
+def _by_kind(methods: Sequence[MethodResult]) -> dict[str, MethodResult]:
+    """Return the methods that the headline tells: of ours the best one."""
+    named = {method.name: method for method in methods}
+    ours = [method for method in methods if method.name not in SIFT_SUMMARIES]
+    found = dict[str, MethodResult]()
+    if SIFT_COLMAP in named:
+        found["COLMAP as it is"] = named[SIFT_COLMAP]
+    if SIFT in named:
+        found["our mapper with SIFT"] = named[SIFT]
+    if ours:
+        found["our features"] = max(ours, key=lambda method: method.trusted.mean)
+    return found
 
 
 def notes(comparison: Comparison) -> list[str]:
@@ -101,7 +114,18 @@ def notes(comparison: Comparison) -> list[str]:
     missing = comparison.registered_by_none
     if finished and missing:
         texts.append(f"Registered by no method: {such_as(missing, MAX_NAMES)}.")
-    for method in finished:
+    texts += _incomplete(comparison)
+    if not comparison.has_ground_truth:
+        for method in finished:
+            for line in by_story(method.usually_doubted):
+                texts.append(f"Doubtful in {method.name}: {line}.")
+    return texts
+
+
+def _incomplete(comparison: Comparison) -> list[str]:
+    """Say which methods lack weights, and which ones failed."""
+    texts = []
+    for method in comparison.finished:
         if method.lacks:
             texts.append(
                 f"{method.name} ran without some of its weights; get them, and compare again with "
@@ -110,10 +134,6 @@ def notes(comparison: Comparison) -> list[str]:
     for method in comparison.methods:
         if method.failed:
             texts.append(f"{method.name} failed: {method.failed}")
-    if not comparison.has_ground_truth:
-        for method in finished:
-            for line in by_story(method.usually_doubted):
-                texts.append(f"Doubtful in {method.name}: {line}.")
     return texts
 
 
@@ -152,9 +172,8 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     lines = []
     for first, *others in rows:
         cells = [first.ljust(widths[0])]
-        cells += [
-            cell.rjust(width) for cell, width in zip(others, widths[1:], strict=False)
-        ]
+        for cell, width in zip(others, widths[1:], strict=False):
+            cells.append(cell.rjust(width))
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
 

@@ -27,7 +27,7 @@ from colmap_affrect.mappers.mapping import (
 )
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write, replace_text
-from colmap_affrect.project.match_state import LookedAt, Worth
+from colmap_affrect.project.match_state import LearnedModels, Worth
 from colmap_affrect.project.outputs import remove_own, temporary_folder
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.report import ModelSummary
@@ -64,9 +64,9 @@ def _set_of(context: Context) -> str:
 # Learned matches
 
 
-def looked_at_before(context: Context) -> LookedAt | None:
+def learned_models_on_record(context: Context) -> LearnedModels | None:
     """Return what is on record of these pairs; None before learned matching."""
-    known = context.matches.state.looked_at
+    known = context.matches.state.learned_models
     return known if known and known.of_set == _set_of(context) else None
 
 
@@ -78,7 +78,7 @@ class Choice:
     measured_worths: dict[Pair, Worth]  # of those that are used
 
 
-def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
+def map_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
     """Map with all learned matches, and keep the models and what they are worth.
 
     Args:
@@ -86,7 +86,7 @@ def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
         mapper: what makes models.
     """
     context = escalation.context
-    choice = _learned_choice(escalation)
+    choice = _choice_of_learned_matches(escalation)
     learned = context.workspace.learned
     with _replaced(learned) as new:
         new.mkdir()
@@ -95,18 +95,20 @@ def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
     found = read_summaries(learned)
     names = set(context.features.names()).difference(context.by_hand.left_out)
     is_sure = bool(found) and names.issubset(found[0].sure)
-    looked_at = LookedAt(
+    learned_models = LearnedModels(
         _set_of(context), score(found), is_sure, present_score(context)
     )
-    context.matches.keep(looked_at=looked_at)
+    context.matches.keep(learned_models=learned_models)
 
 
-def is_to_be_looked_at(context: Context) -> bool:
+def needs_learned_models(context: Context) -> bool:
     """Return whether models of learned matches may be better, and are not there to be chosen."""
-    looked_at = looked_at_before(context)
-    if not looked_at:
+    learned_models = learned_models_on_record(context)
+    if not learned_models:
         return True
-    is_decided = looked_at.is_chosen or looked_at.score <= present_score(context)
+    is_decided = learned_models.is_chosen or learned_models.score <= present_score(
+        context
+    )
     return not is_decided and not context.workspace.learned.exists()
 
 
@@ -121,23 +123,29 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
         Whether they were chosen.
     """
     context = escalation.context
-    looked_at = looked_at_before(context)
-    if not looked_at or looked_at.is_chosen or not context.workspace.learned.exists():
+    learned_models = learned_models_on_record(context)
+    if (
+        not learned_models
+        or learned_models.is_chosen
+        or not context.workspace.learned.exists()
+    ):
         return False
     # At once: as it was then, also for a run that was killed since.
     is_wanted = (
-        looked_at.is_enough if at_once else looked_at.score > present_score(context)
+        learned_models.is_enough
+        if at_once
+        else learned_models.score > present_score(context)
     )
-    choice = _learned_choice(escalation) if is_wanted else None
+    choice = _choice_of_learned_matches(escalation) if is_wanted else None
     if not choice or not choice.matches:
         return False
-    decided = replace(looked_at, is_chosen=True)
-    _choose(context, choice, context.workspace.learned, looked_at=decided)
-    take_over_chosen(escalation)
+    decided = replace(learned_models, is_chosen=True)
+    _choose(context, choice, context.workspace.learned, learned_models=decided)
+    adopt_chosen_models(escalation)
     return True
 
 
-def _learned_choice(escalation: Escalation) -> Choice:
+def _choice_of_learned_matches(escalation: Escalation) -> Choice:
     states = escalation.state.states()
     learned = escalation.matches.learned(list(states))
     levels = {pair: found.matches.level for pair, found in learned.items()}
@@ -183,7 +191,7 @@ def _choose(context: Context, choice: Choice, folder: Path, **changes: Any) -> N
     matches.choose(choice.matches, choice.measured_worths, **changes)
 
 
-def take_over_chosen(escalation: Escalation) -> None:
+def adopt_chosen_models(escalation: Escalation) -> None:
     """Let models follow the matches that were chosen, if they have not yet; a run was killed."""
     context = escalation.context
     name = context.matches.state.follows
@@ -193,20 +201,20 @@ def take_over_chosen(escalation: Escalation) -> None:
     folder = context.workspace.path / name
     if folder.exists():
         guide(context, context.guiding)
-        _take_over(context, folder)
+        _adopt(context, folder)
     context.matches.keep(follows="")
 
 
-def follow_keypoints(context: Context) -> None:
+def update_keypoints_of_models(context: Context) -> None:
     """Give the models that are there the keypoints that images have got; nothing else has changed.
 
     Mapping again would be of the same pairs, and might end elsewhere.
     """
     if context.workspace.mapped_from() != context.to_map():
-        _take_over(context, context.workspace.sparse)
+        _adopt(context, context.workspace.sparse)
 
 
-def _take_over(context: Context, sparse_path: Path) -> None:
+def _adopt(context: Context, sparse_path: Path) -> None:
     """Let models be those of the verified pairs that are there, with all keypoints."""
     workspace = context.workspace
     with _replaced(workspace.sparse) as new:
@@ -267,11 +275,11 @@ def restore_best(escalation: Escalation) -> bool:
     changed = [p for p, level in before.levels(pairs).items() if level != levels[p]]
     choice = Choice(list(before.read(changed)), before.measured_worths(changed))
     _choose(context, choice, best)
-    take_over_chosen(escalation)
+    adopt_chosen_models(escalation)
     return True
 
 
-def forget_others(context: Context) -> None:
+def remove_alternatives(context: Context) -> None:
     """Remove other models: those that are there are as good, or of other pairs."""
     for folder in (context.workspace.best, context.workspace.learned):
         remove_own([folder, _partial(folder)])

@@ -7,16 +7,17 @@ best ones so far are gone back to in the end (:mod:`colmap_affrect.escalation.al
 
 import time
 from dataclasses import replace
+from functools import partial
 
 from colmap_affrect.escalation.alternatives import (
+    adopt_chosen_models,
     choose_learned,
-    follow_keypoints,
-    forget_others,
-    is_to_be_looked_at,
     keep_best,
-    look_at_learned,
+    map_learned_matches,
+    needs_learned_models,
+    remove_alternatives,
     restore_best,
-    take_over_chosen,
+    update_keypoints_of_models,
 )
 from colmap_affrect.escalation.escalate import Escalation, begin
 from colmap_affrect.mappers.base import Mapper
@@ -42,61 +43,59 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         What each step did.
     """
     escalation, escalated = begin(context, recipe.escalate)
-    take_over_chosen(escalation)
-    reports = _mapped_first(context, mapper, recipe)
-    escalated = _learned(escalation, mapper, escalated)
+    adopt_chosen_models(escalation)
+    reports = _map_first(context, mapper, recipe)
+    escalated = _try_learned_matches(escalation, mapper, escalated)
     is_chosen = choose_learned(escalation, at_once=True)
     is_untouched = not is_chosen and not escalation.has_stepped
-    if is_untouched and context.matches.state.learning:
-        follow_keypoints(context)
-    while True:
-        while step := escalation.next_step():
-            keep_best(context)
-            escalated = escalation.taken(step, escalated)
+    if is_untouched and context.matches.state.learned_matching:
+        update_keypoints_of_models(context)
+    goes_on = True
+    while goes_on:
+        escalated = escalation.take_steps(
+            escalated, before_each=partial(keep_best, context)
+        )
         before = context.workspace.mapped_from()
-        reports += _mapped_on(context, mapper, recipe)
-        has_mapped = (
-            context.workspace.mapped_from() != before
-        )  # perhaps there is no model
-        if (
+        reports += _map_on(context, mapper, recipe)
+        # Nothing changes where no pair makes a model, or all are mapped.
+        has_mapped = context.workspace.mapped_from() != before
+        goes_on = (
             has_mapped
             or restore_best(escalation)
             or choose_learned(escalation, at_once=False)
-        ):
-            continue
-        forget_others(context)
-        return [*reports, escalation.ended(escalated)]
+        )
+    remove_alternatives(context)
+    return [*reports, escalation.final_report(escalated)]
 
 
-def _learned(
+def _try_learned_matches(
     escalation: Escalation, mapper: Mapper, report: StageReport
 ) -> StageReport:
-    """Match pairs of a small set by learned matching, once, and look at what models it makes."""
-    if not is_to_be_looked_at(escalation.context) or not escalation.plan_learning():
+    """Match pairs of a small set by learned matching, once, and map with these matches alone."""
+    context = escalation.context
+    if not needs_learned_models(context) or not escalation.plan_learned_matching():
         return report
     start = time.perf_counter()
-    num_matched = escalation.learn()
-    if escalation.is_learned:
-        look_at_learned(escalation, mapper)
+    num_matched = escalation.match_learned()
+    if escalation.has_all_learned_matches:
+        map_learned_matches(escalation, mapper)
     wall_s = report.wall_s + time.perf_counter() - start
     return replace(report, wall_s=wall_s, num_done=report.num_done + num_matched)
 
 
-def _mapped_first(
-    context: Context, mapper: Mapper, recipe: Recipe
-) -> list[StageReport]:
+def _map_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
     """Map for the first time, unless a run before has gone on from there."""
     matches = context.matches
     state = matches.state
     if state.modelled == state.listed and model_folders(context.workspace.sparse):
         return []
-    forget_others(context)  # of other pairs
+    remove_alternatives(context)  # of other pairs
     reports = [guide(context, recipe.guided), map_images(context, mapper)[0]]
     matches.keep(modelled=state.listed)
     return reports
 
 
-def _mapped_on(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
+def _map_on(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
     """Map what has changed, from the models that are there."""
     guided = guide(context, recipe.guided)
     return [guided, map_images(context, mapper, goes_on=True)[0]]

@@ -46,7 +46,7 @@ from colmap_affrect.stages.verify import update_verified
 
 logger = logging.getLogger(__name__)
 
-PAIRS_AT_ONCE = 50  # matched between two looks at the clock
+PAIRS_AT_ONCE = 50  # resources: matched between two looks at the clock
 
 
 def escalate(context: Context, options: EscalateOptions | None = None) -> StageReport:
@@ -60,9 +60,7 @@ def escalate(context: Context, options: EscalateOptions | None = None) -> StageR
         What was done; ``num_done`` counts the pairs that were matched again now.
     """
     escalation, report = begin(context, options)
-    while step := escalation.next_step():
-        report = escalation.taken(step, report)
-    return escalation.ended(report)
+    return escalation.final_report(escalation.take_steps(report))
 
 
 def begin(
@@ -79,7 +77,9 @@ def begin(
     escalation = Escalation(context, options)
     if escalation.has_begun:
         escalation.write()
-    return escalation, StageReport("escalate", time.perf_counter() - start, 0)
+    return escalation, StageReport(
+        name="escalate", wall_s=time.perf_counter() - start, num_done=0
+    )
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,9 @@ def matched_again(context: Context) -> Tried:
         return Tried()
     situation = state.situation(weights, models)
     effort = escalation.matches.state.effort or context.effort
-    return Tried(effort, tuple(tried(situation)), tuple(untried(situation)))
+    return Tried(
+        effort=effort, tried=tuple(tried(situation)), untried=tuple(untried(situation))
+    )
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,12 @@ class Escalation:
         """The recipe, prepared for all images when it is needed first."""
         context = self.context
         names = context.features.names()
-        return prepare(context.extraction, context.resources, names, context.progress)
+        return prepare(
+            options=context.extraction,
+            resources=context.resources,
+            image_names=names,
+            progress=context.progress,
+        )
 
     @property
     def has_stepped(self) -> bool:
@@ -162,7 +169,7 @@ class Escalation:
     def has_begun(self) -> bool:
         """Whether learned matching or a step has begun, perhaps in a run that was killed."""
         state = self.matches.state
-        return state.has_stepped or state.learning is not None
+        return state.has_stepped or state.learned_matching is not None
 
     @property
     def is_over_time(self) -> bool:
@@ -200,16 +207,32 @@ class Escalation:
             return Plan()
         return next_step(self.state.situation(weights, models), self.context.effort)
 
-    def taken(self, step: Step, report: StageReport) -> StageReport:
-        """Take a step, and return the report with its pairs and seconds."""
-        start = time.perf_counter()
-        self.match_at(step.pairs, step.level)
-        wall_s = report.wall_s + time.perf_counter() - start
-        return StageReport("escalate", wall_s, report.num_done + len(step.pairs))
+    def take_steps(
+        self, report: StageReport, before_each: Callable[[], None] = lambda: None
+    ) -> StageReport:
+        """Take steps until none is left.
 
-    def ended(self, report: StageReport) -> StageReport:
+        Args:
+            report: of what was done before.
+            before_each: called before each step.
+
+        Returns:
+            The report with the pairs and seconds of the steps.
+        """
+        step = self.next_step()
+        while step:
+            before_each()
+            start = time.perf_counter()
+            self.match_at(step.pairs, step.level)
+            wall_s = report.wall_s + time.perf_counter() - start
+            num_done = report.num_done + len(step.pairs)
+            report = StageReport(name="escalate", wall_s=wall_s, num_done=num_done)
+            step = self.next_step()
+        return report
+
+    def final_report(self, report: StageReport) -> StageReport:
         """Return the report with what could not be tried, which is logged, too."""
-        warnings = self.waiting()
+        warnings = self._missing_weights()
         if self.is_over_time:
             warnings["time"] = (
                 "it is over; the same command without --max-time tries more"
@@ -217,11 +240,14 @@ class Escalation:
         for what, text in warnings.items():
             logger.warning("%s: %s", what, text)
         return StageReport(
-            "escalate", report.wall_s, report.num_done, warnings=warnings
+            name="escalate",
+            wall_s=report.wall_s,
+            num_done=report.num_done,
+            warnings=warnings,
         )
 
-    def waiting(self) -> dict[str, str]:
-        """Say what levels that lack weights may tie, if anything is left to tie."""
+    def _missing_weights(self) -> dict[str, str]:
+        """Say for which images levels that lack weights would be tried."""
         how = self.context.resources.how_to_complete(self.context.extraction)
         if not how:
             return {}
@@ -242,23 +268,40 @@ class Escalation:
         """
         if pairs:
             self.matches.keep(step=Begun(level, tuple(pairs)), has_stepped=True)
-        learned = self.matches.learned(pairs)
-        known = {
-            pair: one for pair, one in learned.items() if one.matches.level == level
-        }
-        if known:
-            states = self.state.states()
-            trials = [
-                Trial(one.matches, one.worth, states[pair])
-                for pair, one in known.items()
-            ]
-            self._keep(trials, level)
+        known = self._use_learned_matches(pairs, level)
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
         self.write()
         self.matches.keep(step=None, has_stepped=True)
 
-    def plan_learning(self) -> bool:
+    def _use_learned_matches(self, pairs: Sequence[Pair], level: int) -> set[Pair]:
+        """Use the learned matches of a level that are there already, where they are better.
+
+        Args:
+            pairs: of image names.
+            level: number of the level in the recipe.
+
+        Returns:
+            The pairs that have such matches.
+        """
+        learned = list[Learned]()
+        for one in self.matches.learned(pairs).values():
+            if one.matches.level == level:
+                learned.append(one)
+        if not learned:
+            return set()
+        states = self.state.states()
+        trials = list[Trial]()
+        for one in learned:
+            trials.append(
+                Trial(
+                    found=one.matches, worth=one.worth, before=states[one.matches.names]
+                )
+            )
+        self._keep(trials, level)
+        return {one.matches.names for one in learned}
+
+    def plan_learned_matching(self) -> bool:
         """Put on record which pairs are to be matched by a learned level, beside what is there.
 
         An interrupted run resumes with these: images that get features change the database.
@@ -267,7 +310,7 @@ class Escalation:
             Whether there are any; none of sets that are large or need nothing, nor where no learned
             level can be used.
         """
-        if self.matches.state.learning:
+        if self.matches.state.learned_matching:
             return True
         models = self.state.models()
         weights = self.state.weights(models)
@@ -278,16 +321,16 @@ class Escalation:
             return False
         step = learned_step(situation)
         if step.pairs:
-            self.matches.keep(learning=Begun(step.level, tuple(step.pairs)))
+            self.matches.keep(learned_matching=Begun(step.level, tuple(step.pairs)))
         return bool(step.pairs)
 
-    def learn(self) -> int:
-        """Match the pairs of :meth:`plan_learning` that have no learned matches yet.
+    def match_learned(self) -> int:
+        """Match the pairs of :meth:`plan_learned_matching` that have no learned matches yet.
 
         Returns:
             How many were matched; some may be left where the time that the user gave is over.
         """
-        planned = self.matches.state.learning or Begun(0, ())
+        planned = self.matches.state.learned_matching or Begun(0, ())
         done = self.matches.learned_levels(planned.pairs)
         todo = [pair for pair in planned.pairs if done[pair] < 0]
         num_matched = 0
@@ -301,13 +344,13 @@ class Escalation:
         return num_matched
 
     @property
-    def is_learned(self) -> bool:
-        """Whether all pairs of :meth:`plan_learning` have learned matches."""
-        planned = self.matches.state.learning
-        return (
-            planned is not None
-            and min(self.matches.learned_levels(planned.pairs).values()) >= 0
-        )
+    def has_all_learned_matches(self) -> bool:
+        """Whether all pairs of :meth:`plan_learned_matching` have learned matches."""
+        planned = self.matches.state.learned_matching
+        if planned is None:
+            return False
+        levels = self.matches.learned_levels(planned.pairs)
+        return min(levels.values()) >= 0
 
     def write(self) -> None:
         """Bring the database up to what is stored, and verify what is new."""
@@ -315,23 +358,31 @@ class Escalation:
 
     def _match_with(self, pairs: Sequence[Pair], level: int, keep: Keep) -> None:
         """Give images the features of a level that they lack, and match pairs with these."""
-        features = self.context.features
-        chosen = self.context.extraction.levels[level]
-        missing = list[tuple[str, int]]()
-        for name in sorted({name for pair in pairs for name in pair}):
-            there = features.level_ranges(name)
-            missing += [
-                (name, k) for k in sorted({chosen.base, level}) if k not in there
-            ]
-        left = (
-            f" (at most about {self.left_s / 60:.0f} min)" if self.left_s >= 60 else ""
-        )
-        title = f"escalate, {chosen.name}{left}"
+        missing = self._missing_features(pairs, level)
+        title = f"escalate, {self.context.extraction.levels[level].name}"
+        if self.left_s >= 60.0:
+            title += f" (at most about {self.left_s / 60:.0f} min)"
         num_steps = len(missing) + len(pairs)
         with self.context.progress.stage(title, num_steps, "steps") as advance:
             self._extend(missing, advance)
             if pairs:
                 self._match_again(pairs, level, keep, advance)
+
+    def _missing_features(
+        self, pairs: Sequence[Pair], level: int
+    ) -> list[tuple[str, int]]:
+        """Return the images without features of a level or its base, each with the level."""
+        names = set[str]()
+        for pair in pairs:
+            names.update(pair)
+        wanted = sorted({self.context.extraction.levels[level].base, level})
+        missing = list[tuple[str, int]]()
+        for name in sorted(names):
+            there = self.context.features.level_ranges(name)
+            for number in wanted:
+                if number not in there:
+                    missing.append((name, number))
+        return missing
 
     def _extend(
         self, missing: Sequence[tuple[str, int]], advance: Callable[[int], None]
@@ -360,11 +411,20 @@ class Escalation:
         context = self.context
         size_px = context.extraction.levels[level].max_image_size_px
         graph = context.graph
-        verifier = PairVerifier(graph.ids, graph.cameras, context.verification, size_px)
+        verifier = PairVerifier(
+            ids=graph.ids,
+            cameras=graph.cameras,
+            options=context.verification,
+            extracted_px=size_px,
+        )
         states = self.state.states()
 
         def trial_of(found: PairMatches) -> Trial:
-            return Trial(found, self._worth(found, verifier), states[found.names])
+            return Trial(
+                found=found,
+                worth=self._worth(found, verifier),
+                before=states[found.names],
+            )
 
         def write(batch: Sequence[Trial]) -> None:
             keep(batch, level)
@@ -391,9 +451,8 @@ class Escalation:
 
     def _keep_learned(self, batch: Sequence[Trial], _: int) -> None:
         """Write learned matches beside those in use."""
-        self.matches.keep_learned(
-            [Learned(trial.found, trial.worth) for trial in batch]
-        )
+        learned = [Learned(trial.found, trial.worth) for trial in batch]
+        self.matches.keep_learned(learned)
 
     def _measured_worths(self, batch: Sequence[Trial]) -> dict[Pair, Worth]:
         """Return what the best measured matches are worth of pairs that use learned ones."""

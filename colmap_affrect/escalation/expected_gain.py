@@ -1,10 +1,14 @@
 """Which pairs are matched again, and at which level: what is likely to bring most per second.
 
 A pair at a level is worth the chance that it verifies there, times the photographs that it would
-tie, over what it costs. The chances are logistic regressions on what is known of a pair, one for
-each kind of level, and the costs are nominal: seconds of one core. Both are in
+connect, over what it costs. The chances are logistic regressions on what is known of a pair, one
+for each kind of level, and the costs are nominal: seconds of one core. Both are in
 ``expected_gain.json``; ``tests/benchmarks/fit_expected_gain.py`` fits the former on photographs
 whose poses are known.
+
+A pair is *verified* when its two-view geometry has inliers, and *strong* when these are so many
+that nothing more is matched for it (``EscalateOptions.strong_num_inliers``). All other pairs that
+are listed may be matched again.
 """
 
 import json
@@ -21,25 +25,30 @@ from colmap_affrect.project.match_state import Worth
 from colmap_affrect.recipes import Level
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")
-MAPPING_S = 1.0  # of one core, by image: what follows on each step, mapping again
+# Seconds of one core by image, for the mapping that follows each step; measured on runs
+MAPPING_S = 1.0
 LEARNED = "learned"  # kind of the level that matches whole photographs by networks
 
 
 @dataclass(frozen=True)
 class PairState:
-    """What is known of a pair."""
+    """What is known of a pair.
 
-    num_inliers: int  # 0 where it is not verified
-    num_consistent: int = 0  # raw matches that confirm each other
-    level: int = 0  # that its matches are from
-    tried: int = 1  # a bit for each level
-    measured_worth: Worth = (
-        0,
-        0,
-    )  # of the measured matches that learned ones took the place of
-    learned_level: int = (
-        -1
-    )  # of learned matches that are kept beside those in use; -1: none
+    Attributes:
+        num_inliers: 0 where it is not verified.
+        num_consistent: raw matches that confirm each other.
+        level: the level that its matches are from.
+        tried: a bit for each level that it was matched at.
+        measured_worth: of the measured matches that learned ones took the place of.
+        learned_level: of learned matches that are kept beside those in use; -1 if there are none.
+    """
+
+    num_inliers: int
+    num_consistent: int = 0
+    level: int = 0
+    tried: int = 1
+    measured_worth: Worth = (0, 0)
+    learned_level: int = -1
 
     @property
     def worth(self) -> Worth:
@@ -48,12 +57,18 @@ class PairState:
 
 
 @dataclass(frozen=True)
-class LevelGain:
-    """What a kind of level usually brings and costs."""
+class LevelStatistics:
+    """How often a kind of level verifies pairs, and what it costs.
 
-    coefficients: Mapping[str, float]  # of the regression, by name of the term
-    image_s: float  # of one core, for the features of an image, by megapixel
-    pair_s: float  # the same for matching a pair of images
+    Attributes:
+        coefficients: of the regression, by name of the term.
+        image_s: seconds of one core by megapixel, for the features of an image.
+        pair_s: the same for matching a pair of images.
+    """
+
+    coefficients: Mapping[str, float]
+    image_s: float
+    pair_s: float
 
     def chance(self, terms: Mapping[str, float]) -> float:
         """Return the probability that a pair verifies, and is right."""
@@ -77,9 +92,11 @@ class LevelGain:
 
 
 @cache
-def _known() -> dict[str, LevelGain]:
+def _statistics_by_kind() -> dict[str, LevelStatistics]:
     content = json.loads(COEFFICIENTS.read_text(encoding="utf-8"))
-    return {kind: LevelGain(**values) for kind, values in content.items()}
+    return {
+        kind: LevelStatistics(**values) for kind, values in content["levels"].items()
+    }
 
 
 def kind_of(level: Level) -> str:
@@ -90,52 +107,86 @@ def kind_of(level: Level) -> str:
     return LEARNED if warps == "none" else "learned, warps"
 
 
-def gain_of(level: Level) -> LevelGain:
-    """Return what a level brings and costs."""
-    return _known()[kind_of(level)]
+def statistics_of(level: Level) -> LevelStatistics:
+    """Return how often a level verifies pairs, and what it costs."""
+    return _statistics_by_kind()[kind_of(level)]
 
 
 def terms(state: PairState, wins: int, losses: int) -> dict[str, float]:
     """Return what the chance of a pair is made of.
 
-    ``wins`` and ``losses``: pairs of the set that the level has verified so far, and others.
+    Args:
+        state: what is known of the pair.
+        wins: pairs of the set that the level has verified so far.
+        losses: pairs of the set for which it was tried in vain.
+
+    Returns:
+        The value of each term of the regression, by name.
     """
+    num_levels_in_vain = (state.tried >> 1).bit_count()
     return {
         "constant": 1.0,
         "consistent": math.log1p(state.num_consistent),
         "inliers": math.log1p(state.num_inliers),
-        "tried": float((state.tried >> 1).bit_count()),  # in vain
+        "tried": float(num_levels_in_vain),
         "success_ratio": math.log((1 + wins) / (1 + losses)),
     }
 
 
 @dataclass(frozen=True)
+class Connection:
+    """What a pair would connect to the model if it was verified.
+
+    Attributes:
+        key: the name of an image, or the number of a component of the verified pairs.
+        weight: photographs that this saves.
+    """
+
+    key: str | int
+    weight: float
+
+
+@dataclass(frozen=True)
 class Candidate:
-    """A pair that a level may verify."""
+    """A pair that a level may verify.
+
+    Attributes:
+        pair: names of its images.
+        chance: probability that it verifies, and is right.
+        connections: what it would connect.
+    """
 
     pair: Pair
-    chance: float  # that it verifies, and is right
-    ties: Sequence[
-        tuple[str | int, float]
-    ]  # images or a part of the graph, and photographs saved
+    chance: float
+    connections: Sequence[Connection]
 
     @property
     def photographs(self) -> float:
         """How many photographs it is expected to save, if nothing else does."""
-        return self.chance * sum(value for _, value in self.ties)
+        return self.chance * sum(connection.weight for connection in self.connections)
 
 
 @dataclass(frozen=True)
 class Step:
-    """Pairs to match again at a level now, and what is expected of that."""
+    """Pairs to match again at a level now, and what is expected of that.
+
+    Attributes:
+        level: number of the level in the recipe.
+        pairs: those that are matched now.
+        photographs: expected to be saved by these pairs.
+        seconds: of one core, with the mapping that follows.
+        all_photographs: expected of all pairs that the budget allows at this level.
+        all_seconds: what these take.
+        num_pairs: how many these are.
+    """
 
     level: int = 0
     pairs: Sequence[Pair] = ()
-    photographs: float = 0.0  # expected to be saved by these pairs
-    seconds: float = 0.0  # of one core, with the mapping that follows
-    all_photographs: float = 0.0  # by all pairs that the budget allows at this level
-    all_seconds: float = 0.0  # that these take
-    num_pairs: int = 0  # how many these are
+    photographs: float = 0.0
+    seconds: float = 0.0
+    all_photographs: float = 0.0
+    all_seconds: float = 0.0
+    num_pairs: int = 0
 
     @property
     def rate(self) -> float:
@@ -144,64 +195,92 @@ class Step:
 
 
 @dataclass(frozen=True)
-class ExpectedGain:
-    """The pairs of a set as they are now, and what a level may bring to them."""
+class StepPlanner:
+    """Chooses the pairs that a level is likely to verify, from the pairs as they are now.
 
-    states: Mapping[Pair, PairState]  # of all pairs
-    weakly_connected: Set[str]  # images with few features in tracks through three
-    weights: Mapping[str, float]  # of the images to match again, in photographs
-    megapixels: Mapping[str, float]  # of each image, as its features are extracted
-    unmeasured: Collection[int]  # levels whose frames are not measured
-    lacking: Collection[str]  # images without features of the level yet
-    registered: Collection[str]  # images of the model before
-    strong_num_inliers: int  # pairs with as many need nothing more
+    Attributes:
+        states: of all pairs.
+        weakly_connected: images with few features in tracks through three.
+        weights: of the images to match again, in photographs.
+        megapixels: of each image, as its features are extracted.
+        unmeasured: numbers of the levels whose frames are not measured.
+        lacking: images without features of the level yet.
+        registered: images of the model before.
+        strong_num_inliers: pairs with as many inliers need nothing more.
+    """
+
+    states: Mapping[Pair, PairState]
+    weakly_connected: Set[str]
+    weights: Mapping[str, float]
+    megapixels: Mapping[str, float]
+    unmeasured: Collection[int]
+    lacking: Collection[str]
+    registered: Collection[str]
+    strong_num_inliers: int
 
     @cached_property
-    def _parts(self) -> list[set[str]]:
-        verified = (pair for pair, state in self.states.items() if state.num_inliers)
-        return connected_parts(
-            verified, (name for pair in self.states for name in pair)
-        )
+    def _verified(self) -> list[Pair]:
+        return [pair for pair, state in self.states.items() if state.num_inliers]
 
     @cached_property
-    def _part_of(self) -> dict[str, int]:
-        return {
-            name: number for number, part in enumerate(self._parts) for name in part
-        }
+    def _components(self) -> list[set[str]]:
+        """The connected components of the verified pairs, the largest first."""
+        names = list[str]()
+        for pair in self.states:
+            names += pair
+        return connected_parts(self._verified, names)
+
+    @cached_property
+    def _component_of(self) -> dict[str, int]:
+        numbers = dict[str, int]()
+        for number, component in enumerate(self._components):
+            numbers.update(dict.fromkeys(component, number))
+        return numbers
 
     @cached_property
     def _num_pairs_to_model(self) -> Counter[str]:
         """Count the verified pairs of each image with images of the model."""
-        verified = [pair for pair, state in self.states.items() if state.num_inliers]
-        both = [*verified, *(pair[::-1] for pair in verified)]
-        return Counter(name for name, other in both if other in self.registered)
+        counts = Counter[str]()
+        for first, second in self._verified:
+            if second in self.registered:
+                counts[first] += 1
+            if first in self.registered:
+                counts[second] += 1
+        return counts
 
-    def _ties(self, pair: Pair) -> list[tuple[str | int, float]]:
-        """Return what would be tied by a pair, images or a part, and how many images that saves.
+    def _connections(self, pair: Pair) -> list[Connection]:
+        """Return what a pair would connect, and how many photographs that saves.
 
-        What is apart from the largest part must be joined to others before all. Where n verified
-        pairs with images of the model did not save one, another does with 1 / (n + 1), about.
-        While there is no model, each pair of images to match again may begin one.
+        A component apart from the largest one must be joined to others before all. Where n
+        verified pairs with images of the model did not save an image, another does with
+        1 / (n + 1), about. While there is no model, each pair of images to match again may begin
+        one.
         """
-        first, second = (self._part_of[name] for name in pair)
-        if first == second:
-            if first and self.registered:
-                return []
-            needy = [name for name in pair if name in self.weights]
-            num_pairs = self._num_pairs_to_model
-            return [
-                (name, self.weights[name] / (1 + num_pairs[name])) for name in needy
-            ]
-        smaller = max(first, second)  # parts come by size
-        need = sum(self.weights.get(name, 0.0) for name in self._parts[smaller])
-        return [(smaller, need)] if need else []
+        first = self._component_of[pair[0]]
+        second = self._component_of[pair[1]]
+        if first != second:
+            return self._joined_component(max(first, second))  # the smaller one
+        if first and self.registered:
+            return []
+        connections = list[Connection]()
+        for name in pair:
+            if name in self.weights:
+                num_pairs = self._num_pairs_to_model[name]
+                weight = self.weights[name] / (1 + num_pairs)
+                connections.append(Connection(name, weight))
+        return connections
+
+    def _joined_component(self, number: int) -> list[Connection]:
+        """Return the connection of a component, if it has images to match again."""
+        names = self._components[number]
+        weight = sum(self.weights.get(name, 0.0) for name in names)
+        return [Connection(number, weight)] if weight else []
 
     def _is_strong(self, pair: Pair) -> bool:
         """Tell whether a pair needs nothing more; while there is no model, none is."""
-        is_many = self.states[pair].num_inliers >= self.strong_num_inliers
-        return (
-            is_many and bool(self.registered) and self.weakly_connected.isdisjoint(pair)
-        )
+        has_many = self.states[pair].num_inliers >= self.strong_num_inliers
+        is_well_connected = self.weakly_connected.isdisjoint(pair)
+        return has_many and bool(self.registered) and is_well_connected
 
     def _of_measured(self, state: PairState) -> PairState:
         """Return what the best matches of measured frames say of a pair."""
@@ -221,23 +300,31 @@ class ExpectedGain:
         Returns:
             Candidates by falling number of photographs that they are expected to save.
         """
-        gain = gain_of(level)
-        num_tried = sum(state.tried >> number & 1 for state in self.states.values())
-        wins = sum(
-            s.level == number and s.num_inliers > 0 for s in self.states.values()
-        )
-        losses = max(0, num_tried - wins)
-        found = list[Candidate]()
+        statistics = statistics_of(level)
+        wins, losses = self._wins_and_losses(number)
+        candidates = list[Candidate]()
         for pair, state in self.states.items():
             if state.tried & others or self._is_strong(pair):
                 continue
-            ties = self._ties(pair)
-            if not ties:
+            connections = self._connections(pair)
+            if not connections:
                 continue
-            hint = self._of_measured(state) if level.features.has_shapes else state
-            found.append(Candidate(pair, gain.chance(terms(hint, wins, losses)), ties))
-        found.sort(key=lambda one: (-one.photographs, one.pair))
-        return found
+            known = self._of_measured(state) if level.features.has_shapes else state
+            chance = statistics.chance(terms(known, wins, losses))
+            candidates.append(
+                Candidate(pair=pair, chance=chance, connections=connections)
+            )
+        candidates.sort(key=lambda one: (-one.photographs, one.pair))
+        return candidates
+
+    def _wins_and_losses(self, number: int) -> tuple[int, int]:
+        """Return for how many pairs a level was tried with and without success."""
+        num_tried = 0
+        wins = 0
+        for state in self.states.values():
+            num_tried += state.tried >> number & 1
+            wins += state.level == number and state.num_inliers > 0
+        return wins, max(0, num_tried - wins)
 
     def best_step(
         self, number: int, level: Level, others: int, budget_s: float
@@ -257,66 +344,79 @@ class ExpectedGain:
             The step; one without pairs where there is nothing to match.
         """
         mapping_s = MAPPING_S * len(self.megapixels)
-        step = _Selection(self, gain_of(level), mapping_s)
-        everything = _Selection(self, gain_of(level), mapping_s)
+        statistics = statistics_of(level)
+        now = _Selection(self, statistics, seconds=mapping_s)
+        affordable = _Selection(self, statistics, seconds=mapping_s)
         for one in self.candidates(number, level, others):
-            if everything.seconds + everything.cost_of(one) - mapping_s > budget_s:
+            if affordable.seconds + affordable.seconds_of(one) - mapping_s > budget_s:
                 continue
-            everything.add(one)
-            if step.photographs * step.cost_of(one) <= step.gain_of(one) * step.seconds:
-                step.add(one)
+            affordable.add(one)
+            if now.is_worthwhile(one):
+                now.add(one)
         return Step(
-            number,
-            step.pairs,
-            step.photographs,
-            step.seconds,
-            everything.photographs,
-            everything.seconds,
-            len(everything.pairs),
+            level=number,
+            pairs=now.pairs,
+            photographs=now.photographs,
+            seconds=now.seconds,
+            all_photographs=affordable.photographs,
+            all_seconds=affordable.seconds,
+            num_pairs=len(affordable.pairs),
         )
 
 
 @dataclass
 class _Selection:
-    """Pairs that are matched together, what they are expected to save, and what they take."""
+    """Pairs that are matched together, what they are expected to save, and what they take.
 
-    gain: ExpectedGain
-    level: LevelGain
-    seconds: float  # of one core; at first that of mapping
+    Attributes:
+        planner: what is known of the set.
+        statistics: of the level.
+        seconds: of one core; at first that of mapping.
+        photographs: expected to be saved.
+        pairs: those selected so far.
+    """
+
+    planner: StepPlanner
+    statistics: LevelStatistics
+    seconds: float
     photographs: float = 0.0
     pairs: list[Pair] = field(default_factory=list)
-    _there: set[str] = field(
-        default_factory=set
-    )  # images that get features of the level
-    _lost: dict[str | int, float] = field(
-        default_factory=dict
-    )  # chance that none tied it so far
+    # Names of the images that get features of the level
+    _extended: set[str] = field(default_factory=set)
+    # Probability that no selected pair connects an image or a component, by key
+    _chance_missed: dict[str | int, float] = field(default_factory=dict)
 
-    def gain_of(self, one: Candidate) -> float:
+    def photographs_saved_by(self, one: Candidate) -> float:
         """Return how many photographs a pair is expected to save that no other has saved."""
-        return one.chance * sum(
-            value * self._lost.get(key, 1.0) for key, value in one.ties
-        )
+        saved = 0.0
+        for connection in one.connections:
+            saved += connection.weight * self._chance_missed.get(connection.key, 1.0)
+        return one.chance * saved
 
-    def cost_of(self, one: Candidate) -> float:
+    def seconds_of(self, one: Candidate) -> float:
         """Return the seconds of a pair, and of the features that its images lack."""
-        sizes = self.gain.megapixels
+        sizes = self.planner.megapixels
+        images = list[float]()
+        for name in one.pair:
+            if name in self.planner.lacking and name not in self._extended:
+                images.append(sizes[name])
         first, second = one.pair
-        lacking = [
-            n for n in one.pair if n in self.gain.lacking and n not in self._there
-        ]
-        return self.level.seconds(
-            [sizes[n] for n in lacking], [(sizes[first], sizes[second])]
-        )
+        return self.statistics.seconds(images, [(sizes[first], sizes[second])])
+
+    def is_worthwhile(self, one: Candidate) -> bool:
+        """Tell whether a pair saves no less per second than the pairs so far."""
+        so_far = self.photographs * self.seconds_of(one)
+        return so_far <= self.photographs_saved_by(one) * self.seconds
 
     def add(self, one: Candidate) -> None:
         """Take a pair in."""
-        self.seconds += self.cost_of(one)
-        self.photographs += self.gain_of(one)
+        self.seconds += self.seconds_of(one)
+        self.photographs += self.photographs_saved_by(one)
         self.pairs.append(one.pair)
-        self._there.update(one.pair)
-        for key, _ in one.ties:
-            self._lost[key] = self._lost.get(key, 1.0) * (1.0 - one.chance)
+        self._extended.update(one.pair)
+        for connection in one.connections:
+            missed = self._chance_missed.get(connection.key, 1.0)
+            self._chance_missed[connection.key] = missed * (1.0 - one.chance)
 
 
 def insecure_images(
@@ -326,12 +426,18 @@ def insecure_images(
 ) -> set[str]:
     """Return the images that mapping may well lose: without a strong pair, or weakly connected.
 
-    ``num_inliers`` of each pair is 0 where it is not verified.
+    Args:
+        num_inliers: of each pair, 0 where it is not verified.
+        strong_num_inliers: inliers from which on a pair is strong.
+        weakly_connected: images that are insecure in any case.
+
+    Returns:
+        Names of images.
     """
-    strong = (
-        pair
-        for pair, count in num_inliers.items()
-        if count >= max(1, strong_num_inliers)
-    )
-    names = {name for pair in num_inliers for name in pair}
-    return names.difference(*strong).union(weakly_connected)
+    insecure = set[str]()
+    for pair in num_inliers:
+        insecure.update(pair)
+    for pair, count in num_inliers.items():
+        if count >= max(1, strong_num_inliers):
+            insecure.difference_update(pair)
+    return insecure.union(weakly_connected)

@@ -19,62 +19,88 @@ from dataclasses import dataclass, field
 from colmap_affrect.escalation.expected_gain import (
     LEARNED,
     MAPPING_S,
-    ExpectedGain,
     PairState,
     Step,
-    gain_of,
+    StepPlanner,
     kind_of,
+    statistics_of,
 )
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
-# Images up to which learned matching takes all pairs of images to match again
+# Images up to which learned matching takes all pairs of images to match again; resource: these are
+# 435 pairs, some minutes of two cores
 SMALL = 30
-# Expected of all that the budget allows, below which nothing is tried
+# Photographs expected of all that the budget allows, below which nothing is tried; judged on the
+# same sets, by where photographs right against seconds are flat
 MIN_PHOTOGRAPHS = 0.2
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long is tried, after learned matching; in seconds of one core."""
+    """How long is tried, after learned matching; in seconds of one core.
 
-    least_s: float  # even if the first model took less
-    times_first_model: float  # of what the first model took, where that is more
-    without_model_s: float  # while nothing is registered
+    Attributes:
+        least_s: even if the first model took less.
+        times_first_model: of what the first model took, where that is more.
+        without_model_s: while nothing is registered.
+    """
+
+    least_s: float
+    times_first_model: float
+    without_model_s: float
 
     def budget_s(self, first_model_s: float, *, has_model: bool) -> float:
-        """Return the seconds of one core that levels after learned matching may take."""
+        """Return what levels after learned matching may take.
+
+        Args:
+            first_model_s: what the first model took, seconds of one core.
+            has_model: whether images are registered.
+
+        Returns:
+            Seconds of one core.
+        """
         budget = max(self.least_s, self.times_first_model * first_model_s)
         return budget if has_model else max(budget, self.without_model_s)
 
 
+# Seconds of one core; judged by photographs right against seconds (tests/benchmarks/effort.py)
 EFFORTS: Mapping[EffortName, Effort] = {
-    "low": Effort(0.0, 0.0, 0.0),
-    "normal": Effort(120.0, 1.0, 900.0),
-    "high": Effort(600.0, 5.0, 3600.0),
+    "low": Effort(least_s=0.0, times_first_model=0.0, without_model_s=0.0),
+    "normal": Effort(least_s=120.0, times_first_model=1.0, without_model_s=900.0),
+    "high": Effort(least_s=600.0, times_first_model=5.0, without_model_s=3600.0),
 }
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What is known of a set of images, as escalation sees it."""
+    """What is known of a set of images, as escalation sees it.
 
-    levels: Sequence[Level]  # of the recipe, that of every image first
-    usable: Sequence[int]  # numbers of the levels of escalation that may be tried
-    states: Mapping[Pair, PairState]  # of all pairs
-    weights: Mapping[str, float]  # of the images to match again, in photographs
-    weakly_connected: Collection[
-        str
-    ]  # images with few features in tracks through three
-    anchored: Collection[
-        str
-    ]  # images of the model that measured frames tie to a likely one
-    megapixels: Sequence[Mapping[str, float]]  # of each image, by level
-    lacking: Sequence[Collection[str]]  # images without features of a level, by level
-    registered: Collection[str] = ()  # images of the largest model
-    strong_num_inliers: int = 100  # pairs with as many need nothing more
+    Attributes:
+        levels: of the recipe, that of every image first.
+        usable: numbers of the levels of escalation that may be tried.
+        states: of all pairs.
+        weights: of the images to match again, in photographs.
+        weakly_connected: images with few features in tracks through three.
+        anchored: images of the model that measured frames connect to a likely one.
+        megapixels: of each image, by level.
+        lacking: images without features of a level, by level.
+        registered: images of the largest model.
+        strong_num_inliers: pairs with as many inliers need nothing more.
+    """
+
+    levels: Sequence[Level]
+    usable: Sequence[int]
+    states: Mapping[Pair, PairState]
+    weights: Mapping[str, float]
+    weakly_connected: Collection[str]
+    anchored: Collection[str]
+    megapixels: Sequence[Mapping[str, float]]
+    lacking: Sequence[Collection[str]]
+    registered: Collection[str] = ()
+    strong_num_inliers: int = 100
 
     @property
     def is_small(self) -> bool:
@@ -84,78 +110,128 @@ class Situation:
     @property
     def learned_level(self) -> int | None:
         """Number of the level that matches whole photographs by networks, if it can be used."""
-        kinds = ((number, kind_of(self.levels[number])) for number in self.usable)
-        return next((number for number, kind in kinds if kind == LEARNED), None)
+        for number in self.usable:
+            if kind_of(self.levels[number]) == LEARNED:
+                return number
+        return None
 
     def is_measured(self, number: int) -> bool:
         """Tell whether the frames of a level are measured one by one."""
         return self.levels[number].features.has_shapes
 
-    def has_learned(self, state: PairState) -> bool:
-        """Tell whether there are learned matches of a pair, used or beside those that are."""
-        return state.learned_level >= 0 or not self.is_measured(state.level)
+    def pairs_without_learned_matches(self) -> list[Pair]:
+        """Return the pairs without learned matches, used or beside those that are."""
+        pairs = list[Pair]()
+        for pair, state in self.states.items():
+            if state.learned_level < 0 and self.is_measured(state.level):
+                pairs.append(pair)
+        return pairs
+
+    def seconds(
+        self, number: int, names: Collection[str], pairs: Collection[Pair]
+    ) -> float:
+        """Return what features of images, and matching of pairs, take at a level.
+
+        Args:
+            number: of the level in the recipe.
+            names: images that get features.
+            pairs: pairs that are matched.
+
+        Returns:
+            Nominal seconds of one core.
+        """
+        sizes = self.megapixels[number]
+        image_sizes = [sizes[name] for name in names]
+        pair_sizes = [(sizes[first], sizes[second]) for first, second in pairs]
+        return statistics_of(self.levels[number]).seconds(image_sizes, pair_sizes)
 
     @property
     def first_model_s(self) -> float:
         """Nominal seconds of all that comes before escalation."""
-        sizes = self.megapixels[0]
-        pairs = [(sizes[first], sizes[second]) for first, second in self.states]
-        matching_s = gain_of(self.levels[0]).seconds(sizes.values(), pairs)
-        return matching_s + MAPPING_S * len(sizes)
+        names = self.megapixels[0].keys()
+        return self.seconds(0, names, self.states.keys()) + MAPPING_S * len(names)
 
-    def has_tried(self, state: PairState, number: int) -> bool:
-        """Tell whether a pair was matched at a level, also if the matches are not used."""
-        return bool(state.tried >> number & 1) or state.learned_level == number
+    def pairs_tried(self, number: int) -> list[Pair]:
+        """Return the pairs that were matched at a level, also if the matches are not used."""
+        pairs = list[Pair]()
+        for pair, state in self.states.items():
+            if state.tried >> number & 1 or state.learned_level == number:
+                pairs.append(pair)
+        return pairs
 
-    def spent_on(self, number: int) -> float:
+    def seconds_spent_at(self, number: int) -> float:
         """Return the nominal seconds that a level has taken so far."""
-        sizes = self.megapixels[number]
-        tried = [
-            pair for pair, state in self.states.items() if self.has_tried(state, number)
-        ]
-        images = [sizes[name] for name in {name for pair in tried for name in pair}]
-        pairs = [(sizes[first], sizes[second]) for first, second in tried]
-        return gain_of(self.levels[number]).seconds(images, pairs)
+        pairs = self.pairs_tried(number)
+        names = set[str]()
+        for pair in pairs:
+            names.update(pair)
+        return self.seconds(number, names, pairs)
 
-    def spent_s(self) -> float:
+    def seconds_spent(self) -> float:
         """Return the nominal seconds spent after learned matching, of which some is free."""
-        spent = {number: self.spent_on(number) for number in range(1, len(self.levels))}
-        learned_s = sum(
-            s for k, s in spent.items() if kind_of(self.levels[k]) == LEARNED
-        )
+        spent = list[float]()
+        learned = list[float]()
+        for number in range(1, len(self.levels)):
+            seconds = self.seconds_spent_at(number)
+            spent.append(seconds)
+            if kind_of(self.levels[number]) == LEARNED:
+                learned.append(seconds)
+        learned_s = sum(learned)
         free_s = learned_s if self.is_small else min(learned_s, self.first_model_s)
-        return sum(spent.values()) - free_s
+        return sum(spent) - free_s
 
-    def gain(self, number: int, weights: Mapping[str, float]) -> ExpectedGain:
-        """Return what a level may bring to images to match again."""
-        return ExpectedGain(
-            self.states,
-            set(self.weakly_connected),
-            weights,
-            self.megapixels[number],
-            [k for k in range(len(self.levels)) if not self.is_measured(k)],
-            self.lacking[number],
-            self.registered,
-            self.strong_num_inliers,
+    def planner(self, number: int, weights: Mapping[str, float]) -> StepPlanner:
+        """Return what chooses the pairs of a level.
+
+        Args:
+            number: of the level in the recipe.
+            weights: of the images that it may help, in photographs.
+
+        Returns:
+            A planner with all pairs as they are now.
+        """
+        numbers = range(len(self.levels))
+        return StepPlanner(
+            states=self.states,
+            weakly_connected=set(self.weakly_connected),
+            weights=weights,
+            megapixels=self.megapixels[number],
+            unmeasured=[k for k in numbers if not self.is_measured(k)],
+            lacking=self.lacking[number],
+            registered=self.registered,
+            strong_num_inliers=self.strong_num_inliers,
         )
 
     def needless_after(self, number: int) -> int:
         """Return bits of the levels that make one needless: it and later ones of its kind."""
-        kind = self.is_measured(number)
-        later = range(number, len(self.levels))
-        return sum(1 << k for k in later if self.is_measured(k) == kind)
+        bits = 0
+        for later in range(number, len(self.levels)):
+            if self.is_measured(later) == self.is_measured(number):
+                bits |= 1 << later
+        return bits
 
-    def best_at(self, number: int, budget_s: float) -> Step:
-        """Return the best step of a level within a budget."""
+    def best_step(self, number: int, budget_s: float) -> Step:
+        """Return the best step of a level.
+
+        Features without shapes mistake similar things for the same: images that others anchor do
+        not need them.
+
+        Args:
+            number: of the level in the recipe.
+            budget_s: seconds of one core that its pairs may take.
+
+        Returns:
+            The step; without pairs where there is nothing to match.
+        """
         weights = dict(self.weights)
         if not self.is_measured(number):
-            # Features without shapes mistake similar things for the same: images that others anchor
-            # do not need them.
             for name in self.anchored:
                 weights.pop(name, None)
-        gain = self.gain(number, weights)
-        return gain.best_step(
-            number, self.levels[number], self.needless_after(number), budget_s
+        return self.planner(number, weights).best_step(
+            number=number,
+            level=self.levels[number],
+            others=self.needless_after(number),
+            budget_s=budget_s,
         )
 
 
@@ -170,16 +246,15 @@ def learned_step(situation: Situation) -> Step:
     if number is None or not situation.weights:
         return Step()
     if not situation.is_small:
-        left_s = situation.first_model_s - situation.spent_on(number)
-        return situation.best_at(number, left_s)
-    lacking = [
-        p for p, state in situation.states.items() if not situation.has_learned(state)
-    ]
-    needed = [pair for pair in lacking if not situation.weights.keys().isdisjoint(pair)]
-    sizes = situation.megapixels[number]
-    others = [(sizes[a], sizes[b]) for a, b in lacking if (a, b) not in needed]
-    others_s = gain_of(situation.levels[number]).seconds((), others)
-    is_cheap = others_s <= situation.first_model_s
+        left_s = situation.first_model_s - situation.seconds_spent_at(number)
+        return situation.best_step(number, left_s)
+    lacking = situation.pairs_without_learned_matches()
+    needed = list[Pair]()
+    others = list[Pair]()
+    for pair in lacking:
+        is_needed = not situation.weights.keys().isdisjoint(pair)
+        (needed if is_needed else others).append(pair)
+    is_cheap = situation.seconds(number, (), others) <= situation.first_model_s
     return Step(number, lacking if needed and is_cheap else needed)
 
 
@@ -210,16 +285,18 @@ def next_step(situation: Situation, effort: EffortName) -> Plan:
     """
     if not situation.weights:
         return Plan()
-    budget = EFFORTS[effort].budget_s(
-        situation.first_model_s, has_model=bool(situation.registered)
-    )
-    left_s = budget - situation.spent_s()
+    has_model = bool(situation.registered)
+    budget_s = EFFORTS[effort].budget_s(situation.first_model_s, has_model=has_model)
+    left_s = budget_s - situation.seconds_spent()
     if not situation.is_small:
         learned = learned_step(situation)
         if learned.pairs:
             return Plan(learned, max(0.0, left_s) + situation.first_model_s)
-    steps = [situation.best_at(number, left_s) for number in situation.usable]
-    hopeful = [step for step in steps if is_hopeful(step, situation)]
+    hopeful = list[Step]()
+    for number in situation.usable:
+        step = situation.best_step(number, left_s)
+        if is_hopeful(step, situation):
+            hopeful.append(step)
     if not hopeful:
         return Plan()
     all_s = sum(step.all_seconds for step in hopeful)
@@ -230,11 +307,11 @@ def tried(situation: Situation) -> list[MatchedAgain]:
     """Return for how many pairs each level of escalation was tried."""
     found = list[MatchedAgain]()
     for number in range(1, len(situation.levels)):
-        states = situation.states.items()
-        pairs = [pair for pair, state in states if situation.has_tried(state, number)]
+        pairs = situation.pairs_tried(number)
         if pairs:
             kind = kind_of(situation.levels[number])
-            found.append(MatchedAgain(kind, len(pairs), situation.spent_on(number)))
+            core_s = situation.seconds_spent_at(number)
+            found.append(MatchedAgain(kind=kind, num_pairs=len(pairs), core_s=core_s))
     return found
 
 
@@ -244,8 +321,12 @@ def untried(situation: Situation) -> list[MatchedAgain]:
     for number in situation.usable:
         if situation.is_small and number == situation.learned_level:
             continue  # it was tried beside the others
-        step = situation.best_at(number, math.inf)
+        step = situation.best_step(number, math.inf)
         if is_hopeful(step, situation):
             kind = kind_of(situation.levels[number])
-            found.append(MatchedAgain(kind, step.num_pairs, step.all_seconds))
+            found.append(
+                MatchedAgain(
+                    kind=kind, num_pairs=step.num_pairs, core_s=step.all_seconds
+                )
+            )
     return found

@@ -4,21 +4,23 @@ It is read anew for every decision, from the stores and the view graph: each ste
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from colmap_affrect.colmap.verification import weakly_connected_images
-from colmap_affrect.escalation import expected_gain
-from colmap_affrect.escalation.expected_gain import PairState
+from colmap_affrect.escalation.expected_gain import PairState, insecure_images
 from colmap_affrect.escalation.policy import Situation
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import LARGE
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.match_state import Size
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.match import num_confirming
 
-LIKELY = 0.25  # part of a gain that counts for images that are likely right: matches mend few
+# Share of its gain that an image weighs that is likely right already: matches mend few of these;
+# judged on the sets of tests/benchmarks/effort.py
+LIKELY = 0.25
 
 
 class SetState:
@@ -39,9 +41,8 @@ class SetState:
         self.is_measured = [
             level.features.has_shapes for level in context.extraction.levels
         ]
-        self._confirming: dict[
-            Pair, tuple[bytes, int]
-        ] = {}  # raw matches, and their number
+        # Raw matches of pairs, and how many of them confirm each other
+        self._confirming = dict[Pair, tuple[bytes, int]]()
 
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of the pairs that may be used, 0 of those that are not verified."""
@@ -55,7 +56,14 @@ class SetState:
     def models(self) -> list[ModelSummary]:
         """Return what is known of the models before; an empty one where there are none."""
         models = read_summaries(self.context.workspace.sparse)
-        return models or [ModelSummary((), 0, 0.0, 0.0)]
+        return models or [
+            ModelSummary(
+                registered_names=(),
+                num_points3D=0,
+                mean_track_length=0.0,
+                mean_reprojection_error_px=0.0,
+            )
+        ]
 
     def weights(self, models: Sequence[ModelSummary]) -> dict[str, float]:
         """Return the images to match again, and how much more matches may bring to each.
@@ -70,9 +78,8 @@ class SetState:
         Returns:
             Weights in photographs, by image name.
         """
-        names = set(self.context.features.names()).difference(
-            self.context.by_hand.left_out
-        )
+        names = set(self.context.features.names())
+        names.difference_update(self.context.by_hand.left_out)
         wanted = names.difference(models[0].sure)
         if not self._is_mapped():
             wanted = self._insecure(wanted, num_images=len(names))
@@ -90,25 +97,25 @@ class SetState:
 
     def _insecure(self, wanted: set[str], *, num_images: int) -> set[str]:
         """Return the images that the next model may well lose; none where it will tell of them."""
-        strong = self.options.strong_num_inliers
-        weakly_connected = self._weakly_connected()
-        insecure = expected_gain.insecure_images(
-            self.num_inliers(), strong, weakly_connected
+        insecure = insecure_images(
+            num_inliers=self.num_inliers(),
+            strong_num_inliers=self.options.strong_num_inliers,
+            weakly_connected=self._weakly_connected(),
         )
         insecure &= wanted
         has_models = self.context.workspace.sparse.exists()
-        # The next model tells of what has been tied since.
+        # The next model tells of what has been verified since.
         maps_next = insecure != wanted and has_models and num_images < LARGE
         return set() if maps_next else insecure
 
     def _anchored(
         self, model: ModelSummary, states: Mapping[Pair, PairState]
     ) -> set[str]:
-        """Return the images of a model that measured frames tie to one that is likely right."""
+        """Return the images of a model that measured frames connect to a likely one."""
         anchored = set[str]()
         for pair, state in states.items():
-            is_tied = state.num_inliers and self.is_measured[state.level]
-            if is_tied and not model.likely.isdisjoint(pair):
+            is_verified = state.num_inliers and self.is_measured[state.level]
+            if is_verified and not model.likely.isdisjoint(pair):
                 anchored.update(pair)
         return anchored.intersection(model.registered_names)
 
@@ -129,17 +136,17 @@ class SetState:
         tried = matches.levels(num_inliers, "tried")
         measured = matches.measured_worths(num_inliers)
         learned = matches.learned_levels(num_inliers)
-        return {
-            pair: PairState(
-                count,
-                confirming.get(pair, 0),
-                levels[pair],
-                tried[pair],
+        states = dict[Pair, PairState]()
+        for pair, count in num_inliers.items():
+            states[pair] = PairState(
+                num_inliers=count,
+                num_consistent=confirming.get(pair, 0),
+                level=levels[pair],
+                tried=tried[pair],
                 measured_worth=measured[pair],
                 learned_level=learned[pair],
             )
-            for pair, count in num_inliers.items()
-        }
+        return states
 
     def _num_confirming(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
         """Return how many raw matches of pairs confirm each other."""
@@ -171,34 +178,43 @@ class SetState:
         Returns:
             The state of all pairs and images.
         """
-        features = self.context.features
-        levels = self.context.extraction.levels
+        extraction = self.context.extraction
+        sizes = self.context.features.image_sizes()
         states = self.states()
-        sizes = features.image_sizes()
-        levels_of = {name: set(features.level_ranges(name)) for name in sizes}
-        megapixels = list[dict[str, float]]()
-        lacking = list[set[str]]()
-        for number, level in enumerate(levels):
-            limit_px = level.max_image_size_px
-            megapixels.append(
-                {name: _megapixels(size, limit_px) for name, size in sizes.items()}
-            )
-            lacking.append({name for name in sizes if number not in levels_of[name]})
         return Situation(
-            levels=levels,
-            usable=self.context.resources.usable_levels(self.context.extraction)[1:],
+            levels=extraction.levels,
+            usable=self.context.resources.usable_levels(extraction)[1:],
             states=states,
             weights=weights,
             weakly_connected=self._weakly_connected(),
             anchored=self._anchored(models[0], states),
-            megapixels=megapixels,
-            lacking=lacking,
+            megapixels=self._megapixels_by_level(sizes),
+            lacking=self._lacking_by_level(sizes),
             registered=models[0].registered_names,
             strong_num_inliers=self.options.strong_num_inliers,
         )
 
+    def _megapixels_by_level(self, sizes: Mapping[str, Size]) -> list[dict[str, float]]:
+        """Return how large each image is when features of a level are extracted."""
+        by_level = list[dict[str, float]]()
+        for level in self.context.extraction.levels:
+            megapixels = dict[str, float]()
+            for name, size in sizes.items():
+                megapixels[name] = _megapixels(size, level.max_image_size_px)
+            by_level.append(megapixels)
+        return by_level
 
-def _megapixels(size: tuple[int, int], limit_px: int) -> float:
+    def _lacking_by_level(self, names: Collection[str]) -> list[set[str]]:
+        """Return the images without features of each level."""
+        by_level = [set(names) for _ in self.context.extraction.levels]
+        for name in names:
+            for number in self.context.features.level_ranges(name):
+                if number < len(by_level):
+                    by_level[number].discard(name)
+        return by_level
+
+
+def _megapixels(size: Size, limit_px: int) -> float:
     """Return the megapixels of an image of (width, height) px, shrunk to a longest side."""
     scale = min(1.0, limit_px / max(size))
     return math.prod(size) * scale**2 / 1e6

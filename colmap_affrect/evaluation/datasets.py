@@ -33,9 +33,10 @@ Truth = TrueHomography | TruePose | Correspondences
 Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 """Cameras and cam_from_world poses by the name of the image without suffix."""
 PAIR_LIST_SUFFIX = "_image_pairs.txt"  # of SVP
-CATEGORY_DEG = 10  # of rotation, in a category of SVP
+CATEGORY_DEG = 10  # of rotation, in a category of SVP; paper
 CALIBRATION_PREFIX = "calibration_"  # of IMC
-NUM_COVISIBILITY_LIMITS = 10  # of IMC: 0.0, 0.1, ... 0.9
+NUM_COVISIBILITY_LIMITS = 10  # of IMC: 0.0, 0.1, ... 0.9; paper
+# Format of our own
 ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
 """What is added to coordinates of ``pairs.json`` for pixel-centre px, by its ``pixel_origin``."""
 
@@ -84,7 +85,14 @@ def load_evd(folder: Path) -> Pairs:
             if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES):
                 names.add(file.stem)
     entries = [
-        _evd_entry(folder, n, f"1/{n}", f"2/{n}", f"h/{n}.txt") for n in sorted(names)
+        _evd_entry(
+            folder=folder,
+            name=n,
+            stem1=f"1/{n}",
+            stem2=f"2/{n}",
+            homography=f"h/{n}.txt",
+        )
+        for n in sorted(names)
     ]
     for file in sorted(folder.glob("H_*.txt")):
         parts = re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", file.stem)
@@ -174,7 +182,11 @@ def _posed_pairs(
         key2, path2 = images[name2]
         title = f"{key1} {key2}"
         pairs[title] = EvaluationPair(
-            title, (key1, key2), (path1, path2), truth, category(name1, name2)
+            name=title,
+            images=(key1, key2),
+            paths=(path1, path2),
+            truth=truth,
+            category=category(name1, name2),
         )
     if lacking:
         logger.warning(
@@ -207,7 +219,13 @@ def _load_svp_scene(list_path: Path) -> Pairs:
         angle_deg = np.rad2deg(pycolmap.Rotation3d(rotation).angle())
         return f"{CATEGORY_DEG * int(angle_deg // CATEGORY_DEG)}°"
 
-    return _posed_pairs(scene, folder / "images", views, listed, category)
+    return _posed_pairs(
+        scene=scene,
+        folder=folder / "images",
+        views=views,
+        listed=listed,
+        category=category,
+    )
 
 
 def read_views(folder: Path) -> Views:
@@ -274,9 +292,8 @@ def _load_imc_scene(lists_path: Path) -> Pairs:
     views = {}
     for path in sorted((root / "calibration").glob(f"{CALIBRATION_PREFIX}*.h5")):
         views[path.stem.removeprefix(CALIBRATION_PREFIX)] = read_calibration(path)
-    categories: dict[
-        Names, str
-    ] = {}  # covisibility; lists are cumulative, and the last counts
+    # Covisibility; lists are cumulative, and the last counts
+    categories: dict[Names, str] = {}
     for limit in range(NUM_COVISIBILITY_LIMITS):
         path = lists_path / f"keys-th-0.{limit}.npy"
         if limit == 0 and not path.exists():  # this list may be missing
@@ -285,7 +302,11 @@ def _load_imc_scene(lists_path: Path) -> Pairs:
             for key in np.load(path, allow_pickle=False).ravel().tolist():
                 categories[_split(str(key), views)] = f"0.{limit}"
     return _posed_pairs(
-        scene, root / "images", views, categories, lambda *names: categories[names]
+        scene=scene,
+        folder=root / "images",
+        views=views,
+        listed=categories,
+        category=lambda *names: categories[names],
     )
 
 
@@ -397,11 +418,11 @@ def _load(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Pairs:
 
     def pair(entry: _Entry) -> EvaluationPair:
         return EvaluationPair(
-            entry.name,
-            (entry.image1, entry.image2),
-            (folder / entry.image1, folder / entry.image2),
-            _truth(entry, folder, offset_px),
-            entry.category,
+            name=entry.name,
+            images=(entry.image1, entry.image2),
+            paths=(folder / entry.image1, folder / entry.image2),
+            truth=_truth(entry, folder, offset_px),
+            category=entry.category,
         )
 
     return list(map_ordered(pair, entries, available_cores()))

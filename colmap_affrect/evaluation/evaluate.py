@@ -54,20 +54,26 @@ from colmap_affrect.stages.one_image import prepare
 
 logger = logging.getLogger(__name__)
 
-NUM_DIGITS = 8  # of a digest in the name of a file of features
+NUM_DIGITS = 8  # of a digest in the name of a file of features; format
 
 
 @dataclass
 class _Matched:
-    """The matches of a pair at the level with most verified inliers."""
+    """The matches of a pair at the level with most verified inliers.
 
-    points: tuple[Array, Array] = (
-        np.zeros((0, 2)),
-        np.zeros((0, 2)),
-    )  # (M, 2) px, by image
+    Attributes:
+        points: (M, 2) px, by image.
+        num_keypoints: by image.
+        level: see ``PairResult``.
+        num_inliers: of COLMAP's two-view geometry; 0 where there is one level alone.
+        failure: why the pair could not be matched.
+    """
+
+    points: tuple[Array, Array] = (np.zeros((0, 2)), np.zeros((0, 2)))
     num_keypoints: tuple[int, int] = (0, 0)
-    level: str = ""  # see ``PairResult``
-    failure: str = ""  # why the pair could not be matched
+    level: str = ""
+    num_inliers: int = 0
+    failure: str = ""
 
 
 class EvaluateOptions(Options):
@@ -140,13 +146,13 @@ class RecipeRun:
         for level in self._extractor.extractors:
             chosen = self.recipe.extraction.levels[level]
             matching = Matching(
-                self._store,
-                chosen.matching or self.recipe.matching,
-                level,
-                chosen.base,
-                chosen.features.name,
-                self._options.resources,
-                self._options.max_num_keypoints or 0,
+                store=self._store,
+                options=chosen.matching or self.recipe.matching,
+                level=level,
+                base=chosen.base,
+                extractor=chosen.features.name,
+                resources=self._options.resources,
+                max_num_features=self._options.max_num_keypoints or 0,
             )
             matchers[level] = CachedMatcher(matching)
         results = []
@@ -190,39 +196,56 @@ class RecipeRun:
         watch: Stopwatch,
     ) -> _Matched:
         """Match a pair, level by level, until it has many verified inliers."""
-        best: _Matched | None = None
+        best = None
         most = 0
+        strong = max(1, self.recipe.escalate.strong_num_inliers)
         for level, matcher in matchers.items():
-            with self._lock, watch.step("extract"):
-                if not self._extract_pair(pair, level):
-                    break
-                first, second = map(matcher.prepared, pair.images)
-            with watch.step("match"):
-                rows1, rows2 = matcher.matcher.match(
-                    first.content, second.content
-                ).indices.T
-                lafs = (first.frames[rows1], second.frames[rows2])
-                num_inliers = 0
-                name = ""
-                if len(matchers) > 1:
-                    num_inliers = self._verified_inliers(pair, lafs, level)
-                    name = (
-                        self.recipe.extraction.levels[level].name
-                        if num_inliers
-                        else "none"
-                    )
-            if num_inliers > most or not most:
-                most = num_inliers
-                points = (lafs[0][:, :, 2], lafs[1][:, :, 2])
-                best = _Matched(points, (len(first.frames), len(second.frames)), name)
-            if most >= max(1, self.recipe.escalate.strong_num_inliers):
+            found = self._matched_at(level, matcher, pair, watch)
+            if found is None:
                 break
-        if best is None:
-            failures = [
-                self.failures[name] for name in pair.images if name in self.failures
-            ]
-            best = _Matched(failure="; ".join(failures))
-        return best
+            if best is None or not most or found.num_inliers > most:
+                most = found.num_inliers
+                best = found
+            if most >= strong:
+                break
+        if best is not None:
+            return best
+        failures = [self.failures[n] for n in pair.images if n in self.failures]
+        return _Matched(failure="; ".join(failures))
+
+    def _matched_at(
+        self, level: int, matcher: CachedMatcher, pair: EvaluationPair, watch: Stopwatch
+    ) -> _Matched | None:
+        """Match a pair by the features of a level, and verify it if there are other levels.
+
+        Args:
+            level: of the recipe.
+            matcher: with the features of the level.
+            pair: the images.
+            watch: takes the seconds.
+
+        Returns:
+            The matches; None if an image cannot be used.
+        """
+        with self._lock, watch.step("extract"):
+            if not self._extract_pair(pair, level):
+                return None
+            first, second = map(matcher.prepared, pair.images)
+        with watch.step("match"):
+            matches = matcher.matcher.match(first.content, second.content)
+            rows1, rows2 = matches.indices.T
+            lafs = (first.frames[rows1], second.frames[rows2])
+            num_inliers = 0
+            name = ""
+            if len(self._extractor.extractors) > 1:
+                num_inliers = self._verified_inliers(pair, lafs, level)
+                name = self.recipe.extraction.levels[level].name
+        return _Matched(
+            points=(lafs[0][:, :, 2], lafs[1][:, :, 2]),
+            num_keypoints=(len(first.frames), len(second.frames)),
+            level=name if num_inliers or not name else "none",
+            num_inliers=num_inliers,
+        )
 
     def _extract_pair(self, pair: EvaluationPair, level: int) -> bool:
         """Extract what the images of a pair lack of a level; tell whether both can be used."""
@@ -281,10 +304,10 @@ class RecipeRun:
             sides.append(Side(camera, colmap_keypoints(lafs[number])))
         indices = np.arange(len(lafs[0]))
         geometry = estimate_geometry(
-            (sides[0], sides[1]),
-            np.stack([indices, indices], axis=1),
-            VerificationOptions(random_seed=0),
-            self.recipe.extraction.levels[level].max_image_size_px,
+            sides=(sides[0], sides[1]),
+            matches=np.stack([indices, indices], axis=1),
+            options=VerificationOptions(random_seed=0),
+            extracted_px=self.recipe.extraction.levels[level].max_image_size_px,
         )
         return len(geometry.inlier_matches)
 
@@ -330,7 +353,14 @@ def evaluate(
     with Workspace(output_path).locked():
         pairs = PROTOCOLS[protocol](dataset_path)
         runs = [
-            RecipeRun(method, pairs, output_path, inputs, options) for method in methods
+            RecipeRun(
+                method=method,
+                pairs=pairs,
+                output_path=output_path,
+                inputs=inputs,
+                options=options,
+            )
+            for method in methods
         ]
         for method in methods if overwrite else ():
             pattern = f"features/{method.folder_name}-{'?' * NUM_DIGITS}.h5"

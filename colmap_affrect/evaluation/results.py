@@ -33,9 +33,8 @@ class RecipeResult:
     """The scores of one recipe."""
 
     name: str  # its label
-    summary: Mapping[
-        str, Mapping[str, float]
-    ]  # columns of tables, by the kind of truth
+    # Columns of tables, by the kind of truth
+    summary: Mapping[str, Mapping[str, float]]
     # number of failed pairs, seconds in all, and means over the pairs: ``solved`` from 0 to 1,
     # ``keypoints`` of an image, ``matches``, ``inliers``
     costs: Mapping[str, float]

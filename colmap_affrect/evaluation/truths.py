@@ -32,29 +32,32 @@ Points = Floats
 Sides = tuple[Floats, Floats]  # points or rays of both images
 Size = tuple[int, int]  # (width, height) in px
 
-CONFIDENCE = 0.9999  # at which estimators may end before all iterations
-NUM_ESTIMATES = 5  # with other orders of the matches; the one of median error counts
-MIN_HOMOGRAPHY_MATCHES = 4  # determine a homography
-MIN_FUNDAMENTAL_MATCHES = 8  # determine a fundamental matrix linearly
-# Five determine several essential matrices, without support for any of them
+CONFIDENCE = 0.9999  # at which estimators may end before all iterations; paper
+# With other orders of the matches; the one of median error counts; resource
+NUM_ESTIMATES = 5
+MIN_HOMOGRAPHY_MATCHES = 4  # determine a homography; theory
+MIN_FUNDAMENTAL_MATCHES = 8  # determine a fundamental matrix linearly; theory
+# Five determine several essential matrices, without support for any of them; theory
 MIN_POSE_MATCHES = 6
 MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices; judged
 # Largest transfer error or Sampson distance of a correct match; judged
 CORRECT_PX = 3.0
-# In x and y, of the pixels over which the error of a homography is a mean
+# In x and y, of the pixels over which the error of a homography is a mean; resource
 GRID_STEP_PX = 4
 # Of the homography of a solved pair; a column of the paper's table on EVD
 MAX_ERROR_PX = 5.0
 MAX_ERROR_DEG = 5.0  # of the rotation of a solved pair: the paper's limit
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
-MAX_AUC_ERROR_DEG = 10.0  # of the area under the curve of recall; that of the IMC
-NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
+# Of the area under the curve of recall; that of the IMC; paper
+MAX_AUC_ERROR_DEG = 10.0
+# The score of WxBS is the mean share within 0, 1, ... 19 px; paper
+NUM_WXBS_LIMITS = 20
 
 
 class ScoreOptions(Options):
     """How models are estimated from matches."""
 
-    threshold_px: Annotated[float, within(0.01, 1000.0)] = 0.5
+    threshold_px: Annotated[float, within(0.01, 1000.0)] = 0.5  # paper
     """Largest error of an inlier of plain RANSAC, for homographies and poses."""
     max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
     """As the paper says; its numbers of poses are those of 1000."""
@@ -246,18 +249,18 @@ class TrueHomography:
             The score; its error is :meth:`error_px`.
         """
         matrix, num_inliers = estimate_matrix(
-            cv2.findHomography,
-            (points1, points2),
-            cv2.RANSAC,
-            options.threshold_px,
-            options,
+            find=cv2.findHomography,
+            points=(points1, points2),
+            method=cv2.RANSAC,
+            threshold_px=options.threshold_px,
+            options=options,
         )
         error = self.error_px(matrix)
         is_correct = transfer_errors(self.matrix, points1, points2) < CORRECT_PX
         return PairScore(
-            error,
-            num_inliers,
-            int(is_correct.sum()),
+            error=error,
+            num_inliers=num_inliers,
+            num_correct=int(is_correct.sum()),
             solved=float(error < MAX_ERROR_PX),
             kind="homographies",
         )
@@ -324,10 +327,10 @@ class TruePose:
         _, translation = self.pose
         has_baseline = translation.any()  # else distances are not defined
         return PairScore(
-            rotation_deg,
-            num_inliers,
-            int((distances_px < CORRECT_PX).sum()) if has_baseline else 0,
-            direction_deg,
+            error=rotation_deg,
+            num_inliers=num_inliers,
+            num_correct=int((distances_px < CORRECT_PX).sum()) if has_baseline else 0,
+            direction_error_deg=direction_deg,
             solved=float(rotation_deg < MAX_ERROR_DEG),
             kind="poses",
         )
@@ -362,11 +365,11 @@ class Correspondences:
         estimates = []  # error, number of inliers, seed, distances; seeds differ
         for seed in range(options.random_seed, options.random_seed + NUM_ESTIMATES):
             matrix, num_inliers = estimate_matrix(
-                cv2.findFundamentalMat,
-                (points1, points2),
-                cv2.USAC_MAGSAC,
-                MAX_EPIPOLAR_NOISE_PX,
-                options.changed(random_seed=seed),
+                find=cv2.findFundamentalMat,
+                points=(points1, points2),
+                method=cv2.USAC_MAGSAC,
+                threshold_px=MAX_EPIPOLAR_NOISE_PX,
+                options=options.changed(random_seed=seed),
             )
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
             estimates.append(

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 MAX_TILT = 20.0
-"""Largest tilt of a shape; more is degenerate. AffNet's shapes on photographs stay below 6 (judged
-on Graffiti)."""
+"""Largest tilt of a shape; more is degenerate. AffNet's shapes on photographs stay below 6
+(measured on Graffiti)."""
 PATCH_SIGMAS = 12.0  # half width of a patch in units of the feature's sigma (the paper)
-BATCH_SIZE = 256  # patches that go through a network at once
+BATCH_SIZE = 256  # patches that go through a network at once; resource
 BATCH_MULTIPLE = 64
 """Batches are padded to multiples of this many patches: other sizes change the last bits of the
-results on a CPU, so that an image alone would differ from one among others."""
+results on a CPU, so that an image alone would differ from one among others; numeric."""
 
 
 class AffNetHardNetOptions(DogOptions):

@@ -39,23 +39,25 @@ if TYPE_CHECKING:
 ORIGIN_PX = conventions.grid_origin(STEP_PX)  # centre of the first block
 LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
-front, that patch has the block of rows and columns 0...3 in its middle."""
+front, that patch has the block of rows and columns 0...3 in its middle; theory."""
 PAPER_CROP_PX = (-LEAD_PX) % STEP_PX  # puts the patches of all cells round whole blocks
-PAPER_LEAD_CELLS = (
-    LEAD_PX + PAPER_CROP_PX
-) // STEP_PX  # blocks before the first with a patch
-CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9  # cell i depends on rows 4 i - 11...4 i + 39
-STRIP_CELLS = 64  # rows of cells that are computed at once, to bound the memory
-WINDOW_PX = 33  # surroundings whose mean and deviation normalize a pixel: about a patch
+# Blocks before the first with a patch
+PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX
+# Cell i depends on rows 4 i - 11...4 i + 39; theory
+CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9
+# Rows of cells that are computed at once, to bound the memory; resource
+STRIP_CELLS = 64
+# Surroundings whose mean and deviation normalize a pixel: about a patch; theory
+WINDOW_PX = 33
 DEVIATION_FLOOR = 0.01 * 255
 """Gray values added to deviations, so that surroundings without texture stay so; judged."""
-# Added to the deviation of the whole image (the authors' value)
+# Added to the deviation of the whole image (the value of the paper's authors)
 PAPER_DEVIATION_FLOOR = 1e-6
 MAX_NORMALIZED = 6.0
-"""Largest normalized value, as in the fully convolutional network of AffNet's authors."""
+"""Largest normalized value, as in the fully convolutional network of AffNet's authors; paper."""
 # Half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
 PATCH_SIGMAS = 12.0
-BATCH_SIZE = 256  # patches that go through the network at once
+BATCH_SIZE = 256  # patches that go through the network at once; resource
 
 
 class AffNetOptions(ShapeOptions):
@@ -65,7 +67,7 @@ class AffNetOptions(ShapeOptions):
     scales: Annotated[
         tuple[Annotated[float, within(0.05, 1.0)], ...],
         Field(strict=False, min_length=1),
-    ] = (1.0, 0.5, 0.25)
+    ] = (1.0, 0.5, 0.25)  # judged
     """Sizes of the image at which dense shapes are estimated; their log-Euclidean mean counts."""
     paper: bool = False
     """Normalise by mean and deviation of the whole image and use the full size only, as the
@@ -73,7 +75,7 @@ class AffNetOptions(ShapeOptions):
     min_deviation: Annotated[float, within(0.0, 255.0)] = 3.0
     """Standard deviation of the surroundings, in gray values, under which a block counts as flat;
     not with ``paper``."""
-    max_num_keypoints: Annotated[int, within(1, 1_000_000)] = 4000
+    max_num_keypoints: Annotated[int, within(1, 1_000_000)] = 4000  # resource
     """Sparse shapes are those of the strongest keypoints."""
 
     @property
@@ -116,13 +118,17 @@ class AffNet:
             logs = self._mean_logs(image)
             textured = _textured_blocks(image, self.options.min_deviation)
             logs[~textured] = 0.0
-        return ShapeGrid(tilts.metrics_from_log(logs), textured, ORIGIN_PX, STEP_PX)
+        return ShapeGrid(
+            metrics=tilts.metrics_from_log(logs),
+            textured=textured,
+            origin_px=ORIGIN_PX,
+            step_px=STEP_PX,
+        )
 
     def samples(self, image: GrayImage) -> ShapeSamples:
         """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image, where finite."""
-        lafs = self.detect(image).lafs[
-            : self.options.max_num_keypoints
-        ]  # by falling response
+        # By falling response
+        lafs = self.detect(image).lafs[: self.options.max_num_keypoints]
         shapes = _shapes(self._patch_outputs(image, lafs))
         is_finite = np.isfinite(shapes).all(axis=(1, 2))
         is_valid = is_finite & (determinants(shapes) > 0)
@@ -260,8 +266,12 @@ def _interpolated(
     num_rows, num_columns, num_channels = values.shape
     scale_x, shift_x = level_from_image[0, [0, 2]]
     scale_y, shift_y = level_from_image[1, [1, 2]]
-    row_weights = _linear_weights(scale_y, shift_y, cells[0], num_rows)
-    column_weights = _linear_weights(scale_x, shift_x, cells[1], num_columns)
+    row_weights = _linear_weights(
+        scale=scale_y, shift=shift_y, num_cells=cells[0], num_values=num_rows
+    )
+    column_weights = _linear_weights(
+        scale=scale_x, shift=shift_x, num_cells=cells[1], num_values=num_columns
+    )
     channels = []
     for number in range(num_channels):
         channels.append(row_weights @ values[:, :, number] @ column_weights.T)

@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Protocol
 from colmap_affrect.data import GrayImage, LocalFeatures, ShapeGrid, ShapeSamples, View
 from colmap_affrect.options import PartOptions, Registry, within
 
-PATCH_SIZE_PX = 32  # side of the patches that all networks take
+PATCH_SIZE_PX = 32  # side of the patches that all networks take; paper
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class FeatureOptions(NetworkOptions):
 
     in_color: ClassVar[bool] = False
     """Whether views are (H, W, 3) instead of (H, W)."""
-    bytes_per_px: ClassVar[int] = 256
+    bytes_per_px: ClassVar[int] = 256  # measured
     """Memory of the extraction of one image, roughly."""
     has_shapes: ClassVar[bool] = True
     """Whether LAFs were measured one by one, so that they can tell right matches from wrong."""
-    max_num_features: Annotated[int, within(1, 1_000_000)] = 8192
+    max_num_features: Annotated[int, within(1, 1_000_000)] = 8192  # COLMAP's
     """Most features of the image itself, by response."""
-    max_num_rectified_features: Annotated[int, within(1, 1_000_000)] = 6144
+    max_num_rectified_features: Annotated[int, within(1, 1_000_000)] = 6144  # resource
     """Most features of all warps together, by response."""
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 RADIUS_PX = 12.0
-"""Radius of all LAFs, of a sigma of 2 px: judged on photographs, the network finds a point again
+"""Radius of all LAFs, of a sigma of 2 px: measured on photographs, the network finds a point again
 within so much, so that the same point of several warps is recognized as one."""
 
 
@@ -33,13 +33,13 @@ class AlikedOptions(FeatureOptions):
 
     name: Literal["aliked"] = "aliked"
     in_color: ClassVar[bool] = True
-    bytes_per_px: ClassVar[int] = 1600
+    bytes_per_px: ClassVar[int] = 1600  # measured
     has_shapes: ClassVar[bool] = False
-    max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
+    max_num_features: Annotated[int, within(1, 1_000_000)] = 2048  # paper
     """Most features of one view, by response, as its authors match them."""
     model: Literal["n16", "n16rot"] = "n16"
     """``n16rot`` was trained with rotated images."""
-    score_threshold: Annotated[float, within(0.001, 1.0)] = 0.2
+    score_threshold: Annotated[float, within(0.001, 1.0)] = 0.2  # paper
     """Least score; where nothing has it, all maxima above the mean score of the view stay."""
 
     @property
@@ -84,9 +84,8 @@ class Aliked(FeatureExtractor):
         with torch.inference_mode():
             pixels = _pixels(image).to(self.device)
             feature_map, score_map = self.network.extract_dense_map(pixels)
-            (normalized,), (scores,), _ = self.network.dkd(
-                score_map
-            )  # positions in [-1, 1]
+            # Positions in [-1, 1]
+            (normalized,), (scores,), _ = self.network.dkd(score_map)
             last_pixel = normalized.new_tensor([image.shape[1] - 1, image.shape[0] - 1])
             points = (normalized + 1) / 2 * last_pixel
             kept = np.flatnonzero(in_mask(is_allowed, _array(points)))
@@ -99,7 +98,7 @@ class Aliked(FeatureExtractor):
             responses = _array(scores[rows])
         radii_px = np.full(len(keypoints), RADIUS_PX)
         lafs = lafs_from_keypoints(keypoints, radii_px, np.zeros(len(keypoints)))
-        return LocalFeatures(lafs, responses, descriptors)
+        return LocalFeatures(lafs=lafs, responses=responses, descriptors=descriptors)
 
 
 def _pixels(image: GrayImage | ColorImage) -> Tensor:

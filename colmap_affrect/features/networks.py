@@ -26,11 +26,11 @@ from colmap_affrect.images.warping import halved
 Network = TypeVar("Network", bound=nn.Module)
 State = dict[str, Any]
 UNUSED_PREFIX = "SIFT."  # of parameters in the file of HardTFeat that no layer has
-# Patches that are sampled at once, which stay in the cache of a CPU
+# Patches that are sampled at once, which stay in the cache of a CPU; resource
 PATCHES_AT_ONCE = 512
 # Added to deviations of patches, as in kornia's AffNet and OriNet
 DEVIATION_FLOOR = 1e-6
-MAX_PROBLEM_LENGTH = 80  # characters of torch's message that are shown
+MAX_PROBLEM_LENGTH = 80  # characters of torch's message that are shown; display
 
 
 def resolve_device(name: str) -> torch.device:
@@ -123,7 +123,9 @@ def load_extractor(
     """
     aliked = feature.ALIKED(key, detection_threshold=score_threshold)
     computed = {"dkd.hw_grid": aliked.dkd.hw_grid}  # is in no file
-    return _ready(_with_state(aliked, path, key, computed), device)
+    return _ready(
+        _with_state(network=aliked, path=path, name=key, computed=computed), device
+    )
 
 
 def hardtfeat() -> OnPatches:

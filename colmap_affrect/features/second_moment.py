@@ -23,14 +23,14 @@ class SecondMomentOptions(ShapeOptions):
 
     name: Literal["second-moment"] = "second-moment"
     uses_network: ClassVar[bool] = False
-    derivative_sigma_px: Annotated[float, within(0.3, 20.0)] = 1.5
+    derivative_sigma_px: Annotated[float, within(0.3, 20.0)] = 1.5  # judged
     """Gaussian smoothing before the gradients."""
     integration_sigmas_px: Annotated[
         tuple[Annotated[float, within(1.0, 1000.0)], ...],
         Field(strict=False, min_length=1),
-    ] = (8.0, 16.0, 32.0)
+    ] = (8.0, 16.0, 32.0)  # judged
     """Windows over which the structure tensor is averaged; shapes are their log-Euclidean mean."""
-    min_gradient: Annotated[float, within(0.0, 255.0)] = 1.0
+    min_gradient: Annotated[float, within(0.0, 255.0)] = 1.0  # judged
     """Root mean square gradient, gray values per px, under which a block counts as flat."""
 
 
@@ -61,7 +61,10 @@ class SecondMoment:
         textured = square_gradients > self.options.min_gradient**2
         mean_log[~textured] = 0.0
         return ShapeGrid(
-            metrics_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX
+            metrics=metrics_from_log(mean_log),
+            textured=textured,
+            origin_px=grid_origin(STEP_PX),
+            step_px=STEP_PX,
         )
 
     def samples(self, image: GrayImage) -> ShapeSamples:

@@ -19,20 +19,20 @@ from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.options import within
 
 MIN_IMAGE_SIZE_PX = 8  # of the shorter side, which OpenCV's scale space needs
-SMALLEST_SUM = 1e-12  # of descriptors, which are divided by it
+SMALLEST_SUM = 1e-12  # of descriptors, which are divided by it; numeric
 
 
 class DogOptions(FeatureOptions):
     """OpenCV's difference-of-Gaussians detector."""
 
     name: str = "dog"
-    contrast_threshold: Annotated[float, within(0.0, 1.0)] = 0.013
+    contrast_threshold: Annotated[float, within(0.0, 1.0)] = 0.013  # judged
     """OpenCV's contrast threshold; lower finds fainter features (OpenCV and the paper: 0.04)."""
     edge_threshold: Annotated[float, within(1.0, 1e6)] = 10.0
     """OpenCV's edge threshold: largest ratio of the principal curvatures of a keypoint."""
-    num_octave_layers: Annotated[int, within(1, 10)] = 3
+    num_octave_layers: Annotated[int, within(1, 10)] = 3  # OpenCV's
     """Scales in an octave."""
-    sigma_px: Annotated[float, within(0.5, 10.0)] = 1.6
+    sigma_px: Annotated[float, within(0.5, 10.0)] = 1.6  # OpenCV's
     """Blur of the first scale."""
 
 
@@ -82,7 +82,11 @@ class RootSift(FeatureExtractor):
             ordered.angles_rad[kept],
         )
         described = descriptors[ordered.order[kept]].astype(np.float32)
-        return LocalFeatures(lafs, ordered.responses[kept], root_normalized(described))
+        return LocalFeatures(
+            lafs=lafs,
+            responses=ordered.responses[kept],
+            descriptors=root_normalized(described),
+        )
 
 
 def root_normalized(descriptors: Floats) -> Singles:
@@ -166,5 +170,7 @@ def detect_dog(
     radii_px = MEASUREMENT_SIGMAS * ordered.sigmas_px[kept]
     lafs = lafs_from_keypoints(ordered.points[kept], radii_px, np.zeros(len(kept)))
     return LocalFeatures(
-        lafs, ordered.responses[kept], np.zeros((len(kept), 0), np.float32)
+        lafs=lafs,
+        responses=ordered.responses[kept],
+        descriptors=np.zeros((len(kept), 0), np.float32),
     )

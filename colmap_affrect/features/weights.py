@@ -27,12 +27,9 @@ from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.record import file_sha256
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
-WEIGHTLESS_RECIPES = (
-    "default",
-    "on-demand",
-    "unrectified-rootsift",
-)  # work without weights
-TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
+# Work without weights
+WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")
+TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read; resource
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,7 @@ def image_corners(image_size: tuple[int, int]) -> Array:
     return np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
 
 
-# Float64 rounding of a mapped point adds no column or row to a canvas
+# Float64 rounding of a mapped point adds no column or row to a canvas; numeric
 CANVAS_ROUNDING_PX = 1e-9
 
 

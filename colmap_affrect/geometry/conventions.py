@@ -18,8 +18,8 @@ import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Bools, Floats
 
-HALF_PIXEL = 0.5
-# Radius of the measurement ellipse of a local affine frame, in sigmas
+HALF_PIXEL = 0.5  # theory
+# Radius of the measurement ellipse of a local affine frame, in sigmas; kornia's mr_size
 MEASUREMENT_SIGMAS = 6.0
 
 

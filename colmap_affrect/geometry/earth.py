@@ -4,8 +4,8 @@ import math
 
 from colmap_affrect.geometry.arrays import Array
 
-NO_FIX_DEG = 1e-6  # receivers without a fix write 0, 0, which is in the sea
-# Above and below zero: no photograph is taken beyond (edge of space)
+NO_FIX_DEG = 1e-6  # receivers without a fix write 0, 0, which is in the sea; numeric
+# Above and below zero: no photograph is taken beyond (edge of space); theory
 MAX_ALTITUDE_M = 100_000.0
 
 

@@ -106,7 +106,15 @@ class EpipolarModel:
         return np.asarray(products / np.maximum(lengths, TINY))
 
     def scaled(self, first: float, second: float) -> Self:
-        """Return the model in px of images that are smaller by two factors."""
+        """Return the model in px of images that are smaller.
+
+        Args:
+            first: px of image 1 for each px of its smaller version.
+            second: the same of image 2.
+
+        Returns:
+            The same geometry.
+        """
         image1_from_smaller = np.diag([first, first, 1.0])
         image2_from_smaller = np.diag([second, second, 1.0])
         fundamental = image2_from_smaller @ self.fundamental @ image1_from_smaller
@@ -155,7 +163,15 @@ class HomographyModel:
         return rotation_cosines(mapped, shapes[1][rows2])
 
     def scaled(self, first: float, second: float) -> Self:
-        """Return the model in px of images that are smaller by two factors."""
+        """Return the model in px of images that are smaller.
+
+        Args:
+            first: px of image 1 for each px of its smaller version.
+            second: the same of image 2.
+
+        Returns:
+            The same geometry.
+        """
         image1_from_smaller = np.diag([first, first, 1.0])
         smaller_from_image2 = np.diag([1 / second, 1 / second, 1.0])
         matrix = smaller_from_image2 @ self.matrix @ image1_from_smaller

@@ -20,31 +20,37 @@ from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.geometry.vanishing import VanishingFit, refined
 
 FOCALS: Array = np.exp(np.linspace(math.log(0.4), math.log(6.0), 28))
-"""Grid of focal lengths, longer sides: lenses of 14 to 216 mm for film of 36 mm."""
+"""Grid of focal lengths, longer sides: lenses of 14 to 216 mm for film of 36 mm; theory."""
 SHIFTS: Array = np.linspace(-0.3, 0.3, 25)
-"""Grid of shifts, longer sides: view cameras go to a quarter of their plate."""
+"""Grid of shifts, longer sides: view cameras go to a quarter of their plate; theory."""
 
-# Fewer say nothing: three directions and a focal length have 4 unknowns
+# Fewer say nothing: three directions and a focal length have 4 unknowns; theory
 MIN_NUM_SEGMENTS = 12
-NUM_SEGMENTS_OF_TRIALS = 90  # the longest, by which first frames are tried
-NUM_TRIALS = 160  # frames of three directions that are tried for each focal length
-NUM_KEPT = 3  # of these, which are refined for each focal length
-MIN_SINE = 1e-3  # of the angle between planes that meet in a direction of a first frame
-NUM_STEPS = 5  # of refinement without a shift
-NUM_STEPS_SHIFTED = 3  # of refinement for each shift, from there
-TEMPER = 3.0  # lines that count as one piece of evidence: what is built errs together
+NUM_SEGMENTS_OF_TRIALS = 90  # the longest, by which first frames are tried; resource
+# Frames of three directions that are tried for each focal length; resource
+NUM_TRIALS = 160
+NUM_KEPT = 3  # of these, which are refined for each focal length; resource
+# Of the angle between planes that meet in a direction of a first frame; numeric
+MIN_SINE = 1e-3
+NUM_STEPS = 5  # of refinement without a shift; resource
+NUM_STEPS_SHIFTED = 3  # of refinement for each shift, from there; resource
+# Lines that count as one piece of evidence: what is built errs together; fitted
+TEMPER = 3.0
 MODEL_SIGMA = 0.04
 """Deviation of log focal length that is left where lines are many. This and ``TEMPER`` are fitted
 by ``tests/benchmarks/lines.py``, with each scene left out in turn."""
 USUAL_FOCAL = 1.2  # longer sides: what COLMAP guesses
-USUAL_FOCAL_SIGMA = 0.5  # of the logarithm of the focal lengths that photographs have
-KNOWN_SIGMA = 0.15  # of log focal length, below which lines know it
-# Longer sides, of the axis of a photograph that is as the camera took it
+# Of the logarithm of the focal lengths that photographs have; theory
+USUAL_FOCAL_SIGMA = 0.5
+KNOWN_SIGMA = 0.15  # of log focal length, below which lines know it; theory
+# Longer sides, of the axis of a photograph that is as the camera took it; judged
 MIDDLE_SIGMA = 0.02
-# Longer sides, of the axis of a print: view cameras shift, and prints are cut
+# Longer sides, of the axis of a print: view cameras shift, and prints are cut; judged
 SHIFTED_SIGMA = 0.15
-MIN_EVIDENCE = 3.0  # nats, from which on lines have their directions not by chance
-SHIFT_EVIDENCE = 3.0  # nats, from which on lines say that the axis is not in the middle
+# Nats, from which on lines have their directions not by chance; theory
+MIN_EVIDENCE = 3.0
+# Nats, from which on lines say that the axis is not in the middle; theory
+SHIFT_EVIDENCE = 3.0
 
 
 @dataclass(frozen=True)

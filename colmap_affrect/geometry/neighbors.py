@@ -20,7 +20,7 @@ MAX_RELATIVE_ERROR = 0.5
 MIN_DISTANCE_PX = 4.0
 """Distance of a neighbour in both images. Nearer matches are of the same point, in several
 orientations or warps; judged."""
-# Matches that are compared with all others at a time, which bounds memory
+# Matches that are compared with all others at a time, which bounds memory; resource
 CHUNK_ROWS = 512
 
 
@@ -77,9 +77,8 @@ def _distances(points: Array, rows: Indices) -> Array:
 class NeighborLists:
     """Neighbours of each point, itself included, as compressed rows."""
 
-    starts: (
-        Indices  # (N + 1,) the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
-    )
+    # (N + 1,): the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
+    starts: Indices
     indices: Indices  # points
 
     def of(self, points: Integers) -> tuple[Indices, Indices]:

@@ -15,34 +15,37 @@ Size = tuple[int, int]
 
 FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
 """Focal lengths that are tried for a rotated camera, in units of the longer side. From ten on a
-rotation is a shift of the image."""
+rotation is a shift of the image; theory."""
 # Measure a ratio to two per cent (theory: binomial standard deviation)
 MAX_NUM_POINTS = 500
-# Of a rotated ray of length 1; what is behind lands far outside of the image
+# Of a rotated ray of length 1; what is behind lands far outside of the image; numeric
 MIN_DEPTH = 1e-3
-NUM_STARTS = 30  # rotations of two matches each; least squares begin with the best one
-MAX_ITERATIONS = 3  # least squares are repeated without outliers
+# Rotations of two matches each; least squares begin with the best one; resource
+NUM_STARTS = 30
+MAX_ITERATIONS = 3  # least squares are repeated without outliers; resource
 
 # Error of a match of print, in units of the longer side; judged
 TEXT_ERROR_FRAC = 0.001
 # Height of a line of small print, in units of the longer side; judged
 TEXT_HEIGHT_FRAC = 0.015
-# Sine of the angle of a line of text to a side of the image, five degrees
+# Sine of the angle of a line of text to a side of the image, five degrees; judged
 MAX_TEXT_SLOPE = 0.087
-MAX_NUM_TRIALS = 300  # of RANSAC: enough for a set that one in eight matches is in
+# Of RANSAC: enough for a set that one in eight matches is in; theory
+MAX_NUM_TRIALS = 300
 
 MIN_SAME_VIEW_RATIO = 0.85  # matches of copies that a change of scale explains; judged
 # Their error, in units of the longer side: paper is not flat; judged
 SAME_VIEW_ERROR_FRAC = 0.01
 
-COMPARED_SIZE_PX = 400  # longer side of images whose windows are correlated
-WINDOW_PX = 11  # side of the windows
-MIN_VARIANCE = 60.0  # of gray values in a window; less is a surface without texture
+COMPARED_SIZE_PX = 400  # longer side of images whose windows are correlated; resource
+WINDOW_PX = 11  # side of the windows; judged
+# Of gray values in a window; less is a surface without texture; judged
+MIN_VARIANCE = 60.0
 
 DISPLACEMENT_PX = np.array([13.0, 7.0])
-"""Displaced by this, keypoints meet others only by chance; judged: farther than a keypoint is from
+"""Displaced by this, keypoints meet others only by chance; theory: farther than a keypoint is from
 its neighbours, and different in x and y."""
-MARGIN_PX = 16  # around an image, for points that are displaced out of it
+MARGIN_PX = 16  # around an image, for points that are displaced out of it; theory
 MIN_FREE_RATIO = 0.1
 """Where keypoints are so dense that chance leaves less than this, they prove nothing; judged."""
 
@@ -106,9 +109,8 @@ def _rotation_ratios(
 
     def errors_of(rotations: Array) -> Array:
         """Return (L, S, N) px for (L, S, 3, 3) rotations."""
-        rows = rotations.reshape(
-            len(lenses), -1, 3
-        )  # one product is ten times as fast as many
+        # One product is ten times as fast as many
+        rows = rotations.reshape(len(lenses), -1, 3)
         rotated = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
         depths = np.maximum(rotated[..., 2, :], MIN_DEPTH)
         scales = focals2[:, None, None] / depths

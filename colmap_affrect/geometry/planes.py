@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.conventions import grid_origin
 
-WINDOW_RADIUS_PX = 2  # a plane is fitted to 5 x 5 px (the authors' value)
-WINDOW_SIGMA_PX = 0.8  # of its Gaussian weights (the authors' value)
+WINDOW_RADIUS_PX = 2  # a plane is fitted to 5 x 5 px (the value of the paper's authors)
+WINDOW_SIGMA_PX = 0.8  # of its Gaussian weights (the value of the paper's authors)
 MIN_WEIGHT_FRAC = 0.5
-"""Share of the window's weight that known neighbours need; a mere line has 0.499 of it."""
+"""Share of the window's weight that known neighbours need; a mere line has 0.499 of it; theory."""
 MAX_SLANT_COS = np.cos(np.deg2rad(85.0))
-"""Cosine of the largest viewing angle of a plane; steeper neighbours are on another surface."""
-# Distance of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars 1997)
+"""Cosine of the largest viewing angle of a plane; steeper neighbours are on another
+surface; judged."""
+# Distance of neighbours on the spiral, times sqrt(N) (Saff & Kuijlaars 1997); paper
 SPIRAL_STEP = 3.6
 
 
@@ -67,9 +68,8 @@ def normals_from_depth(depth: Floats, camera_matrix: Floats) -> Array:
     offsets = range(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1)
     total_weight = 0.0
     moments = np.zeros((6, height, width))  # sums of w times 1, x, y, x x, x y, y y
-    change_moments = np.zeros(
-        (3, height, width)
-    )  # sums of w times the change times 1, x, y
+    # Sums of w times the change times 1, x, y
+    change_moments = np.zeros((3, height, width))
     for dy in offsets:
         top = dy + WINDOW_RADIUS_PX
         for dx in offsets:
@@ -140,9 +140,8 @@ class PlaneClusters:
     """Directions that many normals share."""
 
     normals: Array  # (K, 3) unit normals in order of choice; K may be 0
-    labels: NDArray[
-        np.int32
-    ]  # (h, w) the nearest of them for each pixel, -1 where none is near
+    # (h, w) the nearest of them for each pixel, -1 where none is near
+    labels: NDArray[np.int32]
 
 
 def cluster_normals(

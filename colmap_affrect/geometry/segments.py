@@ -12,12 +12,13 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.conventions import HALF_PIXEL
 
-MAX_NUM_SEGMENTS = 160  # the longest are looked at
-ANGLE_SIGMA = 0.008  # rad, of a segment's direction: lenses distort, and walls are not quite plumb
-END_SIGMA = 0.0008  # longer sides, of the ends of a segment: about one px
-# Longer sides; closer parallel segments are of one cornice or frame
+MAX_NUM_SEGMENTS = 160  # the longest are looked at; resource
+# Rad, of a segment's direction: lenses distort, and walls are not quite plumb; judged
+ANGLE_SIGMA = 0.008
+END_SIGMA = 0.0008  # longer sides, of the ends of a segment: about one px; theory
+# Longer sides; closer parallel segments are of one cornice or frame; judged
 SAME_LINE_DISTANCE = 0.012
-SAME_LINE_ANGLE = 0.05  # rad
+SAME_LINE_ANGLE = 0.05  # rad; judged
 
 
 @dataclass(frozen=True)

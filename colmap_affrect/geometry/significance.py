@@ -13,11 +13,13 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Indices
 
 NUM_RANDOM_MATCHES = 4000
-"""Random matches of a pair, about: they measure a probability of 1 % to a sixth of itself."""
+"""Random matches of a pair, about: they measure a probability of 1 % to a sixth of itself
+(theory)."""
 MIN_AGREEING_RATIO = 0.5
 """Inliers of right pairs whose LAFs agree, at least, as a share of all; judged."""
 RATIO_STEPS = np.linspace(0.0, 1.0, 51)[:-1]
-"""Ratios of agreeing LAFs that are averaged over, from the smallest one (0) to below all (1)."""
+"""Ratios of agreeing LAFs that are averaged over, from the smallest one (0) to below all (1);
+a numeric integral."""
 
 
 def random_matches(num: int) -> tuple[Indices, Indices]:

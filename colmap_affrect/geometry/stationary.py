@@ -14,15 +14,16 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices
 
 MAX_SHEET_ROTATION = 0.01
-"""Rotation in radians, and change of scale, between two positions of a sheet on a scanner; judged:
+"""Rotation in radians, and change of scale, between two positions of a sheet on a scanner; theory:
 half a degree."""
 EXACT_RATIO = 0.9
 """Stationary matches whose motion is zero within the tolerance, as a share of all; judged: some
 keypoints are badly localized."""
-MAX_COMPARED = 300  # motions that are compared with each other, which bounds time
+# Motions that are compared with each other, which bounds time; resource
+MAX_COMPARED = 300
 MAX_SLOPE = 0.5
 """Difference of the motions of two points of one object, as a share of their distance; judged."""
-# Of a rotation to the motions that agree, each of which may make more agree
+# Of a rotation to the motions that agree, each of which may make more agree; resource
 MAX_FITS = 3
 
 

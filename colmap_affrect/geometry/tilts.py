@@ -23,23 +23,22 @@ from colmap_affrect.geometry.arrays import Array, Floats, Singles
 
 # Dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
 STEP_PX = 4
-MAX_TANH = 0.999  # where logarithms of metrics are cut off: a tilt of 45
-SMALLEST_NORM = 1e-12  # of deviators that are divided by their norm
-SMALLEST_LOG = 1e-9  # below it sinh(x) / x is 1 in float64
+MAX_TANH = 0.999  # where logarithms of metrics are cut off: a tilt of 45; numeric
+SMALLEST_NORM = 1e-12  # of deviators that are divided by their norm; numeric
+SMALLEST_LOG = 1e-9  # below it sinh(x) / x is 1 in float64; numeric
 MIN_DISTINCT_RATIO = 0.5
 """Shapes that differ, as a share of all, where they were measured one by one: then nearly all do;
-judged."""
-# Shapes of unit area that are this close are equal; float32 rounding is less
+theory."""
+# Shapes of unit area that are this close are equal; float32 rounding is less; numeric
 SHAPE_STEP = 1e-4
-GRID_TILTS = np.geomspace(
-    2.0, 6.21970, 6
-)  # candidates for 1.7-balls up to tilt 5.8 (the paper)
+# Candidates for 1.7-balls up to tilt 5.8 (the paper)
+GRID_TILTS = np.geomspace(2.0, 6.21970, 6)
 GRID_NUM_ANGLES = 32  # candidates of each tilt (the paper)
 NEAR_OPTIMAL_RINGS = ((2.61757, 0.398032, 8), (5.18168, 0.198314, 16))
 """Tilts, steps of the angle in radians and numbers of maps (Rodriguez, Delon, Morel 2018, constants
-for r = 1.7)."""
-IDENTITY_LABEL = -1
-UNCOVERED_LABEL = -2
+for r = 1.7); paper."""
+IDENTITY_LABEL = -1  # format
+UNCOVERED_LABEL = -2  # format
 
 
 def unit_metrics(matrices: Floats) -> Array:
@@ -182,9 +181,8 @@ class Cover:
     """Covering centres of a set of shapes and the centre nearest to each shape."""
 
     centers: Array  # (K, 2) rows (tilt, angle_rad) in order of choice; K may be 0
-    labels: NDArray[
-        np.int32
-    ]  # (N,) index of the nearest centre, IDENTITY_LABEL, UNCOVERED_LABEL
+    # (N,) index of the nearest centre, IDENTITY_LABEL, UNCOVERED_LABEL
+    labels: NDArray[np.int32]
 
 
 def cover_shapes(

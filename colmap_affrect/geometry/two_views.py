@@ -16,11 +16,11 @@ MAX_LOG_DIFFERENCE = 0.08
 at one depth."""
 NUM_NEIGHBORS = 5  # known depths that are compared with the depth of a match; judged
 NUM_ON_PLANE = 12  # known depths to which a plane is fitted; judged
-NUM_PLANE_PARAMETERS = 3
+NUM_PLANE_PARAMETERS = 3  # theory
 MAX_PLANE_ERROR = 0.04
 """Relative standard deviation of a predicted inverse depth, and of those a plane is fitted to;
 half of ``MAX_LOG_DIFFERENCE``."""
-# Added to normal equations, which twelve points on a line leave singular
+# Added to normal equations, which twelve points on a line leave singular; numeric
 PLANE_DAMPING = 1e-9
 NUM_INDEPENDENT = 10
 """Ratios that make the scale more certain, at most: all share the errors of the same poses;

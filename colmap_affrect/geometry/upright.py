@@ -6,11 +6,13 @@ import numpy as np
 
 from colmap_affrect.geometry.arrays import Bools, Floats
 
-MAX_ANGLE = math.radians(4.0)  # between the uprights of two photographs that agree
-MIN_NUM_AGREEING = 2  # photographs
-MIN_SHARE = 0.5  # of those that say something; more than so many must agree
-MAX_LEAN = math.radians(45.0)  # of the upright from how cameras are held on average
-# Length of the mean upright of cameras, below which they are held in all ways
+# Between the uprights of two photographs that agree; judged
+MAX_ANGLE = math.radians(4.0)
+MIN_NUM_AGREEING = 2  # photographs; theory
+MIN_SHARE = 0.5  # of those that say something; more than so many must agree; theory
+# Of the upright from how cameras are held on average; theory
+MAX_LEAN = math.radians(45.0)
+# Length of the mean upright of cameras, below which they are held in all ways; judged
 MIN_COMMON = 0.3
 
 

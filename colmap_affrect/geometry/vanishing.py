@@ -18,14 +18,15 @@ from colmap_affrect.geometry.segments import Segments
 
 CHANCE_DENSITY = (
     2.0 / math.pi
-)  # of the angle of a segment that is there by chance, per rad
-CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand
-DIRECTION_COUNT = 1.0  # segments of each direction that are reckoned with beforehand
-NUM_EM_STEPS = 3  # for the shares of the directions and of chance
-MAX_STEP = 0.1  # rad, of a step of refinement
-DAMPING = 1e-6  # of it, relative to what is known of the turn
-TINY = 1e-12
-CHANCE = -1  # kind of a segment that belongs to no direction
+)  # of the angle of a segment that is there by chance, per rad; theory
+CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand; judged
+# Segments of each direction that are reckoned with beforehand; theory
+DIRECTION_COUNT = 1.0
+NUM_EM_STEPS = 3  # for the shares of the directions and of chance; resource
+MAX_STEP = 0.1  # rad, of a step of refinement; numeric
+DAMPING = 1e-6  # of it, relative to what is known of the turn; numeric
+TINY = 1e-12  # numeric
+CHANCE = -1  # kind of a segment that belongs to no direction; format
 
 
 class VanishingFit:

@@ -29,10 +29,11 @@ SUFFIXES = (
     ".tiff",
 )  # in the order in which they are looked for
 MAX_NUM_VALUES = 1 << 27  # of a map; more is taken for damage
-PNG_STEP = 0.001  # depth of one step of 16 bits; only the ratio of depths matters
-# Of aspects of map and photograph: networks round sizes to 32 px
+# Depth of one step of 16 bits; only the ratio of depths matters; theory
+PNG_STEP = 0.001
+# Of aspects of map and photograph: networks round sizes to 32 px; theory
 MAX_ASPECT_RATIO = 1.05
-MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
+MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known; damage
 
 
 class DepthOptions(Options):

@@ -19,20 +19,21 @@ from colmap_affrect.images.reading import opened, read_header, stored_size
 FILM_DIAGONAL_MM = 43.27
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """By EXIF's number of the unit of focal-plane resolutions: inches, cm, and, as COLMAP reads them,
-mm and micrometres."""
+mm and micrometres; format."""
 PLAUSIBLE_FOCALS = (
     0.3,
     6.0,
-)  # in longer sides: 118 to 10 degrees, which hold nearly all lenses
-# Ratio of focal lengths that still agree: equivalents are rounded
+)  # in longer sides: 118 to 10 degrees, which hold nearly all lenses; theory
+# Ratio of focal lengths that still agree: equivalents are rounded; theory
 MAX_CONTRADICTION = 1.15
-MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
+# Lossless rotation cuts off up to 15 px, shrinking rounds; theory
+MAX_ASPECT_ERROR = 0.01
 SENSOR_ASPECTS = (
     3 / 2,
     4 / 3,
     16 / 9,
-)  # photographs of another shape may have been cropped
-# Longer side of the thumbnails of cameras, often with black bars
+)  # photographs of another shape may have been cropped; theory
+# Longer side of the thumbnails of cameras, often with black bars; format
 MAX_THUMBNAIL_PX = 160
 RESOLUTION = "focal-plane resolution"
 EQUIVALENT = "35 mm equivalent"

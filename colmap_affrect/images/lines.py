@@ -12,12 +12,12 @@ from colmap_affrect.geometry.lines import Lines, measure_lines
 from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.images.reading import shrink_to
 
-# Longest side that photographs are shrunk to: lines stay, and grain goes
+# Longest side that photographs are shrunk to: lines stay, and grain goes; resource
 MAX_SIZE_PX = 1024
-MIN_LENGTH = 0.02  # longer sides
-# Longer sides; segments along the image's border and closer are of its frame
+MIN_LENGTH = 0.02  # longer sides; judged
+# Longer sides; segments along the image's border and closer are of its frame; judged
 BORDER = 0.025
-ALONG = 0.05  # rad, of a segment that runs along the border
+ALONG = 0.05  # rad, of a segment that runs along the border; theory
 
 
 def lines_of(image: GrayImage, mask: Mask | None = None) -> Lines:

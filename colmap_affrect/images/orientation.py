@@ -13,12 +13,12 @@ from PIL import ExifTags
 from colmap_affrect.images.reading import PNG, opened, read_header, stand_upright
 from colmap_affrect.project.atomic_files import replace_bytes
 
-UPRIGHT = 1  # EXIF's number
+UPRIGHT = 1  # EXIF's number; format
 JPEG_START = b"\xff\xd8"
 JPEG_EXIF = b"Exif\0\0"
 JPEG_XMP = b"http://ns.adobe.com/xap/1.0/\0"
-JPEG_PIXELS = 0xDA  # the segment that begins them; metadata come before
-JPEG_LONE = {0x01, *range(0xD0, 0xD9)}  # segments without content
+JPEG_PIXELS = 0xDA  # the segment that begins them; metadata come before; format
+JPEG_LONE = {0x01, *range(0xD0, 0xD9)}  # segments without content; format
 XMP_ORIENTATION = re.compile(rb"(tiff:Orientation\s*(?:=\s*[\"']|>)\s*)[2-8]")
 
 

@@ -48,7 +48,7 @@ class CameraOptions(Options):
     """COLMAP's name of the camera model."""
     params: str = ""
     """Known intrinsics in COLMAP's order, separated by commas; empty if they are not known."""
-    default_focal_length_factor: Annotated[float, within(0.01, 100.0)] = 1.2
+    default_focal_length_factor: Annotated[float, within(0.01, 100.0)] = 1.2  # COLMAP's
     """Focal length in units of the longer side where EXIF has none."""
     ignore_exif: bool = False
     """Take no focal length from EXIF, and do not ask it which images share a camera."""

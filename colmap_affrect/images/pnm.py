@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from colmap_affrect.geometry.arrays import Bytes
 
-MAX_HEADER = 1 << 16  # bytes, with comments; the pixels follow
-MAX_WHITE_OF_A_BYTE = 255
-MAX_WHITE = 65535  # of two bytes
+MAX_HEADER = 1 << 16  # bytes, with comments; the pixels follow; damage
+MAX_WHITE_OF_A_BYTE = 255  # format
+MAX_WHITE = 65535  # of two bytes; format
 TEXT_KINDS = b"123"
 _SPACE = rb"(?:\s|#[^\n\r]*[\n\r])+"
-_HEADER = re.compile(rb"P([2356])" + 3 * (_SPACE + rb"(\d{1,9})") + rb"\s")
+_HEADER = re.compile(rb"P([2356])" + 3 * (_SPACE + rb"(\d{1,9})") + rb"\s")  # format
 
 
 @dataclass(frozen=True)

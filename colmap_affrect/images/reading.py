@@ -34,12 +34,12 @@ from colmap_affrect.project.regular_files import (
 
 MAX_NUM_PX = (
     1 << 29
-)  # of a photograph; those of the largest cameras have 400 megapixels
-MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
+)  # of a photograph; those of the largest cameras have 400 megapixels; damage
+MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes; damage
 USUAL_BYTES = 1 << 26
 """Of a photograph, with all that cameras put beside its pixels, as short films; 64 MiB. Only longer
-files are compared with their pixels."""
-MAX_BYTES_PER_PX = 16  # four channels of four bytes
+files are compared with their pixels; resource."""
+MAX_BYTES_PER_PX = 16  # four channels of four bytes; format
 ONE_AT_A_TIME = (
     Lock()
 )  # filters of warnings are of the process: threads would mix them up
@@ -57,7 +57,7 @@ READERS = {
 NEW_SUBFILE_TYPE, REDUCED = (
     254,
     1,
-)  # TIFF's tag, and its bit of a smaller copy of another page
+)  # TIFF's tag, and its bit of a smaller copy of another page; format
 
 Found = TypeVar("Found")
 
@@ -257,19 +257,19 @@ FOREIGN_FORMATS = {
 TONE_PERCENTILES = (
     0.5,
     99.5,
-)  # black and white of a stretched photograph but for dust and glints
-# A photograph whose tones fill less of the range of its file is stretched
+)  # black and white of a stretched photograph but for dust and glints; judged
+# A photograph whose tones fill less of the range of its file is stretched; judged
 MIN_TONE_RANGE = 0.5
-# Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
+# Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise; judged
 MAX_TONE_STEP = 16
 FLOAT_RANGE = (
     -0.5,
     2.0,
-)  # of floats that are meant from 0 to 1: filters and highlights go beyond
-NUM_TONES = 250_000  # about so many pixels are looked at
-# Along each border is passed over: scans have frames and captions there
+)  # of floats that are meant from 0 to 1: filters and highlights go beyond; theory
+NUM_TONES = 250_000  # about so many pixels are looked at; resource
+# Along each border is passed over: scans have frames and captions there; judged
 FRAME_FRAC = 0.1
-# What files of more than 4 GiB have in the place of 42, with offsets of 64 bits
+# What files of more than 4 GiB have in the place of 42, with offsets of 64 bits; format
 BIG_TIFF = 43
 GRAY_AS_STORED = (
     cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

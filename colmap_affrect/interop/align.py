@@ -3,7 +3,7 @@
 import json
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
 from typing import Annotated, TypedDict, Unpack
@@ -36,14 +36,16 @@ from colmap_affrect.project.tables import read_table
 GEOREFERENCE = (
     "georeference.json"  # beside a model: what COLMAP's files have no place for
 )
-# Of known places across the line that fits them best, in units of its length
+# Of known places across the line that fits them best, in units of its length; numeric
 MIN_WIDTH = 0.01
 METRIC = ("x", "y", "z")
 ON_EARTH = ("latitude", "longitude", "altitude")
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-GPS_ERROR_M = 10.0  # a position on earth that is no further off is not left out
-TABLE_ERROR = 0.02  # the same of other positions, of how far they spread
-SHOWN = 12  # residuals in the summary, the largest first
+# A position on earth that is no further off is not left out;
+# theory: of receivers without corrections
+GPS_ERROR_M = 10.0
+TABLE_ERROR = 0.02  # the same of other positions, of how far they spread; judged
+SHOWN = 12  # residuals in the summary, the largest first; display
 
 Distance = Annotated[tuple[str, str, float], Field(strict=False)]  # a list, too
 Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
@@ -146,47 +148,88 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
             "--distance: gives the scale alone; leave it out, or the positions"
         )
     model = read_finished_model(model_path)
-    origin = tuple[float, ...]()
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
-    old = {name: image.projection_center() for name, image in images.items()}
-    true = Places()
-    is_on_earth = False
-    marked = Places()
-    left_out: dict[str, str] = {}
-    if reference.points_path:
-        marked, true = _marked_points(model, images, reference.points_path)
+    fit = _fit(model, images, reference)
+    model.transform(fit.new_from_old)
+    upright = ""
     if reference.distances:
-        new_from_old, residuals = _scale(old | marked, reference.distances)
-    else:
-        if reference.points_path:
-            old = marked
-        elif reference.gps_database:
-            true, is_on_earth = _gps(reference.gps_database)
-        elif reference.positions_path:
-            true, is_on_earth = _table_of_positions(reference.positions_path)
-        else:
-            raise OptionError("give --gps, --positions, --points or --distance")
-        left_out = _not_on_earth(true) if is_on_earth else {}
-        left_out |= _not_fitting(old, _without(true, left_out), is_on_earth=is_on_earth)
-        right = _without(true, left_out)
-        new_from_old, residuals, origin = _similarity(
-            old, right, is_on_earth=is_on_earth
-        )
-    model.transform(new_from_old)
-    upright = (
-        stand_upright(model_folder(model_path), model) if reference.distances else ""
-    )
+        upright = stand_upright(model_folder(model_path), model)
+    scale = fit.new_from_old.scale
     why = why_unusable(model)
-    if not why and new_from_old.scale <= 1.0 / FAR:
+    if not why and scale <= 1.0 / FAR:
         why = "it has no extent"
     if why:
-        raise OptionError(f"a scale of {new_from_old.scale:.3g} cannot be right: {why}")
+        raise OptionError(f"a scale of {scale:.3g} cannot be right: {why}")
     with new_results(output_path, names=images) as (folder,):
         write_model(model, folder)
-        if origin:
-            content = dict(zip(ON_EARTH, origin, strict=True))
+        if fit.origin:
+            content = dict(zip(ON_EARTH, fit.origin, strict=True))
             replace_text(folder / GEOREFERENCE, json.dumps(content, indent=1) + "\n")
-    return Alignment(float(new_from_old.scale), residuals, left_out, upright)
+    return Alignment(
+        scale=float(scale),
+        residuals=fit.residuals,
+        left_out=fit.left_out,
+        upright=upright,
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How a model is to be transformed.
+
+    Attributes:
+        new_from_old: the similarity.
+        residuals: how far each position, point or distance is off, in metres.
+        origin: latitude, longitude and altitude (WGS 84) of the new origin; empty if not on earth.
+        left_out: why positions did not count.
+    """
+
+    new_from_old: pycolmap.Sim3d
+    residuals: dict[str, float]
+    origin: tuple[float, ...] = ()
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def _fit(
+    model: pycolmap.Reconstruction,
+    images: Mapping[str, pycolmap.Image],
+    reference: Reference,
+) -> _Fit:
+    """Fit a model to its reference.
+
+    Args:
+        model: the model.
+        images: its registered images by name.
+        reference: what the model is aligned to.
+
+    Returns:
+        The similarity, and how well it fits.
+    """
+    old = Places()
+    for name, image in images.items():
+        old[name] = image.projection_center()
+    true = Places()
+    is_on_earth = False
+    if reference.points_path:
+        marked, true = _marked_points(model, images, reference.points_path)
+        old = old | marked if reference.distances else marked
+    if reference.distances:
+        return _scale(old, reference.distances)
+    if not reference.points_path:
+        true, is_on_earth = _positions(reference)
+    left_out = _not_on_earth(true) if is_on_earth else {}
+    left_out |= _not_fitting(old, _without(true, left_out), is_on_earth=is_on_earth)
+    fit = _similarity(old, _without(true, left_out), is_on_earth=is_on_earth)
+    return replace(fit, left_out=left_out)
+
+
+def _positions(reference: Reference) -> tuple[Places, bool]:
+    """Return the positions of a database or a table, and whether they are on earth."""
+    if reference.gps_database:
+        return _gps(reference.gps_database)
+    if reference.positions_path:
+        return _table_of_positions(reference.positions_path)
+    raise OptionError("give --gps, --positions, --points or --distance")
 
 
 def _without(places: Places, names: Collection[str]) -> Places:
@@ -195,8 +238,12 @@ def _without(places: Places, names: Collection[str]) -> Places:
 
 def _not_on_earth(true: Places) -> dict[str, str]:
     """Return why some positions are no place on earth, by name."""
-    found = {name: why_not_on_earth(place) for name, place in true.items()}
-    return {name: why for name, why in found.items() if why}
+    found = dict[str, str]()
+    for name, place in true.items():
+        why = why_not_on_earth(place)
+        if why:
+            found[name] = why
+    return found
 
 
 def _not_fitting(old: Places, true: Places, *, is_on_earth: bool) -> dict[str, str]:
@@ -204,9 +251,8 @@ def _not_fitting(old: Places, true: Places, *, is_on_earth: bool) -> dict[str, s
     names = sorted(old.keys() & true.keys())
     if len(names) < 4:
         return {}
-    before, after = (
-        np.array([places[name] for name in names]) for places in (old, true)
-    )
+    before = np.array([old[name] for name in names])
+    after = np.array([true[name] for name in names])
     if is_on_earth:
         after = np.asarray(WGS84.ellipsoid_to_enu(after, *np.median(after, axis=0)))
         floor = GPS_ERROR_M
@@ -218,33 +264,27 @@ def _not_fitting(old: Places, true: Places, *, is_on_earth: bool) -> dict[str, s
     if agree.all() or found is None:
         return {}
     off = residuals_of(found, before, after)
-    return {
-        name: f"{_metres(distance)} from where the others say"
-        for name, distance, agrees in zip(names, off.tolist(), agree, strict=True)
-        if not agrees
-    }
+    contradicted = dict[str, str]()
+    for name, distance, agrees in zip(names, off.tolist(), agree, strict=True):
+        if not agrees:
+            contradicted[name] = f"{_metres(distance)} from where the others say"
+    return contradicted
 
 
 def _metres(distance: float) -> str:
     return f"{distance / 1000:.0f} km" if distance >= 10_000 else f"{distance:.3g} m"
 
 
-def _similarity(
-    old: Places, true: Places, *, is_on_earth: bool
-) -> tuple[pycolmap.Sim3d, dict[str, float], tuple[float, ...]]:
-    """Return the similarity of least squares, its residuals, and the origin if on earth.
-
-    The origin is latitude, longitude and altitude (WGS 84); x, y, z are east, north, up of it.
-    """
+def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
+    """Return the similarity of least squares; x, y, z are east, north, up of an origin on earth."""
     names = sorted(old.keys() & true.keys())
     if len(names) < 3:
         raise OptionError(
             f"the true places of {len(names)} photographs or points of the model are known, and "
             f"3 are needed; known are those of {', '.join(sorted(true)[:3]) or 'none'}"
         )
-    before, after = (
-        np.array([places[name] for name in names]) for places in (old, true)
-    )
+    before = np.array([old[name] for name in names])
+    after = np.array([true[name] for name in names])
     origin = tuple(after.mean(axis=0).tolist()) if is_on_earth else ()
     if origin:
         after = np.asarray(WGS84.ellipsoid_to_enu(after, *origin))
@@ -261,12 +301,14 @@ def _similarity(
             "the known places do not fit the model in any scale and rotation"
         )
     residuals = residuals_of(new_from_old, before, after).tolist()
-    return new_from_old, dict(zip(names, residuals, strict=True)), origin
+    return _Fit(
+        new_from_old=new_from_old,
+        residuals=dict(zip(names, residuals, strict=True)),
+        origin=origin,
+    )
 
 
-def _scale(
-    places: Places, distances: Sequence[tuple[str, str, float]]
-) -> tuple[pycolmap.Sim3d, dict[str, float]]:
+def _scale(places: Places, distances: Sequence[tuple[str, str, float]]) -> _Fit:
     """Return the scale that fits distances best, by least squares of their logarithms."""
     lengths = {}
     for first, second, length in distances:
@@ -281,20 +323,19 @@ def _scale(
                 f"--distance {first},{second}: must be of two places, and positive"
             )
         lengths[f"{first},{second}"] = own, length
-    scale = float(
-        np.exp(np.mean([np.log(true / own) for own, true in lengths.values()]))
-    )
+    log_ratios = [np.log(true / own) for own, true in lengths.values()]
+    scale = float(np.exp(np.mean(log_ratios)))
     residuals = {name: abs(scale * own - true) for name, (own, true) in lengths.items()}
-    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)), residuals
+    new_from_old = pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3))
+    return _Fit(new_from_old, residuals)
 
 
 def _gps(path: Path) -> tuple[Places, bool]:
     """Return the pose priors of a database by image name, and whether they are on earth."""
     with open_copy(path, FATAL_FOR_IMAGES - FATAL_FOR_MAPPING) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        priors = [
-            prior for prior in database.read_all_pose_priors() if prior.has_position()
-        ]
+        all_priors = database.read_all_pose_priors()
+    priors = [prior for prior in all_priors if prior.has_position()]
     systems = {prior.coordinate_system for prior in priors}
     if not priors:
         raise DatabaseError(
@@ -302,11 +343,11 @@ def _gps(path: Path) -> tuple[Places, bool]:
         )
     if len(systems) > 1:
         raise DatabaseError(f"{path}: some positions are on earth, others are not")
-    true = {
-        names[prior.corr_data_id.id]: np.array(prior.position).ravel()
-        for prior in priors
-        if prior.corr_data_id.id in names
-    }
+    true = Places()
+    for prior in priors:
+        image_id = prior.corr_data_id.id
+        if image_id in names:
+            true[names[image_id]] = np.array(prior.position).ravel()
     return true, pycolmap.PosePriorCoordinateSystem.WGS84 in systems
 
 
@@ -342,29 +383,38 @@ def _marked_points(
     where = f"--points {path}"
     marks: defaultdict[str, dict[int, Array]] = defaultdict(dict)  # by image id
     true = Places()
-    for place, row in read_table(
-        path, where, ("point", "image", "px", "py", *METRIC), "point"
-    ):
+    columns = ("point", "image", "px", "py", *METRIC)
+    for place, row in read_table(path, where, columns, "point"):
         name = row.get("point", "")
         if not name:
             raise OptionError(f"{place}: names no point")
-        if any(column in row for column in METRIC):
+        if not row.keys().isdisjoint(METRIC):
             true[name] = _numbers(row, METRIC, place)
-        if row.get("image", "") in images:
-            image = images[row["image"]]
+        image = images.get(row.get("image", ""))
+        if image is not None:
             camera = model.cameras[image.camera_id]
             mark = _numbers(row, ("px", "py"), place)
             require_inside(place, mark, image.name, (camera.width, camera.height))
             marks[name][image.image_id] = mark
-    views = {name: marked for name, marked in marks.items() if len(marked) > 1}
-    if not views:
-        raise OptionError(f"{where}: no point is marked in two registered photographs")
+    return _triangulated_points(model, marks, where), true
+
+
+def _triangulated_points(
+    model: pycolmap.Reconstruction,
+    marks: Mapping[str, Mapping[int, Array]],
+    where: str,
+) -> Places:
+    """Return where points are in a model that are marked in two of its images or more."""
     old = Places()
-    for name, marked in views.items():
+    for name, marked in marks.items():
+        if len(marked) < 2:
+            continue
         point = triangulated(model, marked)
         if point is None:
             raise OptionError(
                 f"{where}: the rays of point {name} do not meet; look at its marks"
             )
         old[name] = point
-    return old, true
+    if not old:
+        raise OptionError(f"{where}: no point is marked in two registered photographs")
+    return old

@@ -9,11 +9,12 @@ from colmap_affrect.colmap.cameras import known_model
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.arrays import Array
 
-GRID = 41  # pixels on a side of an image that are compared
-MAX_STEPS = 50
+GRID = 41  # pixels on a side of an image that are compared; resource
+MAX_STEPS = 50  # resource
 STEP = 1e-6  # of numeric derivatives, of what a parameter has, or of 1
-SMALL = 1e-10  # relative change of the errors from which on nothing gets better
-MAX_DAMPING = 1e12
+# Relative change of the errors from which on nothing gets better; numeric
+SMALL = 1e-10
+MAX_DAMPING = 1e12  # numeric
 
 
 def with_camera_model(model: pycolmap.Reconstruction, name: str) -> dict[int, float]:

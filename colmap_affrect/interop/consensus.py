@@ -8,11 +8,12 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array, Bools
 
-MAX_NUM_TRIPLES = 500  # similarities that are tried, each by three places
-GROSS = 5.0  # times the median residual: beyond is no error of measuring any more
-# Few places fit too well by chance, of which the median says too little
+MAX_NUM_TRIPLES = 500  # similarities that are tried, each by three places; resource
+# Times the median residual: beyond is no error of measuring any more; theory
+GROSS = 5.0
+# Few places fit too well by chance, of which the median says too little; theory
 SMALL_SAMPLE = 5.0
-# Times how far three places spread is the fourth, if these alone tell it
+# Times how far three places spread is the fourth, if these alone tell it; judged
 FAR_BEYOND = 10.0
 
 

@@ -37,12 +37,11 @@ logger = logging.getLogger(__name__)
 USUAL = ("ply", "text", "cameras")  # formats that need no photographs
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 
-UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright
-# Of cameras from the middle, as instant-ngp's converter has it
+UP = np.array([0.0, 0.0, 1.0])  # of a model that was turned upright; format
+# Of cameras from the middle, as instant-ngp's converter has it; format
 MEAN_DISTANCE_IN_CUBES = 1.32
-FLIP_Y_Z = np.diag(
-    [1.0, -1.0, -1.0]
-)  # from COLMAP's camera to that of OpenGL and nerfstudio
+# From COLMAP's camera to that of OpenGL and nerfstudio; format
+FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -113,16 +112,17 @@ def _source(model_path: Path, image_path: Path | None) -> Source:
     photographs = (
         image_path or Workspace(resolved(model_path).parent.parent).photographs()
     )
-    return Source(model_path, read_finished_model(model_path), photographs)
+    return Source(
+        path=model_path, model=read_finished_model(model_path), image_path=photographs
+    )
 
 
 def _write(
     source: Source, output_path: Path, formats: Sequence[str]
 ) -> dict[str, Path]:
     """Write formats into a folder, all or none; return what was written by format."""
-    chosen = [
-        name for name in FORMATS if name in formats
-    ]  # in the order in which they are made
+    # In the order in which they are made
+    chosen = [name for name in FORMATS if name in formats]
     targets = dict.fromkeys(output_path / FORMATS[name].leaves for name in chosen)
     photographs = [image.name for image in source.images()]
     written = {}
@@ -236,9 +236,8 @@ def _undistorted(source: Source, folder: Path) -> Path:
         picture = path / "images" / image.name
         if not picture.is_file():
             raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
-        forget_orientation(
-            picture
-        )  # COLMAP takes over EXIF, by which others would turn it
+        # COLMAP takes over EXIF, by which others would turn it
+        forget_orientation(picture)
     return path
 
 
@@ -272,7 +271,12 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
     try:
-        flat = Source(path, read_given_model(path / "sparse"), None, source.is_upright)
+        flat = Source(
+            path=path,
+            model=read_given_model(path / "sparse"),
+            image_path=None,
+            is_upright=source.is_upright,
+        )
     except (
         OptionError,
         StoreError,
@@ -380,9 +384,8 @@ def _no_formula(text: str) -> str:
 class Format:
     """A format that models are exported to."""
 
-    write: Callable[
-        [Source, Path], Path
-    ]  # writes it into a folder, returns what it has written
+    # Writes it into a folder, returns what it has written
+    write: Callable[[Source, Path], Path]
     leaves: str  # what it leaves in the folder
 
 

@@ -35,7 +35,8 @@ from colmap_affrect.colmap.database import (
     write_descriptors,
 )
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
+from colmap_affrect.colmap.image_import import import_images
+from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.colmap.verification import (
     VerificationOptions,
     verified_pairs,
@@ -93,7 +94,7 @@ logger = logging.getLogger(__name__)
 
 Datasets = dict[str, NDArray[Any]]
 
-SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
+SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet; resource
 
 
 @documented
@@ -192,13 +193,22 @@ def import_h5(  # noqa: PLR0913 (all but three are keywords)
             "--match-list-path: only without --matches-path: it says what to match"
         )
     wanted = _Wanted(
-        as_path_or_none(matches_path, "matches_path"),
-        match_type,
-        as_path_or_none(match_list_path, "match_list_path"),
-        image_path,
-        None if skip_verification else VerificationOptions(random_seed=random_seed),
+        matches_path=as_path_or_none(matches_path, "matches_path"),
+        match_type=match_type,
+        match_list_path=as_path_or_none(match_list_path, "match_list_path"),
+        image_path=image_path,
+        verification=None
+        if skip_verification
+        else VerificationOptions(random_seed=random_seed),
     )
-    return _import(image_path, features_path, database_path, cameras, wanted, progress)
+    return _import(
+        image_path=image_path,
+        features_path=features_path,
+        database_path=database_path,
+        cameras=cameras,
+        wanted=wanted,
+        progress=progress,
+    )
 
 
 def _import(
@@ -221,7 +231,9 @@ def _import(
         keys = keys_of(features, names, image_path)
         refuse_colliding_keys(list(keys))
         with _matches(wanted, features, keys) as found:
-            rejected = import_images(new, image_path, names, cameras)
+            rejected = import_images(
+                path=new, image_path=image_path, names=names, options=cameras
+            )
             lost = sorted(keys.keys() & set(rejected))
             if lost:
                 raise ImageError(
@@ -229,7 +241,7 @@ def _import(
                     f"mode {cameras.mode} allows): {such_as(lost)}"
                 )
             unkept = _fill(new, features, keys, progress)
-            _fill_matches(new, found, wanted, progress)
+            _fill_matches(path=new, given=found, wanted=wanted, progress=progress)
         counts, num_verified = _verified(new, wanted, progress)
         _, problems = check_database(new)
     without = sorted(set(names) - set(rejected) - keys.keys())
@@ -282,7 +294,7 @@ def _matches(
         except OptionError as error:
             raise StoreError(f"{features.path}: {error}") from error
 
-    yield GivenMatches(features.path, tuple(pairs), matched_pairs)
+    yield GivenMatches(path=features.path, pairs=tuple(pairs), read=matched_pairs)
 
 
 def _fill(
@@ -294,7 +306,9 @@ def _fill(
         images = {image.name: image for image in database.read_all_images()}
         with progress.stage("keypoints", len(keys), "images") as advance:
             for name, key in keys.items():
-                _write_keypoints(database, images[name], features, key)
+                _write_keypoints(
+                    database=database, image=images[name], source=features, key=key
+                )
                 if not _keep_descriptors(
                     database, images[name].image_id, features, key
                 ):
@@ -404,9 +418,13 @@ def export_h5(
         matches = _match_groups(database, known, pair_ids)
         with new_results(features_path, matches_path, names=names) as made:
             with progress.stage("features", len(names), "images") as advance:
-                _write_file(made[0], features_path, features, advance)
+                _write_file(
+                    new=made[0], path=features_path, groups=features, advance=advance
+                )
             with progress.stage("matches", len(pair_ids), "pairs") as advance:
-                _write_file(made[1], matches_path, matches, advance)
+                _write_file(
+                    new=made[1], path=matches_path, groups=matches, advance=advance
+                )
         counts = (database.num_keypoints(), len(pair_ids), database.num_matches())
     without = [image.name for image in images if image.name not in names]
     left_out = {"images without keypoints are left out": without}
@@ -426,7 +444,12 @@ def _match_groups(
         _, one_each = np.unique(indices[:, 0], return_index=True)
         scores = np.ones(len(one_each), np.float32)
         count = database.num_keypoints_for_image(id1)
-        pair = PairMatches((names[id1], names[id2]), indices[one_each], scores, count)
+        pair = PairMatches(
+            names=(names[id1], names[id2]),
+            indices=indices[one_each],
+            scores=scores,
+            num_keypoints1=count,
+        )
         yield pair_key(*pair.names), hloc_matches(pair)
 
 

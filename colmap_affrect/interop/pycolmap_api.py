@@ -60,9 +60,8 @@ from colmap_affrect.stages.pairs import add_pairs
 
 CANCELLED = "Operation cancelled"  # what pycolmap says
 
-Native = (
-    Mapping[str, Any] | None
-)  # nested dictionaries are taken for all options of pycolmap
+# Nested dictionaries are taken for all options of pycolmap
+Native = Mapping[str, Any] | None
 GivenMatching = pycolmap.FeatureMatchingOptions | MatcherOptions | Native
 GivenVerification = VerificationOptions | pycolmap.TwoViewGeometryOptions | Native
 Token = pycolmap.CancellationToken | None

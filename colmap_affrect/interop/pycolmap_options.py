@@ -74,7 +74,12 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
     if isinstance(given, kind):
         options = given
     elif given is None or isinstance(given, Mapping):
-        resolve(options, _unusual(_named(given), options), f"{argument}:", owned={})
+        resolve(
+            options=options,
+            given=_unusual(_named(given), options),
+            flag=f"{argument}:",
+            owned={},
+        )
     else:
         shown = f"{argument}: {type(given).__name__} does not apply here"
         raise OptionError(

@@ -26,26 +26,26 @@ from colmap_affrect.mappers.camera_priors import (
 )
 from colmap_affrect.mappers.tie_points import NONE, TiePoints
 
-NOISE_PX = 0.7  # standard deviation of keypoints, judged on the benchmark scenes
+NOISE_PX = 0.7  # standard deviation of keypoints, measured on the benchmark scenes
 
-FAST = 15  # iterations while a model grows
-MEDIUM = 50  # iterations before models are compared
-FINAL = 300  # iterations of models that are kept
-# Relative change of the cost at which Ceres ends a fast adjustment
+FAST = 15  # iterations while a model grows; resource
+MEDIUM = 50  # iterations before models are compared; resource
+FINAL = 300  # iterations of models that are kept; resource
+# Relative change of the cost at which Ceres ends a fast adjustment; numeric
 FAST_TOLERANCE = 1e-5
-TOLERANCE = 1e-7  # the same of all others
+TOLERANCE = 1e-7  # the same of all others; numeric
 DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one (measured)
 MIN_LONG_TRACKS = 100
 """Tracks of three images that every image needs before tracks of two are left out (judged)."""
-# In deviations of keypoints: tie points pull from farther away
+# In deviations of keypoints: tie points pull from farther away; judged
 TIE_POINT_LOSS_SCALE = 4.0
 
-# When a trial adjustment ends early. Judged: this changes the growth of the cost by less than
+# When a trial adjustment ends early. Measured: this changes the growth of the cost by less than
 # three times as many iterations do, four per cent.
 FIRST_STEPS = 3  # of an adjustment, which say nothing of those that follow
-# Part of the excess over the other cost, below which a step is small
+# Part of the excess over the other cost, below which a step is small; measured
 SMALL_STEP = 0.001
-NUM_SMALL = 3  # small steps in a row that end an adjustment
+NUM_SMALL = 3  # small steps in a row that end an adjustment; measured
 
 
 class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
@@ -152,15 +152,12 @@ class Adjuster:
 
     priors: Mapping[int, CameraPrior]  # by camera id
     noise_px: float  # standard deviation of the keypoints, the scale of the robust loss
-    refining: (
-        pycolmap.BundleAdjustmentOptions
-    )  # say which parameters of cameras are refined
-    constant: frozenset[int] = (
-        frozenset()
-    )  # ids of the cameras of which nothing is refined
-    constant_frames: frozenset[int] = (
-        frozenset()
-    )  # ids of the frames whose poses are fixed
+    # Say which parameters of cameras are refined
+    refining: pycolmap.BundleAdjustmentOptions
+    # Ids of the cameras of which nothing is refined
+    constant: frozenset[int] = frozenset()
+    # Ids of the frames whose poses are fixed
+    constant_frames: frozenset[int] = frozenset()
     tie_points: TiePoints = NONE  # observed by all models that have two of their images
 
     def set_initial_focals(self, model: pycolmap.Reconstruction) -> None:
@@ -199,7 +196,10 @@ class Adjuster:
             model.images[image_id].camera_id for image_id in others
         } | self.constant
         config = self._config(
-            model, images, cameras & fixed, fix_gauge=image_ids is None
+            model=model,
+            image_ids=images,
+            fixed_cameras=cameras & fixed,
+            fix_gauge=image_ids is None,
         )
         problem = self._problem(model, config, cameras - fixed)
         solver = _solver_options(max_iterations, len(images))
@@ -226,7 +226,12 @@ class Adjuster:
         """
         images = sorted(model.reg_image_ids())
         cameras = {model.images[image_id].camera_id for image_id in images}
-        config = self._config(model, images, cameras & self.constant, fix_gauge=False)
+        config = self._config(
+            model=model,
+            image_ids=images,
+            fixed_cameras=cameras & self.constant,
+            fix_gauge=False,
+        )
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
         problem = self._problem(model, config, cameras - self.constant)
         wanted = pycolmap.BACovarianceOptions()

@@ -119,10 +119,9 @@ class MappedModel:
     reconstruction: pycolmap.Reconstruction
     bridges: Mapping[str, Bridge] = field(default_factory=dict)
     """By the names of images that came in by one verified pair, not by tracks of three images."""
-    moves: tuple[
-        str, ...
-    ] = ()  # hypotheses that made the model, in the words of a report
-    finish: Callable[[], None] | None = None
+    # Hypotheses that made the model, in the words of a report
+    hypotheses: tuple[str, ...] = ()
+    add_last_points: Callable[[], None] | None = None
     """Gives the reconstruction its last points and colours; called once, when images are scored."""
 
 

@@ -36,11 +36,12 @@ from colmap_affrect.project.report import Bridge
 # Judged on bridges of the benchmark scenes whose poses are known.
 # Of the longer side of an image: known depths so near are compared
 NEIGHBOR_RADIUS = 0.03
-# Known depths on a common plane may be so many times farther away
+# Known depths on a common plane may be so many times farther away; judged
 PLANE_RADIUS_FACTOR = 4.0
-MIN_AGREEING = 10  # depth ratios that agree with a scale
-MIN_AGREEING_SHARE = 0.5  # of all ratios: right pairs have 0.8, chance 0.25
-FOCAL_STEP = 0.02  # of the logarithm: relative poses are estimated once for such a step
+MIN_AGREEING = 10  # depth ratios that agree with a scale; judged
+MIN_AGREEING_SHARE = 0.5  # of all ratios: right pairs have 0.8, chance 0.25; measured
+# Of the logarithm: relative poses are estimated once for such a step; resource
+FOCAL_STEP = 0.02
 
 
 class _PosedModel:
@@ -117,7 +118,9 @@ class BridgeFinder:
             if sum(is_inside) == 1:
                 side = is_inside.index(True)
                 initial = self.graph.cameras[pair.ids[1 - side]]
-                yield _OpenPair(pair, side, refined.get(initial.camera_id, initial))
+                yield _OpenPair(
+                    pair=pair, side=side, camera=refined.get(initial.camera_id, initial)
+                )
 
     def _hypotheses(
         self, posed: _PosedModel, open_pair: _OpenPair
@@ -132,18 +135,25 @@ class BridgeFinder:
             if scale is None:
                 continue
             pose = _chained(
-                posed.poses[inside], relative.pose, open_pair.side, scale.scale
+                known=posed.poses[inside],
+                relative=relative.pose,
+                side=open_pair.side,
+                scale=scale.scale,
             )
             agreeing = self._agreeing_weight(posed, outside, pose, camera)
             if agreeing is not None:
                 bridge = Bridge(
-                    self.graph.names[inside],
-                    scale.num_agreeing,
-                    scale.num_ratios,
-                    scale.error_frac,
+                    by=self.graph.names[inside],
+                    num_agreeing=scale.num_agreeing,
+                    num_ratios=scale.num_ratios,
+                    scale_error_frac=scale.error_frac,
                 )
                 yield BridgeHypothesis(
-                    bridge, outside, pose, camera, agreeing * scale.share
+                    bridge=bridge,
+                    image_id=outside,
+                    pose=pose,
+                    camera=camera,
+                    rank=agreeing * scale.share,
                 )
 
     def _scale(

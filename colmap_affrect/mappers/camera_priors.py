@@ -24,11 +24,11 @@ from colmap_affrect.geometry.lines import (
     LineCamera,
 )
 
-# The usual focal length and its deviation are judged on lenses of 25 to 70 mm on 35 mm film; the
+# The usual focal length and its deviation are those of lenses of 25 to 70 mm on 35 mm film; the
 # deviation by EXIF covers rounding and the distance of focus.
-USUAL_FOCAL = 1.15  # longer sides of the image, the median
-USUAL_SIGMA = 0.4  # of the logarithm of an uncalibrated focal length
-EXIF_SIGMA = 0.08  # of the logarithm of a focal length by EXIF
+USUAL_FOCAL = 1.15  # longer sides of the image, the median; theory
+USUAL_SIGMA = 0.4  # of the logarithm of an uncalibrated focal length; theory
+EXIF_SIGMA = 0.08  # of the logarithm of a focal length by EXIF; theory
 LINES_SIGMA = 0.1
 """Least deviation of the logarithm of a focal length by lines: pairs know it better, and lines of
 one building err together (judged)."""
@@ -39,17 +39,19 @@ crops were enlarged or shrunk, too (judged)."""
 # Of each distortion coefficient, judged on lenses that are no fisheyes
 DISTORTION_SIGMA = 0.07
 SHIFTED_SHARE = 0.2  # of the photographs of which nothing is known (judged)
-NO_SHARE = 1e-9  # of measurements that are false
-WIDE_SIGMA = 1.0  # of the logarithm of a focal length of which nothing is expected
-MIN_FOCAL_PX = 1e-9  # whose logarithm is taken
-SAME_PX = 1e-3  # to which two principal points are the same
-# By which EXIF and lines may differ before they contradict each other
+NO_SHARE = 1e-9  # of measurements that are false; numeric
+# Of the logarithm of a focal length of which nothing is expected; theory
+WIDE_SIGMA = 1.0
+MIN_FOCAL_PX = 1e-9  # whose logarithm is taken; numeric
+SAME_PX = 1e-3  # to which two principal points are the same; numeric
+# By which EXIF and lines may differ before they contradict each other; theory
 MAX_DEVIATIONS = 2.5
 ZOOMS = 1.0, 1.4, 0.7, 2.0
-"""Factors of the usual focal length near which unknown ones begin (judged): all lenses from wide to
+"""Factors of the usual focal length near which unknown ones begin (theory): all lenses from wide to
 long are within a fifth of one of them. Where lines tell more, starts are nearer to each other."""
 LOG_FOCALS: Array = np.linspace(math.log(0.05), math.log(50.0), 1401)
-"""Grid of the logarithms of focal lengths in longer sides, on which distributions are combined."""
+"""Grid of the logarithms of focal lengths in longer sides, on which distributions are combined;
+numeric."""
 
 
 @dataclass(frozen=True)
@@ -238,9 +240,9 @@ def camera_prior(
     focal = product(usual, told) if told else usual
     focal = LogNormal(focal.focal * longer_px, max(focal.sigma, LINES_SIGMA))
     return CameraPrior(
-        focal.focal,
-        focal.sigma,
-        _principal_point(camera, record, lines),
+        focal_px=focal.focal,
+        sigma=focal.sigma,
+        principal_point=_principal_point(camera, record, lines),
         given_starts_px=_starts(focal),
     )
 
@@ -388,11 +390,11 @@ def focal_contradictions(
         if by_lines.sigma < KNOWN_SIGMA and abs(difference) > tolerated:
             found.append(
                 FocalContradiction(
-                    record.names,
-                    record.source,
-                    said_px,
-                    by_lines.focal * longer_px,
-                    by_lines.sigma,
+                    names=record.names,
+                    source=record.source,
+                    said_px=said_px,
+                    lines_px=by_lines.focal * longer_px,
+                    lines_sigma=by_lines.sigma,
                 )
             )
     return found

@@ -15,7 +15,7 @@ from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.mappers.model_score import GRID
 from colmap_affrect.mappers.pair_graph import PairGraph
 
-NUM_POSE_PARAMETERS = 6
+NUM_POSE_PARAMETERS = 6  # theory
 MIN_NUM_IMAGES = 3
 """Images of a camera, from which on they tell its distortion: what else is wrong of a model is not
 the same in all of them (judged)."""

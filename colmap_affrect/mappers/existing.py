@@ -28,7 +28,7 @@ from colmap_affrect.project.regular_files import read_regular
 
 SAME_POSE = 1e-6
 """Largest difference of elements of two poses that are the same, relative to the translation: files
-round quaternions."""
+round quaternions; numeric."""
 
 
 class Extension(Options):

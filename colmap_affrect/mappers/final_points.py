@@ -17,7 +17,7 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.tie_points import TiePoints
 
-MAX_ITERATIONS = 20  # each point is a problem of its own, which few solve
+MAX_ITERATIONS = 20  # each point is a problem of its own, which few solve; resource
 
 
 def complete_points(
@@ -46,15 +46,20 @@ def complete_points(
     triangulator.complete_all_tracks(finding)
     triangulator.merge_all_tracks(finding)
     by_hand = {mark.point3D_id for _, _, mark in tie_points.observed(model)}
-    _refine(model, by_hand, pycolmap.LossFunctionType.CAUCHY, noise_px)
+    _refine(
+        model=model,
+        held=by_hand,
+        loss=pycolmap.LossFunctionType.CAUCHY,
+        noise_px=noise_px,
+    )
     max_error_px = mapping.filter_max_reproj_error
     failing = _failing(model, max_error_px) - by_hand
     if failing:
         _refine(
-            model,
-            model.point3D_ids() - failing,
-            pycolmap.LossFunctionType.TRIVIAL,
-            noise_px,
+            model=model,
+            held=model.point3D_ids() - failing,
+            loss=pycolmap.LossFunctionType.TRIVIAL,
+            noise_px=noise_px,
         )
     refined = model.point3D_ids() - by_hand
     manager.filter_points3D(max_error_px, mapping.filter_min_tri_angle, refined)
@@ -84,14 +89,17 @@ def _failing(model: pycolmap.Reconstruction, max_error_px: float) -> set[int]:
     for point_id, point in model.points3D.items():
         if point.error * point.track.length() <= max_error_px:  # the sum: none is above
             continue
-        errors = [_error_px(model, point, element) for element in point.track.elements]
+        errors = [
+            _observation_error_px(model, point, element)
+            for element in point.track.elements
+        ]
         num_within = sum(error <= max_error_px for error in errors)
         if num_within < 2:
             found.add(point_id)
     return found
 
 
-def _error_px(
+def _observation_error_px(
     model: pycolmap.Reconstruction,
     point: pycolmap.Point3D,
     element: pycolmap.TrackElement,
@@ -153,8 +161,7 @@ def _pose_parameters(model: pycolmap.Reconstruction) -> list[Array]:
     """Return the parameters of the poses of frames, and of the sensors in rigs, as the model's."""
     poses = [model.frames[key].rig_from_world for key in sorted(model.reg_frame_ids())]
     for rig_id in sorted(model.rigs):
-        rig = model.rigs[
-            rig_id
-        ]  # its sensors are copies there, and the model's by their ids
+        # Its sensors are copies there, and the model's by their ids
+        rig = model.rigs[rig_id]
         poses += [rig.sensor_from_rig(sensor) for sensor in rig.non_ref_sensors]
     return [pose.params for pose in poses if pose is not None]

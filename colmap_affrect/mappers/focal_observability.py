@@ -26,20 +26,21 @@ FACTORS = 1.25, 0.8
 """Other focal lengths that are tried: with these, poses are off by 5 degrees and more (judged)."""
 MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing (judged)
 MAX_GROWTH = 1.0  # as of known focal lengths: more makes no photograph surer (judged)
-# Of the logarithm of a given focal length while others are tried: nearly free
+# Of the logarithm of a given focal length while others are tried: nearly free; theory
 FREE_SIGMA = 1.0
-# Of the logarithm of a given focal length, from which on another one is named
+# Of the logarithm of a given focal length, from which on another one is named; display
 MIN_MOVE = 0.1
 # Of a trial: three times as many change growths by 4 % at most (measured)
 NUM_ITERATIONS = 100
-MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once, to save time
-# Larger models have points of many images, which tell focal lengths
+# More cameras than that are tried several at once, to save time; resource
+MAX_NUM_TRIALS = 12
+# Larger models have points of many images, which tell focal lengths; resource
 MAX_NUM_IMAGES = 100
-MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time
+MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time; resource
 MAX_NUM_OBSERVATIONS = 3_000
 """The same of a model of rigs: with the poses of the sensors as unknowns, too, each observation
-takes two or three times as long."""
-MIN_COST = 1e-9  # costs are divided by
+takes two or three times as long; resource."""
+MIN_COST = 1e-9  # costs are divided by; numeric
 
 
 class _FocalTrials:
@@ -64,13 +65,20 @@ class _FocalTrials:
         self.priors = priors
         self.refining = refining
         self.fixed = fixed
-        adjuster = Adjuster(priors, NOISE_PX, refining, fixed)
+        adjuster = Adjuster(
+            priors=priors, noise_px=NOISE_PX, refining=refining, constant=fixed
+        )
         self.cost = max(adjuster.adjust(model, NUM_ITERATIONS), MIN_COST)
 
     def growth(self, camera_ids: Sequence[int]) -> float:
         """Return the part by which the cost grows, with the factor for which that is least."""
         fixed = self.fixed.union(camera_ids)
-        adjuster = Adjuster(self.priors, NOISE_PX, self.refining, fixed)
+        adjuster = Adjuster(
+            priors=self.priors,
+            noise_px=NOISE_PX,
+            refining=self.refining,
+            constant=fixed,
+        )
         least = math.inf
         for factor in FACTORS:
             trial = pycolmap.Reconstruction(self.model)
@@ -143,9 +151,13 @@ def fitting_focals(
     constant = frozenset(key for key in given if task.cameras[key].is_fixed)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
     fixed = with_fewer_points(model)
-    fixed_cost = Adjuster(priors, NOISE_PX, refining, constant).adjust(fixed, FINAL)
+    fixed_cost = Adjuster(
+        priors=priors, noise_px=NOISE_PX, refining=refining, constant=constant
+    ).adjust(fixed, FINAL)
     free = with_fewer_points(model)
-    free_cost = Adjuster(free_priors, NOISE_PX, refining).adjust(free, FINAL)
+    free_cost = Adjuster(
+        priors=free_priors, noise_px=NOISE_PX, refining=refining
+    ).adjust(free, FINAL)
     num = num_independent(fixed)
     gain = (fixed_cost - free_cost) * (num / max(1, fixed.compute_num_observations()))
     if gain < 0.5 * len(given) * np.log(max(2, num)):

@@ -157,6 +157,9 @@ class GlobalMapper:
                 has_changed = True
         if has_changed:
             priors = camera_priors(model.cameras.values(), task.cameras, task.lines)
-            Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(
-                model, FINAL
-            )
+            Adjuster(
+                priors=priors,
+                noise_px=NOISE_PX,
+                refining=options,
+                constant=frozenset(constant),
+            ).adjust(model, FINAL)

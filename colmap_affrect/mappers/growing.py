@@ -24,11 +24,12 @@ from colmap_affrect.mappers.pair_graph import (
 )
 
 MIN_POINTS = 10  # of a first pair (judged)
-# Images up to which each new one is followed by a global adjustment
+# Images up to which each new one is followed by a global adjustment; resource
 NUM_ALWAYS_ADJUSTED = 10
-GROWTH = 1.15  # of the number of images from one global adjustment to the next; COLMAP has 1.1
-NUM_LAST_ROUNDS = 2  # of triangulation and adjustment at the end (judged)
-# Bridges that are built from one model before it is called complete (judged)
+# Of the number of images from one global adjustment to the next; COLMAP has 1.1; resource
+GROWTH = 1.15
+NUM_LAST_ROUNDS = 2  # of triangulation and adjustment at the end (resource)
+# Bridges that are built from one model before it is called complete (resource)
 MAX_TRIALS = 5
 
 
@@ -83,7 +84,7 @@ class Grower:
             self._complete(mapper)
         return model
 
-    def finish(
+    def adjust_fully(
         self, model: pycolmap.Reconstruction, max_iterations: int = FINAL
     ) -> None:
         """Triangulate again and adjust a model, by default until it converges.

@@ -27,13 +27,13 @@ FLAG = "--mapper-options"
 class PipelineOptions(MapperOptions):
     """Options of COLMAP's incremental pipeline."""
 
-    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
+    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0  # judged
     """Smallest angle between the rays of a point, in the first pair of images."""
-    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50
+    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50  # judged
     """Fewest inliers of the first pair of images."""
-    abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12
+    abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12  # judged
     """Fewest points that an image is registered by."""
-    max_focal_length_ratio: Annotated[float, within(1.0, 1000.0)] = 30.0
+    max_focal_length_ratio: Annotated[float, within(1.0, 1000.0)] = 30.0  # judged
     """Longest focal length, in longer sides of the image; COLMAP's 10 leaves nothing of the
     photographs of a narrow lens."""
 
@@ -93,7 +93,13 @@ class IncrementalMapper:
         native = self.native(task, random_seed)
         if task.image_path is None:
             native.extract_colors = False
-        run = _PipelineRun(task, native, output_path, show, task.database_path)
+        run = _PipelineRun(
+            task=task,
+            options=native,
+            output_path=output_path,
+            show=show,
+            database_path=task.database_path,
+        )
         try:
             models = run_cancellable(run.models, task.cancellation)
         except InterruptedError as error:
@@ -214,9 +220,8 @@ class _PipelineRun:
     def _map(
         self, token: pycolmap.CancellationToken, input_path: Path | None = None
     ) -> list[pycolmap.Reconstruction]:
-        num_initial = (
-            0 if input_path else 2
-        )  # pycolmap also calls it for a resumed model
+        # Pycolmap also calls it for a resumed model
+        num_initial = 0 if input_path else 2
         models = pycolmap.incremental_mapping(
             self.database_path,
             self.task.colors_path,

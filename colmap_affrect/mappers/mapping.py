@@ -34,11 +34,12 @@ from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_probability
 
 MIN_PROBABILITY = 0.05
-"""Images leave their model below this probability: nineteen of twenty such poses are wrong."""
+"""Images leave their model below this probability: nineteen of twenty such poses are wrong
+(theory)."""
 # What was begun is removed while a call of COLMAP may still write there.
 ENOUGH_OF_SMALL_SET = 0.8  # of all images: such a model is never too small (COLMAP)
-NUM_REMOVALS = 5  # times that this is tried
-REMOVAL_INTERVAL_S = 0.05  # between them
+NUM_REMOVALS = 5  # times that this is tried; resource
+REMOVAL_INTERVAL_S = 0.05  # between them; resource
 
 
 @dataclass(frozen=True)
@@ -104,12 +105,10 @@ class _ScoredModel:
     """A model and the confidence in its images."""
 
     mapped: MappedModel
-    confidences: dict[str, Confidence] = field(
-        default_factory=dict
-    )  # of its images, by name
-    taken_out: dict[str, Confidence] = field(
-        default_factory=dict
-    )  # of images that it has lost
+    # Of its images, by name
+    confidences: dict[str, Confidence] = field(default_factory=dict)
+    # Of images that it has lost
+    taken_out: dict[str, Confidence] = field(default_factory=dict)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -220,8 +219,8 @@ def _write_models(
     summaries = list[ModelSummary]()
     for index, model in enumerate(models):
         path = folder / str(index)
-        if model.mapped.finish:
-            model.mapped.finish()
+        if model.mapped.add_last_points:
+            model.mapped.add_last_points()
         write_model(model.mapped.reconstruction, path)
         summary = _summary(model, task)
         write_summary(summary, path)
@@ -317,7 +316,7 @@ def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
         bridges={name: bridge for name, bridge in bridges.items() if name in focals_px},
         taken_out={name: one.reasons for name, one in scored.taken_out.items()},
         focals_px=focals_px,
-        moves=scored.mapped.moves,
+        hypotheses=scored.mapped.hypotheses,
         tie_points=tie_points_of(task, graph).report(model),
         one_view=_same_viewpoint_names(model, graph, task),
     )

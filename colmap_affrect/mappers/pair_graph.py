@@ -42,12 +42,13 @@ MAX_ERROR = 0.003
 """Of the longer side, of a match that a pose explains: 3 px in a photograph of 1000 (judged)."""
 MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
-MAX_MATCHES = 500  # inliers of a pair that are sampled for agreement and relative poses
-MAX_TRIALS = 1000  # of RANSAC, for a relative pose
-# The strongest of each image that models are scored by (judged)
+# Inliers of a pair that are sampled for agreement and relative poses; resource
+MAX_MATCHES = 500
+MAX_TRIALS = 1000  # of RANSAC, for a relative pose; resource
+# The strongest of each image that models are scored by (resource)
 MAX_PAIRS_OF_IMAGE = 15
 MIN_NUM_MATCHES = 15  # inliers of a pair; COLMAP's min_num_matches
-MIN_SHARE = 0.5  # of the inliers of a pair: fewer that agree contradict poses
+MIN_SHARE = 0.5  # of the inliers of a pair: fewer that agree contradict poses; theory
 
 
 @dataclass(frozen=True)
@@ -246,7 +247,9 @@ class PairGraph:
         if known and known.pair is pair and known.asked == asked:
             return known.share
         pose = relative_pose(poses[first], poses[second])
-        share = float(_agreement(pose, both, self._sampled_points(pair)).agrees.mean())
+        share = float(
+            _compared_with_pose(pose, both, self._sampled_points(pair)).agrees.mean()
+        )
         self._agreements[pair.ids] = _KnownAgreement(pair, asked, share)
         return share
 
@@ -285,7 +288,7 @@ class PairGraph:
         both = cameras[pair.ids[0]], cameras[pair.ids[1]]
         allowed = list[RelativePose]()
         for pose in self._candidate_poses(pair, both, random_seed):
-            found = _agreement(pose, both, self.points(pair))
+            found = _compared_with_pose(pose, both, self.points(pair))
             has_depth = found.agrees & (found.depths.angles_deg > MIN_ANGLE_DEG)
             if found.agrees.mean() >= MIN_SHARE and has_depth.any():
                 depths = found.depths.first[has_depth], found.depths.second[has_depth]
@@ -352,7 +355,9 @@ def sampling_step(num_items: int, max_num: int) -> int:
     return max(1, math.ceil(num_items / max_num))
 
 
-def _agreement(pose: Pose, cameras: Cameras, points: tuple[Array, Array]) -> _Agreement:
+def _compared_with_pose(
+    pose: Pose, cameras: Cameras, points: tuple[Array, Array]
+) -> _Agreement:
     """Compare matches with a relative pose.
 
     Args:

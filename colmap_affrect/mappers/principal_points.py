@@ -32,7 +32,7 @@ NOISE_FACTORS = 12.0, 6.0, 3.0
 principal point is off by a tenth has errors of some ten px). Half of that or twice as much gives
 the same models."""
 USUAL_LIMIT = 2.0
-"""Multiple of the noise that the limits of triangulation and of filters are made for."""
+"""Multiple of the noise that the limits of triangulation and of filters are made for (theory)."""
 ANGLE_LIMITS = (
     "create_max_angle_error",
     "continue_max_angle_error",
@@ -151,9 +151,16 @@ def _from_afar(
         )
     for factor in NOISE_FACTORS:
         coarse = _coarser(_with_priors(free, straight), factor)
-        changed = _restarted(changed, coarse, graph, MEDIUM)
-    changed = _restarted(changed, _with_priors(free, straight), graph, MEDIUM)
-    return _restarted(changed, free, graph, FINAL)
+        changed = _restarted(
+            model=changed, search=coarse, graph=graph, iterations=MEDIUM
+        )
+    changed = _restarted(
+        model=changed,
+        search=_with_priors(free, straight),
+        graph=graph,
+        iterations=MEDIUM,
+    )
+    return _restarted(model=changed, search=free, graph=graph, iterations=FINAL)
 
 
 def _principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> float:
@@ -180,7 +187,7 @@ def _restarted(
     """Return a model with the poses and cameras of another one, and points of its own."""
     grower = search.grower(graph)
     changed = grower.restart_from(model)
-    grower.finish(changed, iterations)
+    grower.adjust_fully(changed, iterations)
     return changed
 
 

@@ -21,20 +21,20 @@ from colmap_affrect.project.reasons import Doubt
 # Shapes of the terms, judged where the share of right photographs no longer changes.
 # Log-likelihood ratio, from which on more counts by its logarithm only
 LOG_RATIO_SCALE = 3.0
-MAX_THREE_VIEW_POINTS = 300  # more points make no photograph surer
-# Share of matches that a rotation may explain from any two positions
+MAX_THREE_VIEW_POINTS = 300  # more points make no photograph surer; judged
+# Share of matches that a rotation may explain from any two positions; judged
 USUAL_ROTATION_RATIO = 0.5
-# Of focal lengths: farther apart they are no surer parts of others
+# Of focal lengths: farther apart they are no surer parts of others; judged
 MAX_LOG_SPREAD = 0.5
 # A bridge edge between two components may be of two scenes, found by chance among all pairs.
 CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (judged)
 # Inliers more that make the former less likely by a factor of e (judged)
 CHANCE_SCALE = 10.0
-MAX_ERROR_DEG = 5.0  # of poses that count as right, in BENCHMARKS and in the fit
-MIN_SIGMA_DEG = 1e-3  # of directions; they are divided by
-# Of the log odds: what takes less, half of the odds, is no reason to doubt
+MAX_ERROR_DEG = 5.0  # of poses that count as right, in BENCHMARKS and in the fit; paper
+MIN_SIGMA_DEG = 1e-3  # of directions; they are divided by; numeric
+# Of the log odds: what takes less, half of the odds, is no reason to doubt; theory
 MIN_LOSS = 0.7
-NUM_REASONS = 2  # that are said of a photograph
+NUM_REASONS = 2  # that are said of a photograph; display
 
 COEFFICIENTS = Path(__file__).with_suffix(".json")
 
@@ -59,7 +59,7 @@ def _log_ratio_reason(features: ReliabilityFeatures) -> Doubt:
     return Doubt("few_matches")
 
 
-def _agreement(features: ReliabilityFeatures) -> float:
+def _agreement_value(features: ReliabilityFeatures) -> float:
     return features.agreement
 
 
@@ -123,7 +123,7 @@ def _focal_spread_reason(features: ReliabilityFeatures) -> Doubt:
 
 TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
     "log-likelihood ratio": Term(_log_ratio, _log_ratio_reason),
-    "agreement": Term(_agreement, _agreement_reason),
+    "agreement": Term(_agreement_value, _agreement_reason),
     "three-view points": Term(_three_view_points, _three_view_points_reason),
     "focal observability": Term(_focal_observability, _focal_observability_reason),
     "given focal length": Term(_given_focal, _given_focal_reason),
@@ -131,11 +131,8 @@ TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
     "mirrored copy": Term(_mirrored_copy, _mirrored_copy_reason),
     "focal spread": Term(_focal_spread, _focal_spread_reason),
 }
-OF_MATCHES = {
-    "log-likelihood ratio",
-    "agreement",
-    "three-view points",
-}  # which more may mend
+# Which more may mend
+OF_MATCHES = {"log-likelihood ratio", "agreement", "three-view points"}
 
 
 @dataclass(frozen=True)
@@ -224,7 +221,12 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
     )
     with_matches = _probability(log_odds + mendable) * share_of_directions
     gain = with_matches - probability
-    return Confidence(probability, _main_reasons(losses), gain, share_of_directions)
+    return Confidence(
+        probability=probability,
+        reasons=_main_reasons(losses),
+        gain=gain,
+        noise_share=share_of_directions,
+    )
 
 
 def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:

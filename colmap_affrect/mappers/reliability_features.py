@@ -42,15 +42,15 @@ from colmap_affrect.mappers.tie_points import (
 MIN_TOLD = 0.03
 """Growth of the cost with another focal length, from which on a model tells the focal length: of
 parts of photographs it is 0.15."""
-# Strongest pairs of a frame that are compared with a pure rotation
+# Strongest pairs of a frame that are compared with a pure rotation; resource
 NUM_ROTATION_PAIRS = 4
-MAX_ROTATION_PAIRS = 300  # the same of a model, to save time
+MAX_ROTATION_PAIRS = 300  # the same of a model, to save time; resource
 MIN_MIRRORED_SHARE = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
-images a tenth by chance."""
-# Looked at, all of 45 photographs; of more some copies are missed
+images a tenth by chance; measured."""
+# Looked at, all of 45 photographs; of more some copies are missed; resource
 MAX_MIRRORED_PAIRS = 1000
-MIN_FOCAL_PX = 1e-9  # focal lengths are divided by
+MIN_FOCAL_PX = 1e-9  # focal lengths are divided by; numeric
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def features_of(
         bridge = bridges.get(image_id)
         found[names[image_id]] = ReliabilityFeatures(
             log_likelihood_ratio=log_ratio - context.priors[key].cost_of(camera),
-            agreement=_agreement(context, image_id),
+            agreement=_agreeing_share(context, image_id),
             num_three_view_points=num_three_view_points[image_id],
             focal_growth=growths.get(key, 1.0),
             focal_px=focal_px,
@@ -198,7 +198,7 @@ def _pair_log_ratio(context: _ModelContext, image_id: int) -> float:
     return total
 
 
-def _agreement(context: _ModelContext, image_id: int) -> float:
+def _agreeing_share(context: _ModelContext, image_id: int) -> float:
     """Return the share of the inliers of an image's pairs that agree with the model."""
     pairs = context.pairs_of[image_id]
     if not pairs:
@@ -251,7 +251,11 @@ def _direction_sigmas_deg(
     fixed = frozenset(key for key in recorded if context.task.cameras[key].is_fixed)
     refining = pycolmap.BundleAdjustmentOptions()
     adjuster = Adjuster(
-        context.priors, NOISE_PX, refining, fixed, tie_points=tie_points
+        priors=context.priors,
+        noise_px=NOISE_PX,
+        refining=refining,
+        constant=fixed,
+        tie_points=tie_points,
     )
     return direction_sigmas_deg(context.model, adjuster)
 

@@ -12,9 +12,10 @@ from colmap_affrect.images.reading import read_gray
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, sampling_step
 
 MIN_CORRELATION = 0.65
-"""Of two photographs, one warped onto the other (judged): photographs of one thing from nearby have
-up to 0.57."""
-MAX_PAIRS = 1000  # of a graph that are looked at, all of 45 photographs; of more some are missed
+"""Of two photographs, one warped onto the other; measured: photographs of one thing from nearby
+have up to 0.57."""
+# Of a graph that are looked at, all of 45 photographs; of more some are missed; resource
+MAX_PAIRS = 1000
 
 
 @lru_cache(maxsize=1)

@@ -29,7 +29,7 @@ SHARED_SIGMA = 0.1
 SAME_FOCAL = 0.03
 """Largest difference of the logarithms of two focal lengths, of which bridges that were built with
 one are right with the other (judged)."""
-NUM_STARTS = 3  # models from which bridges are built in turn (judged)
+NUM_STARTS = 3  # models from which bridges are built in turn (resource)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Search:
                 break
         grower = self.grower(graph)
         for mapped in best.models:
-            grower.finish(mapped.reconstruction)
+            grower.adjust_fully(mapped.reconstruction)
         return best.models
 
     def extend_models(
@@ -104,13 +104,13 @@ class Search:
         first = pycolmap.Reconstruction(known[0].reconstruction)
         search = self._with_focals_of(first)
         grower = search.grower(graph)
-        grower.finish(first)
+        grower.adjust_fully(first)
         grown = search._grown(graph, graph.unexplained_by(first))
         models = [replace(known[0], reconstruction=first), *known[1:], *grown]
         models.sort(key=self._score, reverse=True)
         found = search.with_bridges(graph, models)
         for mapped in found:
-            grower.finish(mapped.reconstruction)
+            grower.adjust_fully(mapped.reconstruction)
         return found
 
     def with_bridges(
@@ -220,12 +220,12 @@ class Search:
             return _Attempt([], -math.inf, agrees=False)
         model = found[0].reconstruction
         if self.unknown:
-            self.grower(graph).finish(model, MEDIUM)
+            self.grower(graph).adjust_fully(model, MEDIUM)
         agrees = search._agrees(model)
         score = self.scorer.score(model)
         if agrees:  # with other focal lengths, bridges have a wrong length
             score += MIN_SCORE_GAIN
-        return _Attempt(found, score, agrees)
+        return _Attempt(models=found, score=score, agrees=agrees)
 
     def _agrees(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether unknown focal lengths ended near those with which a model was made."""

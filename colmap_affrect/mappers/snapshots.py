@@ -17,8 +17,8 @@ logger = logging.getLogger(__name__)
 
 SNAPSHOT_FRAMES = 100
 """Images between two snapshots. A model of so many images is kept whatever comes after it, so that
-mapping can go on from a snapshot of it."""
-# A snapshot may be incomplete when a run is killed; the one before is complete
+mapping can go on from a snapshot of it; resource."""
+# A snapshot may be incomplete when a run is killed; the one before is complete; theory
 NUM_KEPT = 2
 
 
@@ -73,8 +73,7 @@ def largest_snapshot(folder: Path) -> Path | None:
 def drop_old_snapshots(folder: Path) -> None:
     """Remove all but the newest snapshots of the largest models."""
     older = sorted(path for path in folder.iterdir() if path.is_dir())[:-1]
-    complete = [
-        path for path in older if (path / "frames.bin").exists()
-    ]  # the newest may be not
+    # The newest may be not
+    complete = [path for path in older if (path / "frames.bin").exists()]
     complete.sort(key=lambda path: ((path / "frames.bin").stat().st_size, path.name))
     remove_own(complete[: -(NUM_KEPT - 1)])

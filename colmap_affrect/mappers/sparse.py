@@ -40,11 +40,13 @@ OWN_CAMERAS = "with a camera for each photograph"
 COLMAP_MODEL = "from COLMAP's model"
 SHIFTED_AXES = "with optical axes off the middle"
 
-NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from (judged)
+# Of COLMAP's models, the largest ones, that are gone on from; resource
+NUM_COLMAP_MODELS = 2
 FORWARD_MOTION = (
     "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 )
-LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
+# Images from which on COLMAP's own pipeline maps: the search would take too long; resource
+LARGE = 100
 
 logger = logging.getLogger(__name__)
 
@@ -53,11 +55,11 @@ class SparseOptions(PipelineOptions):
     """Incremental mapping with priors of the cameras, and bridges by single pairs."""
 
     name: Literal["sparse"] = "sparse"
-    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 40
-    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 4.0
+    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 40  # judged
+    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 4.0  # judged
     noise_px: Annotated[float, within(0.01, 100.0)] = NOISE_PX
     """Standard deviation of keypoints; larger errors count less and less."""
-    num_seeds: Annotated[int, within(1, 1000)] = 6
+    num_seeds: Annotated[int, within(1, 1000)] = 6  # resource
     """First pairs in a row that bring nothing, after which no others are tried."""
 
 
@@ -83,7 +85,7 @@ class SparseMapper(IncrementalMapper):
             show: Is told how many images have been registered so far.
 
         Returns:
-            The models; their last points come by ``finish``.
+            The models; their last points come by ``add_last_points``.
 
         Raises:
             AffrectError: When COLMAP ends with an error.
@@ -115,7 +117,7 @@ class SparseMapper(IncrementalMapper):
             found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
         best = _joined_by_tie_points(search, search.with_bridges(graph, found))
         if not task.extend:
-            return self._with_finish(best, task, graph, native)
+            return self._with_last_points(best, task, graph, native)
         for mapped in best:
             task.extend.restore(mapped.reconstruction)
             _extract_colors(mapped.reconstruction, task, native)
@@ -148,9 +150,9 @@ class SparseMapper(IncrementalMapper):
         for mapped in best:
             if not has_rigs(mapped.reconstruction):  # which tell the scale
                 mapped.reconstruction.normalize()  # as COLMAP does
-        return self._with_finish(best, task, graph, native)
+        return self._with_last_points(best, task, graph, native)
 
-    def _with_finish(
+    def _with_last_points(
         self,
         models: Sequence[MappedModel],
         task: MappingTask,
@@ -159,12 +161,15 @@ class SparseMapper(IncrementalMapper):
     ) -> list[MappedModel]:
         """Have models get the points of all tracks, and colours, once their images are scored."""
 
-        def finish(model: pycolmap.Reconstruction) -> None:
+        def add_last_points(model: pycolmap.Reconstruction) -> None:
             tie_points = tie_points_of(task, graph)
             complete_points(model, graph, native, self.options.noise_px, tie_points)
             _extract_colors(model, task, native)
 
-        return [replace(m, finish=partial(finish, m.reconstruction)) for m in models]
+        return [
+            replace(m, add_last_points=partial(add_last_points, m.reconstruction))
+            for m in models
+        ]
 
     def _search(
         self,
@@ -266,7 +271,7 @@ class _HypothesisTest:
         self.by_colmap = by_colmap
         self.search = search
         self.own = own
-        if any(SHIFTED_AXES in mapped.moves for mapped in task.previous_models):
+        if any(SHIFTED_AXES in mapped.hypotheses for mapped in task.previous_models):
             self._begin_with_shifted_axes()
         self.best = _restarted(self.search, task.previous_models)
         self.score = search.best_score(self.best)
@@ -314,9 +319,11 @@ class _HypothesisTest:
     def _take(
         self, hypothesis: _Hypothesis, models: Sequence[MappedModel], score: float
     ) -> None:
-        before = self.best[0].moves if self.best else ()
-        moves = _without_duplicates((*before, hypothesis.name, *models[0].moves))
-        self.best = [replace(mapped, moves=moves) for mapped in models]
+        before = self.best[0].hypotheses if self.best else ()
+        hypotheses = _without_duplicates(
+            (*before, hypothesis.name, *models[0].hypotheses)
+        )
+        self.best = [replace(mapped, hypotheses=hypotheses) for mapped in models]
         self.score = score
 
     def _try_colmap(self) -> None:
@@ -334,7 +341,7 @@ class _HypothesisTest:
         found = list[MappedModel]()
         for mapped in models[:NUM_COLMAP_MODELS]:
             model = grower.restart_from(mapped.reconstruction)
-            grower.finish(model)
+            grower.adjust_fully(model)
             found.append(MappedModel(model))
         found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
         found = search.with_bridges(search.graph, found)
@@ -379,7 +386,7 @@ class _HypothesisTest:
         if model is None or self.own.scorer.score(model) <= self.score + MIN_SCORE_GAIN:
             return
         changed = replace(
-            first, reconstruction=model, moves=(*first.moves, OWN_CAMERAS)
+            first, reconstruction=model, hypotheses=(*first.hypotheses, OWN_CAMERAS)
         )
         self.best = with_own_images([changed, *self.best[1:]])
         self.search = self.own
@@ -403,8 +410,8 @@ def _joined_by_tie_points(
     return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 
 
-def _without_duplicates(moves: Sequence[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(moves))
+def _without_duplicates(hypotheses: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(hypotheses))
 
 
 def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
@@ -413,9 +420,9 @@ def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedMo
     found = list[MappedModel]()
     for mapped in previous:
         model = grower.restart_from(mapped.reconstruction)
-        grower.finish(model)
-        moves = _without_duplicates((*mapped.moves, AGAIN))
-        found.append(replace(mapped, reconstruction=model, moves=moves))
+        grower.adjust_fully(model)
+        hypotheses = _without_duplicates((*mapped.hypotheses, AGAIN))
+        found.append(replace(mapped, reconstruction=model, hypotheses=hypotheses))
     return with_own_images(found)
 
 
@@ -442,7 +449,7 @@ def _with_own_cameras(
             return None
     grower = own.grower(graph)
     changed = grower.restart_from(model)
-    grower.finish(changed)
+    grower.adjust_fully(changed)
     return changed
 
 
@@ -461,4 +468,4 @@ def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
     if not has_all or not quick.is_certain(model, search.graph):
         return []
     search.grower(graph).triangulate_all(model)  # its poses are right
-    return [replace(models[0], moves=(SOME_TRACKS,))]
+    return [replace(models[0], hypotheses=(SOME_TRACKS,))]

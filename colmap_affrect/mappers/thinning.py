@@ -9,8 +9,8 @@ import numpy as np
 
 from colmap_affrect.geometry.arrays import Bools, Indices
 
-NUM_TRACKS = 500  # kept of each image (judged: poses are as good as with all)
-NUM_MATCHES_OF_PAIR = 100  # kept of each pair at least (judged)
+NUM_TRACKS = 500  # kept of each image (resource: poses are as good as with all)
+NUM_MATCHES_OF_PAIR = 100  # kept of each pair at least (resource)
 
 
 def matches_of_best_tracks(

@@ -76,8 +76,8 @@ class TieJoiner:
                 mapped = self._with(mapped, new)
                 left = _not_inside(left, mapped)
                 new = self._next_images(mapped, left)
-            if BY_HAND in mapped.moves:
-                self.grower.finish(mapped.reconstruction)
+            if BY_HAND in mapped.hypotheses:
+                self.grower.adjust_fully(mapped.reconstruction)
             self.points.observe(mapped.reconstruction)
             joined.append(mapped)
         return joined
@@ -86,8 +86,12 @@ class TieJoiner:
         """Register images, and what bridges register from there."""
         model = copy.deepcopy(mapped.reconstruction)
         model = self.grower.register_at(new.poses, new.cameras, model)
-        moves = mapped.moves if BY_HAND in mapped.moves else (*mapped.moves, BY_HAND)
-        registered = replace(mapped, reconstruction=model, moves=moves)
+        hypotheses = (
+            mapped.hypotheses
+            if BY_HAND in mapped.hypotheses
+            else (*mapped.hypotheses, BY_HAND)
+        )
+        registered = replace(mapped, reconstruction=model, hypotheses=hypotheses)
         bridges = BridgeFinder(self.grower.graph, self.grower.native.random_seed)
         return register_bridges(registered, bridges, self.grower, self.scorer)
 

@@ -18,20 +18,21 @@ from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph, sampling_step
 from colmap_affrect.project.report import Residual
 
-AGREEING_PX = 4.0 * SIGMA_PX  # residuals up to which a tie point agrees with a pose
+# Residuals up to which a tie point agrees with a pose; theory
+AGREEING_PX = 4.0 * SIGMA_PX
 # Shares of tie points that agree (judged).
 AGREES_IF_RIGHT = 0.9  # with right poses: some marks are wrong
-AGREES_BY_CHANCE = 0.05  # with wrong poses
-# That must agree to register an image: three always do, the others are the test
+AGREES_BY_CHANCE = 0.05  # with wrong poses; judged
+# That must agree to register an image: three always do, the others are the test; theory
 MIN_NUM_POINTS = 4
 MAX_LOG_ODDS = 2.5
 """Of an image by its tie points. Measured: of images that six tie points alone register, twelve of
 thirteen are right."""
-NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P)
+NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P); theory
 # A tie point that one image alone sees has the median depth of the points near its mark (judged).
 NEIGHBOR_RADIUS = 0.1  # of the longer side of the image
-NUM_NEIGHBORS = 5
-# Of an image, among which neighbours are looked for, to save time
+NUM_NEIGHBORS = 5  # judged
+# Of an image, among which neighbours are looked for, to save time; resource
 MAX_NUM_OBSERVED = 2_000
 
 
@@ -74,8 +75,10 @@ class TiePoints:
         found = list[ImageResidual]()
         for name, image_id, mark in self.observed(model):
             position = model.points3D[mark.point3D_id].xyz
-            error_px = _error_px(model, image_id, mark.xy, position)
-            found.append(ImageResidual(name, image_id, error_px))
+            error_px = _mark_error_px(model, image_id, mark.xy, position)
+            found.append(
+                ImageResidual(point=name, image_id=image_id, error_px=error_px)
+            )
         return found
 
     def report(self, model: pycolmap.Reconstruction) -> tuple[Residual, ...]:
@@ -85,7 +88,13 @@ class TiePoints:
             self.residuals(model), key=lambda residual: -residual.error_px
         ):
             name = model.images[residual.image_id].name
-            found.append(Residual(residual.point, name, round(residual.error_px, 2)))
+            found.append(
+                Residual(
+                    point=residual.point,
+                    image=name,
+                    error_px=round(residual.error_px, 2),
+                )
+            )
         return tuple(found)
 
     def positions(self, model: pycolmap.Reconstruction) -> dict[str, Array]:
@@ -111,12 +120,12 @@ class TiePoints:
                 position = triangulated(model, others)
                 if (
                     position is None
-                    or _max_error_px(model, others, position) > AGREEING_PX
+                    or _max_mark_error_px(model, others, position) > AGREEING_PX
                 ):
                     continue
                 num_points[image_id] += 1
                 num_far[image_id] += (
-                    _error_px(model, image_id, xy, position) > AGREEING_PX
+                    _mark_error_px(model, image_id, xy, position) > AGREEING_PX
                 )
         found = list[int]()
         for image_id, num in num_far.items():
@@ -214,7 +223,7 @@ def _position(
     return surroundings.position(image_id, xy)
 
 
-def _error_px(
+def _mark_error_px(
     model: pycolmap.Reconstruction, image_id: int, xy: Array, position: Array
 ) -> float:
     """Return a reprojection error, at most the diagonal of the image, also of points behind it."""
@@ -225,13 +234,13 @@ def _error_px(
     return diagonal if projected is None else min(diagonal, math.dist(projected, xy))
 
 
-def _max_error_px(
+def _max_mark_error_px(
     model: pycolmap.Reconstruction,
     marks: Mapping[int, Array],
     position: Array,
 ) -> float:
     return max(
-        _error_px(model, image_id, xy, position) for image_id, xy in marks.items()
+        _mark_error_px(model, image_id, xy, position) for image_id, xy in marks.items()
     )
 
 

@@ -15,7 +15,7 @@ from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.options import Registry, within
 
 # Rounding error of a float32 cosine of unit rows of 128 values. Distances below its root count as
-# equal, so that the ratio of two copies of one descriptor is 1.
+# equal, so that the ratio of two copies of one descriptor is 1 (numeric).
 COSINE_ROUNDING = np.float32(1e-6)
 
 

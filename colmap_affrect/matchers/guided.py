@@ -20,17 +20,17 @@ from colmap_affrect.options import Options, within
 
 DISPLACEMENT_BANDS = 6.0
 """Displacement, in half widths of the band, of the geometry whose matches are all accidental: the
-bands of both do not overlap, and image content is still similar there."""
+bands of both do not overlap, and image content is still similar there; theory."""
 MAX_ACCIDENTAL_SHARE = 0.5
 """Accidental matches for each guided match, above which guided matches prove nothing; judged."""
 HOMOGRAPHY_BANDS = 2.0
 """Radius, in half widths of the band, around the position that a homography gives: planes are
 never quite plane; judged."""
 GROUP_SIZE = 48
-"""Features of image 1 compared at once: with more, products take longer, with fewer Python does."""
-SECOND_IS_OPPOSITE = (
-    -1.0
-)  # cosine that stands in for a second neighbour where there is none
+"""Features of image 1 compared at once: with more, products take longer, with fewer Python does;
+resource."""
+# Cosine that stands in for a second neighbour where there is none; numeric
+SECOND_IS_OPPOSITE = -1.0
 TINY = np.finfo(float).tiny
 
 
@@ -40,18 +40,21 @@ class GuidedOptions(Options):
     enabled: Literal["auto", "always", "never"] = "auto"
     """``auto``: pairs of images that are missing or hang on few tracks through three images;
     ``always``: all verified pairs, which costs accuracy where guided matches outweigh others."""
+    # COLMAP's abs_pose_min_num_inliers
     min_num_tracks: Annotated[int, within(0, 1_000_000)] = 30
     """An image with fewer features in tracks through three images or more needs guided matches:
     mapping registers images by such features."""
+    # Same as VerificationOptions.max_error_px
     band_px: Annotated[float, within(0.1, 1000.0)] = 3.0
     """Half width of the band around epipolar lines (Sampson's distance); of images that are shrunk
     for extraction in pixels of the shrunk ones."""
-    min_cosine: Annotated[float, within(-1.0, 1.0)] = 0.75
+    min_cosine: Annotated[float, within(-1.0, 1.0)] = 0.75  # judged
     """Smallest cosine of the descriptors of a match."""
-    max_ratio: Annotated[float, within(0.1, 1.0)] = 0.8
+    max_ratio: Annotated[float, within(0.1, 1.0)] = 0.8  # paper
     """Largest ratio of first to second descriptor distance, the second one inside the band."""
-    min_contrast_distance_px: Annotated[float, within(0.1, 1000.0)] = 10.0
+    min_contrast_distance_px: Annotated[float, within(0.1, 1000.0)] = 10.0  # paper
     """The second neighbour must be this far from the first (FGINN)."""
+    # Same as two_views.MAX_FRAME_ANGLE_DEG
     max_angle_deg: Annotated[float, within(0.0, 180.0)] = 20.0
     """Largest angle between a frame and the one that the geometry carries over (Barath, Hajder,
     Matas): of epipolar directions; frames of right matches are off by 5 to 10 degrees."""

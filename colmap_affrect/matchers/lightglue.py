@@ -41,23 +41,24 @@ MIN_VIEW_FEATURES = 8
 linear estimate of a fundamental matrix needs eight)."""
 DUPLICATE_RADIUS_PX = 2.0
 """Of matches that are nearer than this in both images the best stays; the radius of a duplicate in
-:class:`.nearest.NearestOptions`."""
-CHUNK_ROWS = 1 << 10  # descriptors that are compared at once, which bounds memory
+:class:`.nearest.NearestOptions`; same as NearestOptions.duplicate_radius_px."""
+# Descriptors that are compared at once, which bounds memory; resource
+CHUNK_ROWS = 1 << 10
 
 
 class LightGlueOptions(MatcherOptions):
     """LightGlue for features ``aliked``; defaults are those of its authors."""
 
     name: Literal["lightglue"] = "lightglue"
-    max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
+    max_num_features: Annotated[int, within(1, 1_000_000)] = 2048  # paper
     """Most features of each view that are matched, those of the largest responses."""
-    depth_confidence: Annotated[float, within(0.0, 1.0)] = 0.95
+    depth_confidence: Annotated[float, within(0.0, 1.0)] = 0.95  # paper
     """No more layers when this share of the features is decided; 0: always all layers."""
-    width_confidence: Annotated[float, within(0.0, 1.0)] = 0.99
+    width_confidence: Annotated[float, within(0.0, 1.0)] = 0.99  # paper
     """Features that are this sure to have no match are dropped between layers; 0: none."""
-    min_score: Annotated[float, within(0.0, 1.0)] = 0.1
+    min_score: Annotated[float, within(0.0, 1.0)] = 0.1  # paper
     """Smallest score of a match."""
-    max_num_view_pairs: Annotated[int, within(0, 1_000_000)] = 8
+    max_num_view_pairs: Annotated[int, within(0, 1_000_000)] = 8  # resource
     """Of images with warps: pairs of views that are matched, those with most mutual nearest
     neighbours; 0: all."""
 

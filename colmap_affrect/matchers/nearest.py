@@ -28,24 +28,25 @@ from colmap_affrect.matchers.base import (
 )
 from colmap_affrect.options import within
 
-CHUNK_ELEMENTS = 1 << 22  # cosines held at once, which bounds memory
-CHUNK_ENTRIES = 1 << 12  # pairs of descriptors compared at once, which bounds memory
-NO_LIMIT = 2.0  # of ratios, which are at most 1
+CHUNK_ELEMENTS = 1 << 22  # cosines held at once, which bounds memory; resource
+# Pairs of descriptors compared at once, which bounds memory; resource
+CHUNK_ENTRIES = 1 << 12
+NO_LIMIT = 2.0  # of ratios, which are at most 1; theory
 
 
 class NearestOptions(MatcherOptions):
     """Mutual nearest neighbours."""
 
     name: Literal["nearest"] = "nearest"
-    max_ratio: Annotated[float, within(0.1, 1.0)] = 0.85
+    max_ratio: Annotated[float, within(0.1, 1.0)] = 0.85  # judged
     """Largest ratio of first to second descriptor distance."""
     ratio_both_ways: bool = True
     """Test the ratio in both directions; False: from image 1 to 2 only, as in the paper."""
-    min_contrast_distance_px: Annotated[float, within(0.1, 1000.0)] = 10.0
+    min_contrast_distance_px: Annotated[float, within(0.1, 1000.0)] = 10.0  # paper
     """The second neighbour must be this far from the first (FGINN; MODS: 10-30 px)."""
-    duplicate_radius_px: Annotated[float, within(0.01, 1000.0)] = 2.0
+    duplicate_radius_px: Annotated[float, within(0.01, 1000.0)] = 2.0  # judged
     """Of matches closer than this at both ends the best one stays."""
-    max_num_first: Annotated[int, within(0, 1_000_000)] = 8192
+    max_num_first: Annotated[int, within(0, 1_000_000)] = 8192  # resource
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,15 @@ from colmap_affrect.parallel.executor import available_cores, one_openmp_thread
 
 # With fewer, loading torch takes longer than it saves (measured)
 MIN_COMPARISONS_PER_CORE = 6e8
-ERROR_SIGMAS = 6.0  # of the rounding error, allowed for on each side
-MAX_CODE = 127  # largest signed code
-ZERO_CODE = 128  # signed code 0 as an unsigned one
-CODE_STEP = 1.0 / 250  # of cosines: negative ones become 0, errors exceed 1 a little
-NUM_ROWS = 512  # compared at once, a multiple of ``SIZE_MULTIPLE``
+ERROR_SIGMAS = 6.0  # of the rounding error, allowed for on each side; theory
+MAX_CODE = 127  # largest signed code; format
+ZERO_CODE = 128  # signed code 0 as an unsigned one; format
+# Of cosines: negative ones become 0, errors exceed 1 a little; numeric
+CODE_STEP = 1.0 / 250
+NUM_ROWS = 512  # compared at once, a multiple of ``SIZE_MULTIPLE``; resource
 SIZE_MULTIPLE = 256
 """Both factors of a product are padded to a multiple of it: oneDNN prepares and keeps a program
-for every size, and many sizes take memory and time."""
+for every size, and many sizes take memory and time; resource."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +115,8 @@ def _short_list(
 
     ``margin`` is the largest error of a cosine.
     """
-    width = (
-        2.0 * margin / CODE_STEP
-    )  # codes nearer to each other may be in the other order
+    # Codes nearer to each other may be in the other order
+    width = 2.0 * margin / CODE_STEP
     best, highest = _largest(codes)
     of_best = rivals.of(best)
     is_near_best = codes[of_best] >= highest[of_best[0]] - width
@@ -134,9 +134,8 @@ def _short_list(
     rival_rows, rivals_of_best = rivals.of(best[rows])
     entry_rows = np.concatenate([candidate_rows, rival_rows])
     entry_columns = np.concatenate([candidates, rivals_of_best])
-    entries = np.sort(
-        entry_rows << 32 | entry_columns
-    )  # far faster than an order by two keys
+    # Far faster than an order by two keys
+    entries = np.sort(entry_rows << 32 | entry_columns)
     return ShortList(
         rows, runners_up[rows], is_doubtful[rows], entries >> 32, entries & 0xFFFF_FFFF
     )

@@ -82,7 +82,7 @@ def _of_hdf5(source: GivenFile, names: Collection[str]) -> GivenMatches:
             rows = np.flatnonzero(column != -1)
             yield pair, np.stack([rows, column[rows]], axis=1)
 
-    return GivenMatches(source.path, tuple(keys), read)
+    return GivenMatches(path=source.path, pairs=tuple(keys), read=read)
 
 
 def _once(found: Iterator[tuple[Pair, str]]) -> dict[Pair, str]:
@@ -183,7 +183,9 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
         raise StoreError(
             f"{path}: holds no matches; give an HDF5 file, or a list of COLMAP"
         )
-    return GivenMatches(path, tuple(found), lambda _: iter(found.items()))
+    return GivenMatches(
+        path=path, pairs=tuple(found), read=lambda _: iter(found.items())
+    )
 
 
 def _end_of_matches(lines: Sequence[str], begin: int) -> int:

@@ -23,10 +23,13 @@ Pair = tuple[str, str]  # names of two photographs, in order
 
 # At the end of a line; in the time of its length, however many blanks or digits it has.
 SCORE = re.compile(r"(?<![\s,])[\s,]+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?$")
-MAX_SUGGESTIONS = 8  # words of a line for which names that are like them are looked for
-LONGEST_LINE = 1 << 13  # characters: systems have no longer paths than half of it
-AT_ONCE = 1 << 16  # pairs that are given names together
-USUAL_IMAGES_IN_MEMORY = 40  # with 13,000 features each, while pairs are gone through
+# Words of a line for which names that are like them are looked for; display
+MAX_SUGGESTIONS = 8
+# Characters: systems have no longer paths than half of it; format
+LONGEST_LINE = 1 << 13
+AT_ONCE = 1 << 16  # pairs that are given names together; resource
+# With 13,000 features each, while pairs are gone through; resource
+USUAL_IMAGES_IN_MEMORY = 40
 
 
 class PairList(Sequence[Pair]):
@@ -80,16 +83,17 @@ class PairOptions(Options):
     """``exhaustive``: all pairs. ``retrieval``: images whose descriptors are alike as a whole.
     ``gps``: images taken near to each other. ``sequence``: images that follow
     each other by name."""
-    num_neighbors: Annotated[int, within(1, 1_000_000)] = 20
+    num_neighbors: Annotated[int, within(1, 1_000_000)] = 20  # resource
     """Of each image: on average, by retrieval, and half as many at least; at most, by gps; before
     and after it, in a sequence."""
-    max_distance_m: Annotated[float, within(0.0, 1e9)] = 100.0
+    max_distance_m: Annotated[float, within(0.0, 1e9)] = 100.0  # COLMAP's
     """Between positions of ``gps``; in their own unit where they are not longitude and latitude."""
     match_list_path: str = ""
     """List of pairs, two names per line; takes the place of ``exhaustive``."""
 
 
-CANDIDATES_PER_NEIGHBOR = 5  # times as many may an image have as images have on average
+# Times as many may an image have as images have on average; resource
+CANDIDATES_PER_NEIGHBOR = 5
 
 
 def exhaustive_pairs(names: Sequence[str]) -> list[Pair]:

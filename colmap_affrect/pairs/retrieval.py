@@ -17,12 +17,13 @@ from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.pairs.lists import Pair, most_similar_pairs
 from colmap_affrect.progress import Progress
 
-NUM_WORDS = 256
-# The vocabulary of larger sets is built from that many of their images
+NUM_WORDS = 256  # resource
+# The vocabulary of larger sets is built from that many of their images; resource
 NUM_SAMPLED_IMAGES = 512
-NUM_SAMPLES = 1 << 15  # descriptors that the vocabulary is built from
-NUM_ITERATIONS = 10
-VECTORS_AT_ONCE = 512  # compared with as many others at a time, which bounds memory
+NUM_SAMPLES = 1 << 15  # descriptors that the vocabulary is built from; resource
+NUM_ITERATIONS = 10  # resource
+# Compared with as many others at a time, which bounds memory; resource
+VECTORS_AT_ONCE = 512
 
 
 def build_vocabulary(samples: Singles, random: np.random.Generator) -> Singles:

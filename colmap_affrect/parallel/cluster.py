@@ -33,11 +33,12 @@ from colmap_affrect.parallel.executor import Result, Task, in_order
 if TYPE_CHECKING:
     from distributed import Client, Future, Security
 
-CONNECT_TIMEOUT_S = 10.0
-CLOSE_TIMEOUT_S = 5.0
-POLL_S = 1.0  # that a result is waited for before somebody looks whether the cluster is there
-TRANSFER_S = 60.0  # that a finished result may take to come here
-# One that is being worked on and one that waits, so that no worker has to
+CONNECT_TIMEOUT_S = 10.0  # resource
+CLOSE_TIMEOUT_S = 5.0  # resource
+# That a result is waited for before somebody looks whether the cluster is there; resource
+POLL_S = 1.0
+TRANSFER_S = 60.0  # that a finished result may take to come here; resource
+# One that is being worked on and one that waits, so that no worker has to; resource
 TASKS_PER_THREAD = 2
 PACKAGES = (
     "colmap-affrect",

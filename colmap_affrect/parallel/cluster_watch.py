@@ -14,11 +14,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-ASK_TIMEOUT_S = 3.0  # that a scheduler has to answer
-ASK_EVERY_S = 1.0  # at most
-SILENT_S = 15.0  # since a worker was last heard of, which it is every second or so
-WARN_AFTER_S = 5.0  # without a scheduler, or a worker that is not silent
-GIVE_UP_AFTER_S = 35.0  # the same: a nanny starts a lost worker again long before
+ASK_TIMEOUT_S = 3.0  # that a scheduler has to answer; resource
+ASK_EVERY_S = 1.0  # at most; resource
+# Since a worker was last heard of, which it is every second or so; resource
+SILENT_S = 15.0
+WARN_AFTER_S = 5.0  # without a scheduler, or a worker that is not silent; resource
+# The same: a nanny starts a lost worker again long before; resource
+GIVE_UP_AFTER_S = 35.0
 
 
 class ClusterWatch:

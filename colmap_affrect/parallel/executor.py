@@ -19,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 import cv2
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-ASSUMED_MEMORY_BYTES = 8 << 30  # of systems that do not say what they have
+ASSUMED_MEMORY_BYTES = 8 << 30  # of systems that do not say what they have; resource
 _loaded_libraries = cache(ThreadpoolController)
 
 Task = TypeVar("Task")

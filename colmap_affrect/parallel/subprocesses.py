@@ -7,8 +7,9 @@ import sys
 import threading
 import time
 
-PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent dies
-WATCH_S = 0.5  # elsewhere: how often a process looks whether its parent lives
+# Linux: the signal that a process gets when its parent dies; format
+PR_SET_PDEATHSIG = 1
+WATCH_S = 0.5  # elsewhere: how often a process looks whether its parent lives; resource
 
 
 def end_with(parent: int) -> None:

@@ -21,7 +21,7 @@ from colmap_affrect.project.regular_files import open_regular, read_regular
 
 logger = logging.getLogger(__name__)
 
-PAGE_BYTES = 4096
+PAGE_BYTES = 4096  # format
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
 NEW_SUFFIX = (
     ".affrect-new"  # of files that are being written; a killed program leaves them
@@ -30,7 +30,7 @@ JOURNAL_MARK = b"AFFRECT2"
 JOURNAL_HEADER = struct.Struct("<8sQQ")
 """Mark, number of old bytes that stay unless a page changes them, and size of the file; numbered
 pages follow, and a SHA-256."""
-SHA256_BYTES = 32
+SHA256_BYTES = 32  # format
 
 
 def replace_text(path: Path, text: str | Iterable[str]) -> None:

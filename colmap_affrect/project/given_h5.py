@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from colmap_affrect.errors import OptionError, StoreError, damage
 
 MAX_VALUES = 1 << 28  # an array of more values is taken for damage, and not read
-LARGE_BYTES = 1 << 26  # an array of so many may have been declared and never written
-MOST_COMPRESSED = 1100  # deflate makes no array smaller than by this factor
-MAX_DEPTH = 100  # of groups in groups; names of images have fewer folders
+# An array of so many may have been declared and never written; resource
+LARGE_BYTES = 1 << 26
+MOST_COMPRESSED = 1100  # deflate makes no array smaller than by this factor; format
+MAX_DEPTH = 100  # of groups in groups; names of images have fewer folders; damage
 MEND = "make it again with the program that wrote it"
 
 

@@ -19,7 +19,7 @@ Size = tuple[int, int]  # width and height in px
 Cell = tuple[int, int]  # column and row
 
 NOTHING_TO_GO_ON_FROM = 1.0
-"""Score of models below which not one relative pose is expected to be right."""
+"""Score of models below which not one relative pose is expected to be right; theory."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Begun:
 
 
 @dataclass(frozen=True)
-class LookedAt:
+class LearnedModels:
     """What models of learned matches are worth."""
 
     of_set: str  # digest of the pairs, and of what is said by hand
@@ -67,9 +67,9 @@ class MatchState:
     """Digest of the list of which there was a model before pairs were matched again."""
     effort: EffortName | None = None
     """How much was tried for images to match again."""
-    learning: Begun | None = None
+    learned_matching: Begun | None = None
     """What learned matching is for, whose matches are kept beside those in use."""
-    looked_at: LookedAt | None = None
+    learned_models: LearnedModels | None = None
     """What models of these matches are worth."""
     step: Begun | None = None
     """The step of escalation that has begun and not ended."""

@@ -34,12 +34,13 @@ MARKS = {
     "config.toml": b"format_version",
     "run.log": b"colmap-affrect",
 }  # files of ours begin so
-LONGEST_NAME = 255  # bytes that file systems take
+LONGEST_NAME = 255  # bytes that file systems take; format
 MAX_NAME_BYTES = (
     LONGEST_NAME - 35
-)  # there has to be room for what is beside it meanwhile
-SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
-BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
+)  # there has to be room for what is beside it meanwhile; format
+# A disk with less room may have cut off what was written last; resource
+SPARE_BYTES = 1 << 16
+BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are; format
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}  # in folders that look empty
 
 

@@ -81,8 +81,9 @@ Stage = Literal[
     "copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map"
 ]
 STAGES: tuple[str, ...] = get_args(Stage)
-MAX_VALUE = 160  # characters of a value that is told; levels of recipes have thousands
-FORMAT_VERSION = 13  # counts up when a stage records other options than before
+# Characters of a value that is told; levels of recipes have thousands; display
+MAX_VALUE = 160
+FORMAT_VERSION = 13  # counts up when a stage records other options than before; format
 MADE_FROM = "made_from"  # digests of given files
 MAPPED = (
     "mapped"  # what the models that are there were made from, and how many they are

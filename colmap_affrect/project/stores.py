@@ -41,9 +41,9 @@ from colmap_affrect.project.line_report import (
 from colmap_affrect.project.match_state import STATE_JSON, MatchState, Names, Worth
 from colmap_affrect.project.record import Content, stamp_of
 
-MAX_INT16 = 32767
+MAX_INT16 = 32767  # format
 NOT_KNOWN = Content()
-PAIRS_PER_WRITE = 64  # a run that is ended loses at most as many
+PAIRS_PER_WRITE = 64  # a run that is ended loses at most as many; resource
 STATE = "state"  # attribute of the file of matches
 
 Entries = dict[str, tuple[Content, int, tuple[int, int]]]

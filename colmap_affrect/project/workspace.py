@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 FILES_OF_MODEL = {
     "cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin", "summary.json",
 }  # fmt: skip
-LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends
+LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends; resource
 OWN_STEMS = {  # how names of files and folders begin that are written here
     "cameras", "config", "database", "features", "guided", "matches", "methods", "pairs",
     "report", "run", "shared", "sparse",

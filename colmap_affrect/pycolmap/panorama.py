@@ -18,7 +18,19 @@ def reconstruct(
     output_path: str | PathLike[str],
     options: "PanoramaReconstructionOptions | None" = None,  # noqa: F405
 ) -> dict[int, pycolmap.Reconstruction]:
-    """Reconstruct panoramas by views of them, as pycolmap; ``SPHERICAL`` is an AffrectError."""
+    """Reconstruct panoramas by views of them, as pycolmap does.
+
+    Args:
+        input_image_path: folder of the panoramas.
+        output_path: folder of the views, the database and the models.
+        options: pycolmap's.
+
+    Returns:
+        The models, by number.
+
+    Raises:
+        AffrectError: features are ``SPHERICAL``.
+    """
     return dict(_copy.reconstruct(Path(input_image_path), Path(output_path), options))
 
 

@@ -104,7 +104,15 @@ def plan_whole_image(
         matrix, canvas_size = fit_canvas(
             linear, image_corners(image_size), margin_px=0.0
         )
-        items.append(Rectification(matrix, canvas_size, None, tilt, angle))
+        items.append(
+            Rectification(
+                rectified_from_image=matrix,
+                canvas_size=canvas_size,
+                region=None,
+                tilt=tilt,
+                tilt_angle_rad=angle,
+            )
+        )
     return RectificationPlan(image_size, tuple(items))
 
 
@@ -113,9 +121,9 @@ class DenseShapesOptions(base.CoverOptions):
 
     name: Literal["dense-shapes"] = "dense-shapes"
     warps: ClassVar[base.Warps] = "some"
-    min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.02
+    min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.02  # judged
     """Regions of a smaller share of the image are not warped."""
-    min_part_frac: Annotated[float, within(0.0, 1.0)] = 0.002
+    min_part_frac: Annotated[float, within(0.0, 1.0)] = 0.002  # judged
     """A region in several places is warped piece by piece, and pieces of a smaller share of the
     image are left out. 0: all of a region in one warp (the paper)."""
 

@@ -77,7 +77,13 @@ class AffineWarpOptions(RectifierOptions):
         )
         matrix, canvas_size = fit_canvas(linear, region.outline(), MARGIN_PX)
         return Rectification(
-            matrix, canvas_size, region.mask, tilt, angle_rad, region.origin, segment_id
+            rectified_from_image=matrix,
+            canvas_size=canvas_size,
+            region=region.mask,
+            tilt=tilt,
+            tilt_angle_rad=angle_rad,
+            region_origin=region.origin,
+            segment_id=segment_id,
         )
 
 
@@ -94,7 +100,7 @@ class CoverOptions(AffineWarpOptions):
     """Shapes of a larger tilt neither vote nor count. Paper: 5.8."""
     covered_frac: Annotated[float, within(0.0, 1.0)] = 0.95
     """Share of the shapes that the balls must hold. Paper: 0.95."""
-    max_num_rectifications: Annotated[int, within(0, 192)] = 8
+    max_num_rectifications: Annotated[int, within(0, 192)] = 8  # resource
     """Upper bound on the covering maps."""
 
     def cover(self, metrics: Floats, votes: Floats | None = None) -> Cover:

@@ -45,17 +45,18 @@ class PlaneOptions(Options):
 
     num_candidates: Annotated[int, within(10, 100_000)] = 500
     """Candidate normals, on a spiral over the whole sphere. Paper: 500."""
-    bin_angle_deg: Annotated[float, within(1.0, 89.0)] = 35.0
+    bin_angle_deg: Annotated[float, within(1.0, 89.0)] = 35.0  # judged
     """Normals at most this far from a candidate vote for it."""
+    # Theory: walls are perpendicular
     min_separation_deg: Annotated[float, within(0.0, 180.0)] = 87.5
     """Planes are at least this far apart."""
-    max_num_planes: Annotated[int, within(1, 100)] = 3
+    max_num_planes: Annotated[int, within(1, 100)] = 3  # theory
     """Most planes of a photograph."""
-    min_votes_frac: Annotated[float, within(0.0, 1.0)] = 0.15
+    min_votes_frac: Annotated[float, within(0.0, 1.0)] = 0.15  # judged
     """Share of the pixels that a plane must have."""
-    max_angle_deg: Annotated[float, within(0.0, 85.0)] = 75.0
+    max_angle_deg: Annotated[float, within(0.0, 85.0)] = 75.0  # judged
     """Planes seen at a larger angle are not rectified."""
-    min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.03
+    min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.03  # judged
     """Connected regions of a smaller share of the image are not rectified."""
 
 
@@ -91,7 +92,9 @@ class DepthPlanes(WithInputs):
         outside = None
         if self.options.keep_original == "outside":
             outside = ~_union(segments, photograph.size)
-        return RectificationPlan(photograph.size, tuple(items), outside)
+        return RectificationPlan(
+            image_size=photograph.size, items=tuple(items), original_region=outside
+        )
 
 
 def planar_segments(

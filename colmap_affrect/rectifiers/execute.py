@@ -25,9 +25,10 @@ from colmap_affrect.images.warping import mask_values, warp, warp_mask
 DUPLICATE_RADIUS_SIGMAS = 0.5
 """Distance of the same feature in the image and in a warp, in its sigmas; judged."""
 MAX_DUPLICATE_RADIUS_PX = 4.0
-"""Largest such distance that is searched: larger features rarely have a duplicate; judged."""
+"""Largest such distance that is searched: larger features rarely have a duplicate; resource."""
 SAME_SCALE_RATIO = 2 ** (1 / 3)
-"""Ratio of the scales of duplicates: one layer of a scale space with three layers per octave."""
+"""Ratio of the scales of duplicates: one layer of a scale space with three layers per octave
+(theory)."""
 
 
 def extract_rectified(

@@ -25,11 +25,12 @@ from colmap_affrect.rectifiers.base import RectifierOptions, Warps, WithInputs
 from colmap_affrect.rectifiers.depth_planes import connected_regions
 from colmap_affrect.rectifiers.regions import homography_rectification
 
-MAP_SIZE_PX = 160  # longer side of the maps of where segments lie
-REACH = 0.04  # longer sides; a segment tells of a plane about so far around it
-# Of segments, in units of a single long one that runs through the place
+MAP_SIZE_PX = 160  # longer side of the maps of where segments lie; resource
+REACH = 0.04  # longer sides; a segment tells of a plane about so far around it; judged
+# Of segments, in units of a single long one that runs through the place; judged
 MIN_DENSITY = 0.3
-PAIRS = tuple(itertools.combinations(range(3), 2))  # of directions, which span a plane
+# Of directions, which span a plane; theory
+PAIRS = tuple(itertools.combinations(range(3), 2))
 
 
 class LinePlanesOptions(RectifierOptions):
@@ -37,10 +38,12 @@ class LinePlanesOptions(RectifierOptions):
 
     name: Literal["lines"] = "lines"
     warps: ClassVar[Warps] = "some"
-    min_angle_deg: Annotated[float, within(0.0, 85.0)] = 30.0
+    min_angle_deg: Annotated[float, within(0.0, 85.0)] = 30.0  # judged
     """Planes seen at a smaller angle from the front, in the middle of a region, are not warped."""
+    # Same as PlaneOptions.max_angle_deg
     max_angle_deg: Annotated[float, within(0.0, 85.0)] = 75.0
     """Planes seen at a larger angle are not warped."""
+    # Same as PlaneOptions.min_region_frac
     min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.03
     """Connected regions of a smaller share of the image are not warped."""
 
@@ -63,7 +66,12 @@ class LinePlanes(WithInputs):
             (third,) = {0, 1, 2} - {first, second}
             for sign in (-1.0, 1.0):  # a camera between two walls sees both sides
                 normal = sign * explanation.rotation[third]
-                items += self._warps(labels == label, normal, camera, len(items))
+                items += self._warps(
+                    is_of_plane=labels == label,
+                    normal=normal,
+                    camera=camera,
+                    first_number=len(items),
+                )
         return RectificationPlan(photograph.size, tuple(items))
 
     def _warps(

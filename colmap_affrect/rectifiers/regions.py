@@ -13,7 +13,7 @@ from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 MARGIN_PX = 16.0  # surroundings of a region that its descriptors may see, in px of the warp; judged
 CANVAS_RATIO = 2.0
 """Area of the canvas of a homography, without margin, over that of the region (the authors'
-value)."""
+value); paper."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ def homography_rectification(
     (mapped,) = transform_lafs(matrix, laf[None])
     tilt, angle_rad = tilts_from_metrics(unit_metrics(mapped[:, :2]))
     return Rectification(
-        matrix,
-        canvas_size,
-        region.mask,
-        float(tilt),
-        float(angle_rad),
-        region.origin,
-        segment_id,
+        rectified_from_image=matrix,
+        canvas_size=canvas_size,
+        region=region.mask,
+        tilt=float(tilt),
+        tilt_angle_rad=float(angle_rad),
+        region_origin=region.origin,
+        segment_id=segment_id,
     )

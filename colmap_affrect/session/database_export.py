@@ -9,7 +9,7 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database_copy import copy_without_features
-from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
+from colmap_affrect.colmap.image_import import import_images, record_cameras
 from colmap_affrect.pairs.lists import Pair, PairList
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context, Inputs

@@ -28,9 +28,10 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.argument_types import checks_arguments
 
-SIFT_SIZE = 128  # values of the one kind of descriptors that whole numbers stand for
-IMAGES_IN_MEMORY = 60
-USUAL_FEATURES = 8000  # of an image, to tell how much there is to compare
+# Values of the one kind of descriptors that whole numbers stand for; COLMAP's
+SIFT_SIZE = 128
+IMAGES_IN_MEMORY = 60  # resource
+USUAL_FEATURES = 8000  # of an image, to tell how much there is to compare; resource
 
 Arrays = tuple[Floats, Any]
 """(N, 2) keypoints in px, and the (N, D) descriptors of an image."""

@@ -20,7 +20,8 @@ from colmap_affrect.colmap.database_copy import (
     has_matches,
     read_names,
 )
-from colmap_affrect.colmap.initial_cameras import InitialCameras, record_cameras
+from colmap_affrect.colmap.image_import import record_cameras
+from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.photographs import CameraOptions

@@ -30,8 +30,8 @@ from colmap_affrect.session.context import Context
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import extracted_px
 
-MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
-NOTHING: Indices = np.zeros((0, 2), np.int64)
+MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches; judged
+NOTHING: Indices = np.zeros((0, 2), np.int64)  # theory
 
 
 def guide(context: Context, options: GuidedOptions | None = None) -> StageReport:

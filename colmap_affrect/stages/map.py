@@ -23,7 +23,8 @@ from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 
-NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
+# Pairs that are named for each image that was not registered; display
+NUM_BEST_PAIRS = 3
 
 
 def map_images(
@@ -87,7 +88,7 @@ def _models_before(
     models = list[MappedModel]()
     for folder, summary in zip(model_folders(sparse_path), summaries, strict=True):
         model = pycolmap.Reconstruction(str(folder))
-        models.append(MappedModel(model, summary.bridges, summary.moves))
+        models.append(MappedModel(model, summary.bridges, summary.hypotheses))
     return models
 
 

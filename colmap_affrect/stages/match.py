@@ -49,14 +49,15 @@ from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
 
-SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
-# Of the features matched first: photographs of different things have up to 76
+SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each; resource
+# Of the features matched first: photographs of different things have up to 76; measured
 MANY_MATCHES = 300
-NUM_TRIED = 40  # pairs matched by all features before many are
-MIN_GROWTH = 1.1  # of the matches that confirm each other, by all features; small scans have none
-NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others
-CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
-# Of a feature ready for matching, with descriptors of 128 and coarse ones
+NUM_TRIED = 40  # pairs matched by all features before many are; resource
+# Of the matches that confirm each other, by all features; small scans have none; judged
+MIN_GROWTH = 1.1
+NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others; judged
+CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process; resource
+# Of a feature ready for matching, with descriptors of 128 and coarse ones; measured
 BYTES_PER_FEATURE = 870
 
 Found = TypeVar("Found")

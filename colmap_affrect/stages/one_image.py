@@ -49,7 +49,8 @@ from colmap_affrect.rectifiers.base import (
 from colmap_affrect.rectifiers.execute import extract_rectified
 from colmap_affrect.session.context import Resources, require_same_files
 
-MIN_RECTIFIABLE_PX = 32  # shorter side; else no block would see its surroundings
+# Shorter side; else no block would see its surroundings; theory
+MIN_RECTIFIABLE_PX = 32
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from colmap_affrect.session.database_export import write_images_and_keypoints
 
 logger = logging.getLogger(__name__)
 
-MANY_IMAGES = 300
+MANY_IMAGES = 300  # resource
 MANY_PAIRS = (
     "all pairs of %d images are %d; --pairs retrieval matches the promising ones only "
     "(see --num-neighbors)"

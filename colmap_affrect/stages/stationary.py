@@ -28,27 +28,29 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
-# Of the longer side; less is no motion: scans are not cut to the pixel
+# Of the longer side; less is no motion: scans are not cut to the pixel; judged
 MAX_MOTION_FRAC = 0.005
-NUM_CELLS = 48  # cells along the longer side
-MIN_NUM_PAIRS = 3
+NUM_CELLS = 48  # cells along the longer side; resource
+MIN_NUM_PAIRS = 3  # theory
+# Theory
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
-MIN_SHARE = 0.5  # of the pairs that have a match in a cell
-MIN_PX = 1.0
+MIN_SHARE = 0.5  # of the pairs that have a match in a cell; theory
+MIN_PX = 1.0  # theory
 MIN_FRAC = 0.001
 """Error of what stands still, px, or part of the longer side if that is more: large photographs are
-shrunk before features are found in them."""
-CONNECTED = 1  # cells by which those are grown that are looked at together
-MIN_EVIDENCE = 3.0  # nats, twenty to one, that a place stands still to the pixel
-# Where more of what is matched never moves, the camera stands still
+shrunk before features are found in them; judged."""
+CONNECTED = 1  # cells by which those are grown that are looked at together; theory
+# Nats, twenty to one, that a place stands still to the pixel; theory
+MIN_EVIDENCE = 3.0
+# Where more of what is matched never moves, the camera stands still; theory
 MAX_SHARE_OF_PHOTOGRAPH = 0.5
-# Matches of a pair that move together elsewhere, which may make a model
+# Matches of a pair that move together elsewhere, which may make a model; COLMAP's min_num_matches
 MIN_MOVING = 15
 MAX_SHARE_BESIDE = 0.2
 """Of all cells. Matches from beside one place to beside another, or from one to another, are left
 out only where these cells are so few: one in 25 of the scene's goes with them then, and of a
-watermark all over, or before a background, all would."""
+watermark all over, or before a background, all would; judged."""
 
 MIN_SHARE_OF_BACKGROUND = 0.8
 """Matches that stand still, of all matches of one photograph in a cell that shows the background

@@ -142,7 +142,7 @@ def spent(context: Context) -> Row:
     models = escalation.state.models()
     situation = escalation.state.situation(escalation.state.weights(models), models)
     names = [level.name for level in situation.levels]
-    looked_at = context.matches.state.looked_at
+    learned_models = context.matches.state.learned_models
     return {
         "first_model_s": round(situation.first_model_s, 1),
         "spent_s": round(situation.spent_s(), 1),
@@ -153,11 +153,12 @@ def spent(context: Context) -> Row:
         },
         "hope": round(
             max(
-                situation.best_at(k, math.inf).all_photographs for k in situation.usable
+                situation.best_step(k, math.inf).all_photographs
+                for k in situation.usable
             ),
             3,
         ),
-        "scores": vars(looked_at) if looked_at else None,
+        "scores": vars(learned_models) if learned_models else None,
     }
 
 

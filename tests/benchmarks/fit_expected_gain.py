@@ -21,6 +21,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +139,7 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
             }
             for pair in chosen
         }
-        for number in escalation.levels:
+        for number in range(1, len(context.extraction.levels)):
             pairs = chosen if number < 3 else chosen[:NUM_SLOW_PAIRS]
             level = context.extraction.levels[number]
             names = sorted({name for pair in pairs for name in pair})
@@ -274,12 +275,16 @@ def main() -> None:
             chance[out] = 1 / (1 + np.exp(-odds))
         kind = kind_of(levels[number])
         weights = np.round(fitted(values, outcome), 2).tolist()
-        content[kind]["coefficients"] = dict(zip(PRIOR, weights, strict=True))
+        content["levels"][kind]["coefficients"] = dict(zip(PRIOR, weights, strict=True))
         brier = np.mean((chance - outcome) ** 2)
         mean = np.var(outcome)
         print(
             f"{kind}: {len(found) // NUM_ROWS} pairs, Brier {brier:.3f} (mean alone {mean:.3f})"
         )
+    content["made"] = (
+        f"{datetime.now(UTC):%Y-%m-%d} by tests/benchmarks/fit_expected_gain.py"
+    )
+    content["data"] = f"{NUM_PAIRS} weak pairs at most of each of {len(observed)} sets"
     arguments.output_path.write_text(json.dumps(content, indent=1) + "\n")
 
 

@@ -21,7 +21,7 @@ from machine import describe_machine, parser_of, span, table
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.initial_cameras import import_images
+from colmap_affrect.colmap.image_import import import_images
 from colmap_affrect.colmap.verification import (
     VerificationOptions,
     verified_pairs,

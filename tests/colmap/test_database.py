@@ -18,7 +18,7 @@ from colmap_affrect.colmap.database import (
     write_keypoints,
     write_matches,
 )
-from colmap_affrect.colmap.initial_cameras import import_images
+from colmap_affrect.colmap.image_import import import_images
 from colmap_affrect.data import Rectification
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.features.sift import RootSift, SiftOptions

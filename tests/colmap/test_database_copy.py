@@ -26,7 +26,7 @@ from colmap_affrect.colmap.database_copy import (
     open_copy,
     schema_version,
 )
-from colmap_affrect.colmap.initial_cameras import import_images
+from colmap_affrect.colmap.image_import import import_images
 from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.photographs import CameraOptions

@@ -16,11 +16,8 @@ from colmap_affrect.colmap.cameras import (
     write_camera_records,
 )
 from colmap_affrect.colmap.database import camera_matrix, open_database
-from colmap_affrect.colmap.initial_cameras import (
-    InitialCameras,
-    import_images,
-    record_cameras,
-)
+from colmap_affrect.colmap.image_import import import_images, record_cameras
+from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.session.view_graph import ViewGraph

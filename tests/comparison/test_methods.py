@@ -8,7 +8,7 @@ import pytest
 from small_scene import write_photographs
 
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.initial_cameras import import_images
+from colmap_affrect.colmap.image_import import import_images
 from colmap_affrect.comparison.method_run import extract_sift, match_sift
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.errors import AffrectError, OptionError

@@ -20,23 +20,23 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.escalation import alternatives, climb
 from colmap_affrect.escalation.alternatives import (
     Choice,
+    adopt_chosen_models,
     best_score,
     choose_learned,
-    forget_others,
-    is_to_be_looked_at,
     keep_best,
-    look_at_learned,
-    looked_at_before,
+    learned_models_on_record,
+    map_learned_matches,
+    needs_learned_models,
     present_score,
+    remove_alternatives,
     restore_best,
     score,
-    take_over_chosen,
 )
 from colmap_affrect.escalation.escalate import Escalation, begin, matched_again
 from colmap_affrect.escalation.set_state import SetState
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
-from colmap_affrect.project.match_state import Begun, LookedAt
+from colmap_affrect.project.match_state import Begun, LearnedModels
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
@@ -74,8 +74,8 @@ def matched(
         photos, tmp_path_factory.mktemp("matched") / "out", recipe.name
     )
     escalation, _ = begin(Context(workspace), recipe.escalate)
-    escalation.matches.keep(learning=Begun(1, tuple(escalation.state.pairs)))
-    assert escalation.learn() == len(escalation.state.pairs)
+    escalation.matches.keep(learned_matching=Begun(1, tuple(escalation.state.pairs)))
+    assert escalation.match_learned() == len(escalation.state.pairs)
     return workspace
 
 
@@ -168,18 +168,20 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     asked = with_models(monkeypatch, found=better, there=[there])
     learned = context.matches.learned(list(escalation.state.pairs))
     before = escalation.state.states()
-    look_at_learned(escalation, mapper)
+    map_learned_matches(escalation, mapper)
     assert len(asked) == 1
     assert not choose_learned(
         escalation, at_once=True
     )  # more may be tried without them
     assert levels(context) == {0}
     assert choose_learned(escalation, at_once=False)
-    looked_at = looked_at_before(context)
-    assert looked_at
-    assert (looked_at.score, looked_at.score_without) == pytest.approx((2.4, 1.4))
-    assert looked_at.is_chosen
-    assert present_score(context) == looked_at.score
+    learned_models = learned_models_on_record(context)
+    assert learned_models
+    assert (learned_models.score, learned_models.score_without) == pytest.approx(
+        (2.4, 1.4)
+    )
+    assert learned_models.is_chosen
+    assert present_score(context) == learned_models.score
     assert (
         context.matches.state.modelled == context.matches.state.listed
     )  # are gone on from
@@ -203,7 +205,7 @@ def test_learned_models_that_are_sure_of_all_are_chosen_at_once(
         UNSURE, registered_names=NAMES, probabilities=dict.fromkeys(NAMES, 0.95)
     )
     with_models(monkeypatch, found=sure, there=[UNSURE])
-    look_at_learned(escalation_of(context), mapper)
+    map_learned_matches(escalation_of(context), mapper)
     assert choose_learned(escalation_of(context), at_once=True)
     assert levels(context) == {1}
 
@@ -212,7 +214,7 @@ def test_any_learned_model_is_chosen_at_once_where_there_is_none(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with_models(monkeypatch, found=UNSURE, there=())
-    look_at_learned(escalation_of(context), mapper)
+    map_learned_matches(escalation_of(context), mapper)
     assert choose_learned(escalation_of(context), at_once=True)
 
 
@@ -227,7 +229,7 @@ def test_better_learned_models_are_gone_on_from_where_no_pose_is_expected_to_be_
     there = replace(UNSURE, probabilities=dict.fromkeys(NAMES, probability))
     better = replace(UNSURE, probabilities=dict.fromkeys(NAMES, 0.8))
     with_models(monkeypatch, found=better, there=[there])
-    look_at_learned(escalation_of(context), mapper)
+    map_learned_matches(escalation_of(context), mapper)
     assert choose_learned(escalation_of(context), at_once=True) == is_chosen
 
 
@@ -236,7 +238,7 @@ def test_learned_models_that_are_no_better_change_nothing(
 ) -> None:
     with_models(monkeypatch, found=UNSURE, there=[UNSURE])
     before = database_content(context.workspace.database)
-    look_at_learned(escalation_of(context), mapper)
+    map_learned_matches(escalation_of(context), mapper)
     assert not choose_learned(escalation_of(context), at_once=True)
     assert not choose_learned(escalation_of(context), at_once=False)
     assert levels(context) == {0}
@@ -319,7 +321,7 @@ def test_best_models_and_their_matches_come_back(
         map_images(context, mapper, goes_on=True)[0].num_done == 0
     )  # nothing is mapped anew
     assert not restore_best(escalation)
-    forget_others(context)
+    remove_alternatives(context)
     assert best_score(context) == 0.0
     assert not workspace.best.exists()
 
@@ -346,7 +348,7 @@ def test_run_killed_while_it_goes_back_does_so_afterwards(
         with pytest.raises(KeyboardInterrupt):
             restore_best(escalation)
     assert escalation.matches.state.follows
-    take_over_chosen(escalation)
+    adopt_chosen_models(escalation)
     assert not escalation.matches.state.follows
     assert read_summaries(workspace.sparse) == summaries
     after = database_content(workspace.database)
@@ -366,11 +368,13 @@ def test_what_was_looked_at_is_of_the_listed_pairs_and_of_what_is_said_by_hand(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with_models(monkeypatch, found=UNSURE, there=[UNSURE])
-    look_at_learned(escalation_of(context), mapper)
-    assert looked_at_before(context)
-    assert not looked_at_before(replace(context, by_hand=ByHand(left_out=(NAMES[0],))))
+    map_learned_matches(escalation_of(context), mapper)
+    assert learned_models_on_record(context)
+    assert not learned_models_on_record(
+        replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
+    )
     context.matches.keep(listed="another list")
-    assert not looked_at_before(context)
+    assert not learned_models_on_record(context)
 
 
 def test_images_that_are_left_out_need_nothing_and_are_no_lack(
@@ -383,10 +387,10 @@ def test_images_that_are_left_out_need_nothing_and_are_no_lack(
     with_models(monkeypatch, found=sure, there=[UNSURE])
     said = replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
     assert NAMES[0] not in escalation_of(said).state.weights([UNSURE])
-    look_at_learned(escalation_of(said), mapper)
-    looked_at = looked_at_before(said)
-    assert looked_at
-    assert looked_at.is_sure
+    map_learned_matches(escalation_of(said), mapper)
+    learned_models = learned_models_on_record(said)
+    assert learned_models
+    assert learned_models.is_sure
 
 
 def test_learning_that_was_killed_goes_on_with_the_same_pairs(
@@ -395,32 +399,32 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     """Images may have got features: what is needed would look different."""
     escalation = escalation_of(context)
     pairs = list(escalation.state.pairs)
-    context.matches.keep(learning=None)
+    context.matches.keep(learned_matching=None)
     monkeypatch.setattr(SetState, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
-    assert not escalation.plan_learning()  # all have learned matches
+    assert not escalation.plan_learned_matching()  # all have learned matches
     context.matches.remove(pairs=pairs)
     match(context)
     escalation.write()
-    assert escalation.plan_learning()
+    assert escalation.plan_learned_matching()
     monkeypatch.setattr(SetState, "weights", lambda *_: {})
-    assert escalation.plan_learning()
-    assert not escalation.is_learned
+    assert escalation.plan_learned_matching()
+    assert not escalation.has_all_learned_matches
     monkeypatch.setattr(Escalation, "is_over_time", True)
-    assert escalation.learn() == 0
+    assert escalation.match_learned() == 0
     monkeypatch.setattr(Escalation, "is_over_time", False)
-    assert escalation.learn() == len(pairs)
-    assert escalation.is_learned
+    assert escalation.match_learned() == len(pairs)
+    assert escalation.has_all_learned_matches
 
 
 def test_matches_of_pairs_that_are_removed_take_learned_ones_along(
     context: Context,
 ) -> None:
     pairs = list(escalation_of(context).state.pairs)
-    context.matches.keep(looked_at=LookedAt("set", 1.0, True, 0.5))
+    context.matches.keep(learned_models=LearnedModels("set", 1.0, True, 0.5))
     context.matches.remove(pairs=pairs[:1])
     assert not context.matches.has(pairs).any()
-    assert context.matches.state.looked_at is None
-    assert context.matches.state.learning is None
+    assert context.matches.state.learned_models is None
+    assert context.matches.state.learned_matching is None
 
 
 @pytest.mark.long
@@ -443,9 +447,9 @@ def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
     with workspace.locked():
         reports = climb.climb(context, mapper, recipe)
         assert reports[-1].num_done == len(escalation_of(context).state.pairs)
-        looked_at = looked_at_before(context)
-        assert looked_at
-        assert looked_at.score > 1.0
+        learned_models = learned_models_on_record(context)
+        assert learned_models
+        assert learned_models.score > 1.0
         before = hdf5_content(workspace.matches), database_content(workspace.database)
         model = (workspace.sparse / "0" / "images.bin").stat().st_mtime_ns
         again = climb.climb(context, mapper, recipe)
@@ -468,7 +472,7 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
 ) -> None:  # fmt: skip
     """Mapping their matches a second time might end elsewhere."""
     spaces = [copy_of(matched, tmp_path / name) for name in ("whole", "killed")]
-    monkeypatch.setattr(LookedAt, "is_enough", True)
+    monkeypatch.setattr(LearnedModels, "is_enough", True)
     monkeypatch.setattr(SetState, "weights", lambda *_: {NAMES[0]: 1.0})
     monkeypatch.setattr(Escalation, "next_step", lambda _: None)
     whole, killed = (Context(space) for space in spaces)
@@ -477,12 +481,12 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
         patch.setattr(Escalation, "write", interrupted_at_third_call())
         with pytest.raises(KeyboardInterrupt):
             climb.climb(killed, mapper, recipe)
-    looked_at = read_summaries(killed.workspace.learned)
+    learned_models = read_summaries(killed.workspace.learned)
     monkeypatch.setattr(alternatives, "map_images", None)
     climb.climb(killed, mapper, recipe)
     for context in (whole, killed):
         assert levels(context) == {1}
-        assert read_summaries(context.workspace.sparse) == looked_at
+        assert read_summaries(context.workspace.sparse) == learned_models
         assert not context.workspace.learned.exists()
         assert map_images(context, mapper, goes_on=True)[0].num_done == 0
         model = pycolmap.Reconstruction(context.workspace.sparse / "0")
@@ -500,15 +504,17 @@ def test_models_of_learned_matches_that_were_removed_are_made_again(
     mapped: Workspace, mapper: Mapper, tmp_path: Path
 ) -> None:
     context = Context(copy_of(mapped, tmp_path / "out"))
-    assert is_to_be_looked_at(context)
-    look_at_learned(escalation_of(context), mapper)
-    looked_at = looked_at_before(context)
-    assert looked_at
-    forget_others(context)
-    assert is_to_be_looked_at(context) == (looked_at.score > present_score(context))
+    assert needs_learned_models(context)
+    map_learned_matches(escalation_of(context), mapper)
+    learned_models = learned_models_on_record(context)
+    assert learned_models
+    remove_alternatives(context)
+    assert needs_learned_models(context) == (
+        learned_models.score > present_score(context)
+    )
     shutil.rmtree(context.workspace.sparse)
     assert not choose_learned(escalation_of(context), at_once=False)
-    assert is_to_be_looked_at(context)
+    assert needs_learned_models(context)
 
 
 def interrupted_at_third_call() -> Callable[[Escalation], None]:

@@ -10,11 +10,11 @@ import pytest
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.escalation import expected_gain
 from colmap_affrect.escalation.expected_gain import (
-    ExpectedGain,
     PairState,
     Step,
-    gain_of,
+    StepPlanner,
     insecure_images,
+    statistics_of,
     terms,
 )
 from colmap_affrect.recipes import Level, load_recipe, recipe_names
@@ -52,27 +52,31 @@ def test_parts_come_by_size_with_lone_images() -> None:
 def test_what_hints_at_a_surface_makes_a_level_likelier_and_levels_differ(
     level: Level,
 ) -> None:
-    gain = gain_of(level)
-    few, many = (gain.chance(terms(PairState(0, count), 0, 0)) for count in (0, 10))
+    statistics = statistics_of(level)
+    few, many = (
+        statistics.chance(terms(PairState(0, count), 0, 0)) for count in (0, 10)
+    )
     assert 0.0 < few < 0.7 * many < many < 1.0
-    weak, strong = (gain.chance(terms(PairState(count), 0, 0)) for count in (15, 90))
+    weak, strong = (
+        statistics.chance(terms(PairState(count), 0, 0)) for count in (15, 90)
+    )
     assert few < weak < strong
-    assert sum(gain_of(other) == gain for other in LEVELS[1:]) == 1
+    assert sum(statistics_of(other) == statistics for other in LEVELS[1:]) == 1
 
 
 def test_levels_of_any_recipe_are_of_a_kind() -> None:
     for name in recipe_names():
         for rectifier in ("identity", "asift", "dense-shapes"):
             for level in load_recipe(name, [f"rectifier={rectifier}"]).levels:
-                assert gain_of(level).image_s > 0.0
+                assert statistics_of(level).image_s > 0.0
 
 
-def gains(
+def planner(
     inliers: dict[str, int],
     weights: dict[str, float],
     consistent: dict[str, int] | None = None,
     **given: Any,
-) -> ExpectedGain:
+) -> StepPlanner:
     """What a level may bring; ``tried`` by pair, others are optional."""
     tried = given.get("tried", {})
     states = {
@@ -85,17 +89,15 @@ def gains(
     weak = set(given.get("weakly_connected", ""))
     lacking = set(given.get("lacking", ""))
     registered = given.get("registered", "abc")
-    return ExpectedGain(states, weak, weights, sizes, [2, 4], lacking, registered, 100)
+    return StepPlanner(states, weak, weights, sizes, [2, 4], lacking, registered, 100)
 
 
-def best(
-    found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf
-) -> Step:
+def best(found: StepPlanner, level: Level = COVERS, budget_s: float = math.inf) -> Step:
     return found.best_step(1, level, 0b10, budget_s)
 
 
 def chosen(
-    found: ExpectedGain, level: Level = COVERS, budget_s: float = math.inf
+    found: StepPlanner, level: Level = COVERS, budget_s: float = math.inf
 ) -> list[str]:
     return ["".join(pair) for pair in best(found, level, budget_s).pairs]
 
@@ -114,22 +116,24 @@ INLIERS = {
 
 def test_pairs_of_images_in_need_come_by_what_hints_at_a_surface() -> None:
     hints = {"ad": 1, "bd": 8, "cd": 2}
-    assert chosen(gains(INLIERS, {"d": 1.0}, hints))[0] == "bd"
-    assert chosen(gains(INLIERS, {"e": 1.0}, hints)) == ["ae"]  # be is much less likely
-    assert chosen(gains(INLIERS, {})) == []
-    assert chosen(gains(INLIERS, {"a": 0.2})) == ["ae"]  # the others of a are strong
+    assert chosen(planner(INLIERS, {"d": 1.0}, hints))[0] == "bd"
+    assert chosen(planner(INLIERS, {"e": 1.0}, hints)) == [
+        "ae"
+    ]  # be is much less likely
+    assert chosen(planner(INLIERS, {})) == []
+    assert chosen(planner(INLIERS, {"a": 0.2})) == ["ae"]  # the others of a are strong
 
 
 def test_no_step_takes_more_than_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(expected_gain, "MAPPING_S", 0.0)
     hints = {"ad": 7, "bd": 8, "cd": 6}
-    pairs = gains(INLIERS, {"d": 1.0}, hints)
-    pair_s = gain_of(COVERS).pair_s
+    pairs = planner(INLIERS, {"d": 1.0}, hints)
+    pair_s = statistics_of(COVERS).pair_s
     assert chosen(pairs, budget_s=1.01 * pair_s) == ["bd"]
     assert chosen(pairs, budget_s=0.99 * pair_s) == []
     assert chosen(pairs, LEARNED, budget_s=1.01 * pair_s) == []  # takes longer
-    lacking = gains(INLIERS, {"d": 1.0}, hints, lacking="bd")  # features cost, too
-    with_features_s = pair_s + 2 * gain_of(COVERS).image_s
+    lacking = planner(INLIERS, {"d": 1.0}, hints, lacking="bd")  # features cost, too
+    with_features_s = pair_s + 2 * statistics_of(COVERS).image_s
     assert "bd" not in chosen(lacking, budget_s=0.99 * with_features_s)
     assert chosen(lacking, budget_s=1.01 * with_features_s) == ["bd"]
     everything = best(pairs)
@@ -141,15 +145,21 @@ def test_no_step_takes_more_than_the_budget(monkeypatch: pytest.MonkeyPatch) -> 
 def test_while_there_is_no_model_strong_pairs_and_small_parts_count_too() -> None:
     pairs = {"ab": 200, "bc": 90, "de": 90}
     weights = dict.fromkeys("abcde", 1.0)
-    none = best(gains(pairs, weights, registered="")).num_pairs
-    some = best(gains(pairs, weights, registered="abc")).num_pairs
+    none = best(planner(pairs, weights, registered="")).num_pairs
+    some = best(planner(pairs, weights, registered="abc")).num_pairs
     assert (none, some) == (3, 1)
+
+
+def test_mapping_after_a_step_takes_a_second_for_each_image() -> None:
+    step = best(planner(INLIERS, {"d": 1.0}, {"bd": 8}))
+    pairs_s = len(step.pairs) * statistics_of(COVERS).pair_s
+    assert step.seconds == pytest.approx(6 * 1.0 + pairs_s)
 
 
 def test_what_joins_a_part_counts_for_all_of_its_images() -> None:
     apart = {"ab": 200, "cd": 90, "ac": 0}
-    small = best(gains(apart, {"c": 1.0}, {"ac": 3}))
-    large = best(gains(apart, {"c": 1.0, "d": 1.0}, {"ac": 3}))
+    small = best(planner(apart, {"c": 1.0}, {"ac": 3}))
+    large = best(planner(apart, {"c": 1.0, "d": 1.0}, {"ac": 3}))
     assert (
         small.pairs == large.pairs == [("a", "c")]
     )  # and not the weak pair inside of it
@@ -164,7 +174,7 @@ def test_images_are_not_saved_twice() -> None:
         "de": 200,
     }
     likely = dict.fromkeys(many, 1000)
-    assert len(chosen(gains(many, {"f": 1.0}, likely))) < 5
+    assert len(chosen(planner(many, {"f": 1.0}, likely))) < 5
 
 
 def test_levels_that_were_tried_are_done_and_strong_pairs_but_for_weakly_connected_images() -> (
@@ -172,23 +182,23 @@ def test_levels_that_were_tried_are_done_and_strong_pairs_but_for_weakly_connect
 ):
     pairs = {"ab": 200, "bc": 90}
     weights = {"a": 1.0, "b": 1.0}
-    assert chosen(gains(pairs, weights)) == ["bc"]
-    assert "ab" in chosen(gains(pairs, weights, weakly_connected="a"))
-    assert chosen(gains(pairs, weights, weakly_connected="a", tried={"ab": 0b11})) == [
-        "bc"
-    ]
+    assert chosen(planner(pairs, weights)) == ["bc"]
+    assert "ab" in chosen(planner(pairs, weights, weakly_connected="a"))
+    assert chosen(
+        planner(pairs, weights, weakly_connected="a", tried={"ab": 0b11})
+    ) == ["bc"]
 
 
 def test_a_level_that_verified_nothing_is_less_likely_to() -> None:
-    fresh = gain_of(COVERS).chance(terms(PairState(0, 3), 0, 0))
-    assert gain_of(COVERS).chance(terms(PairState(0, 3), 0, 5)) < 0.5 * fresh
-    assert gain_of(COVERS).chance(terms(PairState(0, 3), 5, 0)) > fresh
+    fresh = statistics_of(COVERS).chance(terms(PairState(0, 3), 0, 0))
+    assert statistics_of(COVERS).chance(terms(PairState(0, 3), 0, 5)) < 0.5 * fresh
+    assert statistics_of(COVERS).chance(terms(PairState(0, 3), 5, 0)) > fresh
 
 
 def test_the_more_mapping_costs_the_more_pairs_a_step_has(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    pairs = gains(INLIERS, {"d": 1.0}, {"ad": 1, "bd": 8, "cd": 2}, lacking="c")
+    pairs = planner(INLIERS, {"d": 1.0}, {"ad": 1, "bd": 8, "cd": 2}, lacking="c")
     monkeypatch.setattr(expected_gain, "MAPPING_S", 0.0)
     assert chosen(pairs) == ["bd"]
     rate = best(pairs).rate
@@ -204,7 +214,7 @@ def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_anoth
 
     def rate(inliers: dict[str, int], registered: str = "abc") -> float:
         all_inliers = {"ab": 200, "bc": 200, **inliers}
-        pairs = gains(all_inliers, {"d": 1.0}, {"ad": 5}, registered=registered)
+        pairs = planner(all_inliers, {"d": 1.0}, {"ad": 5}, registered=registered)
         return best(pairs).rate
 
     lost, tied, tied_twice = (

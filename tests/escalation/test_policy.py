@@ -9,11 +9,17 @@ from typing import Any
 import pytest
 
 from colmap_affrect.escalation import policy
-from colmap_affrect.escalation.expected_gain import PairState, gain_of, kind_of
+from colmap_affrect.escalation.expected_gain import (
+    PairState,
+    Step,
+    kind_of,
+    statistics_of,
+)
 from colmap_affrect.escalation.policy import (
     EFFORTS,
     SMALL,
     Situation,
+    is_hopeful,
     learned_step,
     next_step,
     tried,
@@ -56,7 +62,7 @@ def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need(
     """The others are matched, too, where that takes no longer than the first model."""
     assert len(learned_step(situation()).pairs) == 10
     monkeypatch.setattr(
-        Situation, "first_model_s", 3 * gain_of(LEVELS[LEARNED]).pair_s - 0.1
+        Situation, "first_model_s", 3 * statistics_of(LEVELS[LEARNED]).pair_s - 0.1
     )
     step = learned_step(situation())
     assert step.level == LEARNED
@@ -154,26 +160,41 @@ def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one(
         for name in ("low", "normal", "high")
     ]
     assert times == [0.0, 1000.0, 5000.0]
+    high = EFFORTS["high"]
+    assert high.budget_s(1.0, has_model=True) == 600.0
+    assert high.budget_s(1.0, has_model=False) == 3600.0
+
+
+def test_levels_that_are_expected_to_save_a_fifth_of_a_photograph_are_tried() -> None:
+    pairs = [("a", "b")]
+    with_model = situation()
+    assert not is_hopeful(Step(1, pairs, all_photographs=0.1), with_model)
+    assert is_hopeful(Step(1, pairs, all_photographs=0.4), with_model)
+    without_model = situation(registered=())
+    assert is_hopeful(Step(1, pairs, all_photographs=0.1), without_model)
+    assert not is_hopeful(Step(), without_model)
 
 
 def test_what_is_spent_is_counted_but_for_learned_matching_of_small_sets() -> None:
-    assert situation().spent_s() == 0.0
-    assert done_with_learned().spent_s() == 0.0
+    assert situation().seconds_spent() == 0.0
+    assert done_with_learned().seconds_spent() == 0.0
     covers = situation(tried={"ab": 0b11})
-    gain = gain_of(LEVELS[1])
-    assert covers.spent_s() == pytest.approx(2 * gain.image_s + gain.pair_s)
+    statistics = statistics_of(LEVELS[1])
+    assert covers.seconds_spent() == pytest.approx(
+        2 * statistics.image_s + statistics.pair_s
+    )
     gone = replace(
         done_with_learned(), usable=[1, 3]
     )  # weights that are not there any more
-    assert gone.spent_s() == 0.0
+    assert gone.seconds_spent() == 0.0
     names = [f"{number:03}" for number in range(SMALL + 1)]
     large = situation(names)
     states = {
         pair: replace(s, tried=1 | 1 << LEARNED) for pair, s in large.states.items()
     }
     large = replace(large, states=states)
-    assert large.spent_s() == pytest.approx(
-        large.spent_on(LEARNED) - large.first_model_s
+    assert large.seconds_spent() == pytest.approx(
+        large.seconds_spent_at(LEARNED) - large.first_model_s
     )
 
 
@@ -190,15 +211,15 @@ def test_little_hope_ends_it_but_while_nothing_is_registered(
 
 def test_images_that_measured_frames_hold_get_no_learned_warps() -> None:
     warps = KINDS.index("learned, warps")
-    assert done_with_learned().best_at(warps, 1e9).pairs
-    assert not done_with_learned(anchored="de").best_at(warps, 1e9).pairs
+    assert done_with_learned().best_step(warps, 1e9).pairs
+    assert not done_with_learned(anchored="de").best_step(warps, 1e9).pairs
 
 
 def test_what_was_tried_and_what_was_not_is_told_by_kind() -> None:
     after = done_with_learned()
     (one,) = tried(after)
     assert (one.kind, one.num_pairs) == ("learned", 10)
-    assert one.core_s == pytest.approx(after.spent_on(LEARNED))
+    assert one.core_s == pytest.approx(after.seconds_spent_at(LEARNED))
     kinds = {one.kind: one for one in untried(after)}
     assert "learned" not in kinds
     assert kinds["measured, all tilts"].num_pairs == 7

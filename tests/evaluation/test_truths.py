@@ -246,8 +246,8 @@ def test_of_five_fundamental_matrices_the_one_of_median_error_counts(
     """The error of a matrix that shifts lines by some px in image 2 is that in both images."""
     offsets_px = (9.0, 1.0, 5.0, 3.0, 7.0)
 
-    def estimate(*given: Any) -> tuple[np.ndarray, int]:
-        seed = given[-1].random_seed
+    def estimate(*, options: ScoreOptions, **_: Any) -> tuple[np.ndarray, int]:
+        seed = options.random_seed
         return SHIFT_X @ shift(0.0, offsets_px[seed]), seed
 
     monkeypatch.setattr(truths, "estimate_matrix", estimate)

@@ -12,6 +12,7 @@ from colmap_affrect.geometry.arrays import Array, Bytes
 from colmap_affrect.geometry.parallax import (
     Size,
     correlation,
+    mirrored_share,
     same_view_homography,
     text_line_matches,
 )
@@ -113,3 +114,18 @@ def test_copies_correlate_whatever_their_contrast_and_other_photographs_do_not()
 def test_images_without_texture_do_not_correlate() -> None:
     faint = gray_texture(7, 3.5)
     assert correlation(faint, faint, np.eye(3)) == 0.0
+
+
+def test_windows_of_little_contrast_are_compared_too() -> None:
+    photograph = gray_texture(7, 15.0)
+    assert correlation(photograph, photograph, np.eye(3)) > 0.99
+
+
+def test_mirrored_copies_of_dense_keypoints_prove_little() -> None:
+    side = 800
+    is_keypoint = np.random.default_rng(3).random((side, side)) < 0.45
+    rows, columns = np.nonzero(is_keypoint)
+    points = np.stack([columns, rows], axis=1) + 0.5
+    mirrored = points * [-1.0, 1.0] + [side, 0.0]
+    share = mirrored_share(points, mirrored, ((side, side), (side, side)))
+    assert 0.15 < share < 0.6

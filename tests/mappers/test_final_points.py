@@ -168,8 +168,8 @@ def test_tracks_of_two_images_are_refined_where_those_of_three_make_the_model(
     (mapped,) = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
     model = mapped.reconstruction
     before = bits(model), mean_error_of_two_views(model), model.num_points3D()
-    assert mapped.finish is not None
-    mapped.finish()
+    assert mapped.add_last_points is not None
+    mapped.add_last_points()
     assert bits(model) == before[0]
     assert (
         mean_error_of_two_views(model) < 0.95 * before[1]
@@ -190,7 +190,11 @@ def test_models_are_scored_before_their_last_points(tmp_path: Path) -> None:
         def map(self, task: MappingTask, *rest: object) -> list[MappedModel]:
             found = mapper.map(task, *rest)
             unfinished[:] = [
-                replace(m, reconstruction=copy.deepcopy(m.reconstruction), finish=None)
+                replace(
+                    m,
+                    reconstruction=copy.deepcopy(m.reconstruction),
+                    add_last_points=None,
+                )
                 for m in found
             ]
             return list(found)

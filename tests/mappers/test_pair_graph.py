@@ -60,7 +60,7 @@ def test_a_model_of_some_tracks_gets_the_points_of_all(
     )
     assert len(model_poses(model.reconstruction)) == NUM_IMAGES
     assert model.reconstruction.num_points3D() > 2000
-    assert model.moves[-1] == SOME_TRACKS
+    assert model.hypotheses[-1] == SOME_TRACKS
 
 
 def test_pairs_leave_a_graph_and_what_the_mappers_see(path: Path) -> None:
@@ -114,13 +114,13 @@ def test_agreement_of_a_pair_is_computed_anew_where_a_pose_or_a_camera_is_anothe
     cameras = {key: copy.copy(camera) for key, camera in graph.cameras.items()}
     poses = {key: (np.eye(3), np.array([0.1 * key, 0.0, 1.0])) for key in cameras}
     computed = list[str]()
-    compute = pair_graph._agreement
+    compute = pair_graph._compared_with_pose
 
     def counting(*given: Any) -> Any:
         computed.append("")
         return compute(*given)
 
-    monkeypatch.setattr(pair_graph, "_agreement", counting)
+    monkeypatch.setattr(pair_graph, "_compared_with_pose", counting)
     share = graph.agreement(pair, poses, cameras)
     assert graph.agreement(pair, dict(poses), cameras) == share
     assert len(computed) == 1

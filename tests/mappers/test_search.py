@@ -356,7 +356,7 @@ def test_colmaps_own_model_is_taken_where_ours_scores_lower(
     (found,) = mapper_of("sparse").map(
         task_of(scene, UNKNOWN), tmp_path, 0, lambda _: None
     )
-    assert found.moves == (COLMAP_MODEL,)
+    assert found.hypotheses == (COLMAP_MODEL,)
     assert focals(found.reconstruction) == pytest.approx(
         [TRUE_FOCAL] * NUM_IMAGES, rel=0.05
     )
@@ -413,7 +413,10 @@ def test_photographs_get_own_cameras_and_models_of_other_places_stay(
     path = tmp_path / "database.db"
     task = MappingTask(path, None, cameras=two_places(path), may_share=True)
     large, small = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
-    assert (large.moves[-1], small.moves) == (OWN_CAMERAS, ("with all pairs",))
+    assert (large.hypotheses[-1], small.hypotheses) == (
+        OWN_CAMERAS,
+        ("with all pairs",),
+    )
     found = sorted(
         camera.mean_focal_length()
         for camera in cameras_of(large.reconstruction).values()

@@ -179,7 +179,7 @@ def test_lost_photograph_comes_back_by_six_points_in_two_others(tmp_path: Path) 
     (model,), task = tied(
         tmp_path, truth, TRIANGLE, {"1.jpg": 6, "2.jpg": 6, "3.jpg": 6}
     )
-    assert model.moves[-1] == BY_HAND
+    assert model.hypotheses[-1] == BY_HAND
     assert model.reconstruction.num_reg_images() == 4
     assert relative_errors(model, truth, "0.jpg", "3.jpg")[0] < 2.0
     residuals = tie_points_of(task, graph_of(task, 15)).report(model.reconstruction)

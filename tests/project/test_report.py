@@ -92,7 +92,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
             "e.png": {"code": "not_registered", "text": "not registered"},
             "f.png": {"code": "no_features", "text": "no features"},
         },
-        "doubtful": {}, "unsure": {}, "probabilities": {}, "moves": [], "guided": {},
+        "doubtful": {}, "unsure": {}, "probabilities": {}, "hypotheses": [], "guided": {},
         "advice": [
             {"why": "it tries more", "command": "colmap-affrect run"},
             {"why": "more photographs", "command": ""},

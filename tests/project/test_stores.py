@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import StoreError
-from colmap_affrect.project.match_state import Begun, LookedAt, MatchState
+from colmap_affrect.project.match_state import Begun, LearnedModels, MatchState
 from colmap_affrect.project.stores import (
     FeatureStore,
     Learned,
@@ -306,12 +306,15 @@ def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
     matches.write([pair_matches(pair, [[0, 0]], 1) for pair in pairs])
     stationary = (((40, 30), ((1, 2), (3, 4))),)
     matches.keep(stationary=stationary, effort="high", listed="digest")
-    looked_at = LookedAt("digest", 2.5, is_sure=True, score_without=0.75)
+    learned_models = LearnedModels("digest", 2.5, is_sure=True, score_without=0.75)
     matches.keep(
-        step=Begun(1, pairs), has_stepped=True, looked_at=looked_at, in_vain=("a", True)
+        step=Begun(1, pairs),
+        has_stepped=True,
+        learned_models=learned_models,
+        in_vain=("a", True),
     )
     assert matches.state == MatchState(
-        "digest", ("a", True), stationary, effort="high", looked_at=looked_at,
+        "digest", ("a", True), stationary, effort="high", learned_models=learned_models,
         step=Begun(1, pairs), has_stepped=True,
     )  # fmt: skip
     matches.remove(pairs=pairs[:1])
