@@ -33,19 +33,32 @@ class GivenFile:
     def groups_with(self, dataset: str) -> list[str]:
         """Return the sorted paths of the groups that have a dataset."""
         ending = f"/{dataset}"
-        found = sorted(
-            key.removesuffix(ending) for key in self.shapes if key.endswith(ending)
-        )
-        if self.shapes and not found:
+        groups = []
+        for key in self.shapes:
+            if key.endswith(ending):
+                groups.append(key.removesuffix(ending))
+        if self.shapes and not groups:
             raise StoreError(
                 f"{self.path}: holds no '{dataset}' of images; is it a file of hloc?"
             )
-        return found
+        return sorted(groups)
 
     def read(
         self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu"
     ) -> NDArray[Any]:
-        """Read numbers of some of numpy's kinds, of a shape in which None is any size."""
+        """Read an array of numbers.
+
+        Args:
+            key: path of the dataset.
+            shape: that it must have; None is any size.
+            kinds: numpy's kinds of numbers that it may hold.
+
+        Returns:
+            The array.
+
+        Raises:
+            StoreError: it is damaged, or holds something else.
+        """
         stored = self.shapes[key]
         expected = tuple(stored[:1]) if shape[0] is None else shape[:1]
         if stored != expected + shape[1:]:

@@ -59,7 +59,8 @@ class GroupStore:
             with h5py.File(where, mode) as file:
                 if mode == "w":
                     file.attrs.update(format=self.format, pixel_origin="center")
-                if (found := file.attrs.get("format")) != self.format:
+                found = file.attrs.get("format")
+                if found != self.format:
                     raise StoreError(
                         f"{self.path}: expected the format {self.format}, found {found}; use "
                         "another --output-path"
@@ -96,7 +97,8 @@ def checked(group: h5py.Group, name: str) -> NDArray[Any]:
     """Read a dataset; ValueError if it does not hold what was written."""
     dataset = group[name]
     values = np.asarray(dataset[()])
-    if dataset.attrs.get(CHECKSUM, known := _checksum(values)) != known:
+    checksum = _checksum(values)
+    if dataset.attrs.get(CHECKSUM, checksum) != checksum:
         raise ValueError(f"{dataset.name} is not as it was written")
     return values
 

@@ -24,9 +24,8 @@ class Content(NamedTuple):
     """What files hold."""
 
     digest: str = ""  # sha256 of the digests of the files; empty if not known
-    stamp: str = (
-        ""  # their sizes and times: while these stay, nobody has to read the files
-    )
+    # Their sizes and times: while these stay, nobody has to read the files
+    stamp: str = ""
 
 
 def file_sha256(path: Path) -> str:
@@ -84,9 +83,8 @@ STAGES: tuple[str, ...] = get_args(Stage)
 MAX_VALUE = 160  # characters of a value that is told; levels of recipes have thousands
 FORMAT_VERSION = 13  # counts up when a stage records other options than before
 MADE_FROM = "made_from"  # digests of given files
-MAPPED = (
-    "mapped"  # what the models that are there were made from, and how many they are
-)
+# What the models that are there were made from, and how many they are
+MAPPED = "mapped"
 PLANNED = "planned"  # options of stages that have not begun
 KEYS = ("recipe", *STAGES, PLANNED, MADE_FROM, MAPPED)
 
@@ -152,7 +150,8 @@ def read_record(path: Path) -> dict[str, Any]:
                 "gone on with; use another --output-path or remove it"
             )
         record = _Record(**values).model_dump(exclude_unset=True)
-        if unknown := record.keys() - set(KEYS):
+        unknown = record.keys() - set(KEYS)
+        if unknown:
             raise ValueError(f"unknown {min(unknown)!r}")
     return record
 
@@ -190,17 +189,24 @@ def first_difference(
     """
     old = flat({key: value for key, value in known.items() if key not in free})
     new = flat({key: value for key, value in now.items() if key not in free})
-    # The name of a part first: with another one most other options differ too.
-    for key in sorted(
-        old.keys() | new.keys(), key=lambda k: (k.rpartition(".")[2] != "name", k)
-    ):
+    for key in sorted(old.keys() | new.keys(), key=_part_names_first):
         before = old.get(key)
         after = new.get(key)
-        if key.startswith(f"{WEIGHTS}.") and not (
-            before and after
-        ):  # of a level that waits
-            continue
-        if before != after and not (key in PLACES and before and after):
+        if before != after and not _may_differ(key, before, after):
             was = clipped(repr(before), MAX_VALUE)
             return f"{key}={was}, and it is {clipped(repr(after), MAX_VALUE)} now"
     return ""
+
+
+def _part_names_first(key: str) -> tuple[bool, str]:
+    """Return by what options are sorted: with another part most other options differ, too."""
+    is_name = key.rpartition(".")[2] == "name"
+    return not is_name, key
+
+
+def _may_differ(key: str, before: object, after: object) -> bool:
+    """Tell whether results stay the same though an option has another value."""
+    has_both = bool(before and after)
+    if key.startswith(f"{WEIGHTS}."):
+        return not has_both  # a level waits for its weights
+    return key in PLACES and has_both

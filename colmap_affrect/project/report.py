@@ -15,6 +15,7 @@ from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
 
 NUM_WORST = 3  # tie points that a summary names
+MAX_LENSES = 3  # focal lengths in mm that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {  # how a summary calls where focal lengths are from; others by their own names
@@ -52,12 +53,31 @@ def probability_text(probability: float) -> str:
     return ">99%" if percent >= 99 and probability > 0.99 else f"{percent}%"
 
 
-CONTRADICTED: Mapping[str, tuple[Sequence[str], str, str]] = {
-    "EXIF": (("exif", "exif-rescaled"), "by EXIF", "--ignore-exif leaves it out"),
-    "the given focal length": (("given",), "given", "--cameras-path takes another one"),
-}
-"""What may be wrong of a camera: its sources, where its number is from, and what helps. What the
-user gives is usually held; that of a database only has a prior."""
+@dataclass(frozen=True)
+class Contradiction:
+    """A source of focal lengths that a model may contradict, and what to say then."""
+
+    what: str  # that may be wrong
+    sources: tuple[str, ...]  # of a focal length, as ``report.json`` calls them
+    by: str  # what its number is known by
+    remedy: str
+
+
+# What the user gives is usually held; that of a database only has a prior.
+CONTRADICTIONS = (
+    Contradiction(
+        what="EXIF",
+        sources=("exif", "exif-rescaled"),
+        by="by EXIF",
+        remedy="--ignore-exif leaves it out",
+    ),
+    Contradiction(
+        what="the given focal length",
+        sources=("given",),
+        by="given",
+        remedy="--cameras-path takes another one",
+    ),
+)
 # Of a focal length: three standard deviations of what EXIF usually has
 MAX_EXIF_ERROR = 1.27
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
@@ -81,10 +101,11 @@ def installed_versions() -> dict[str, str]:
 
 def _some(lines: Iterable[str]) -> list[str]:
     """Return the first few lines of a list, and how many there are more."""
-    shown = list(lines)
-    if (more := len(shown) - MAX_LINES) > 1:
-        shown[MAX_LINES:] = [f"            and {more} more, see report.json"]
-    return shown
+    listed = list(lines)
+    num_more = len(listed) - MAX_LINES
+    if num_more <= 1:
+        return listed
+    return [*listed[:MAX_LINES], f"            and {num_more} more, see report.json"]
 
 
 def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -94,54 +115,65 @@ def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
         cameras: entries of ``report.json``.
     """
     notes = []
-    for what, (sources, by, remedy) in CONTRADICTED.items():
-        wrong = [camera for camera in cameras if _is_contradicted(camera, sources)]
-        if wrong:
-            first = wrong[0]
-            more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
-            notes.append(
-                f"{what} may be wrong: {first['focal_px']:.0f} px {by}, "
-                f"{first['refined_px']:.0f} px in the model{more}; {remedy}"
-            )
-    lenses_mm = sorted(
-        {camera["lens_mm"] for camera in cameras if camera.get("lens_mm")}
-    )
-    shared = [camera for camera in cameras if _is_found(camera)]
-    num_found = len({camera["refined_px"] for camera in shared})
-    if num_found < len(shared):
+    for contradiction in CONTRADICTIONS:
+        notes += _contradiction_notes(cameras, contradiction)
+    estimated = list(filter(_is_estimated, cameras))
+    num_estimates = len({camera["refined_px"] for camera in estimated})
+    if num_estimates < len(estimated):
         notes.append(
-            f"of those not known mapping makes {num_found}: photographs of one size share one"
+            f"of those not known mapping makes {num_estimates}: photographs of one size share one"
         )
-    if lenses_mm:
+    lenses_mm = {camera.get("lens_mm") or 0.0 for camera in cameras}
+    known_mm = sorted(filter(None, lenses_mm))
+    if known_mm:
+        texts = ", ".join(f"{mm:g}" for mm in known_mm[:MAX_LENSES])
         notes.append(
-            f"EXIF has {', '.join(f'{mm:g}' for mm in lenses_mm[:3])} mm, and not the size of the "
-            f"sensor: --focal-mm {lenses_mm[0]:g} --film-width-mm WIDTH (its longer side) tells "
-            "the focal length"
+            f"EXIF has {texts} mm, and not the size of the sensor: --focal-mm {known_mm[0]:g} "
+            "--film-width-mm WIDTH (its longer side) tells the focal length"
         )
     return notes
 
 
-def as_mapped(cameras: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def _contradiction_notes(
+    cameras: Sequence[Mapping[str, Any]], contradiction: Contradiction
+) -> list[str]:
+    """Return a line where models are far from the focal lengths of some sources."""
+    wrong = []
+    for camera in cameras:
+        if _is_contradicted(camera, contradiction.sources):
+            wrong.append(camera)
+    if not wrong:
+        return []
+    known_px = wrong[0]["focal_px"]
+    estimated_px = wrong[0]["refined_px"]
+    more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
+    return [
+        f"{contradiction.what} may be wrong: {known_px:.0f} px {contradiction.by}, "
+        f"{estimated_px:.0f} px in the model{more}; {contradiction.remedy}"
+    ]
+
+
+def merge_shared_cameras(
+    cameras: Sequence[Mapping[str, Any]],
+) -> list[Mapping[str, Any]]:
     """Return cameras, with those that mapping has made one as one, with all their photographs.
 
     Args:
         cameras: entries of ``report.json``.
     """
-    found: dict[object, Mapping[str, Any]] = {}
+    merged: dict[object, Mapping[str, Any]] = {}
     for number, camera in enumerate(cameras):
         key: object = number
-        if _is_found(camera):
-            key = camera["refined_px"], camera["focal_px"], camera["why"]
-        names = (
-            [*found[key]["names"], *camera["names"]]
-            if key in found
-            else camera["names"]
-        )
-        found[key] = {**camera, "names": names}
-    return list(found.values())
+        if _is_estimated(camera):
+            key = (camera["refined_px"], camera["focal_px"], camera["why"])
+        names = camera["names"]
+        if key in merged:
+            names = [*merged[key]["names"], *names]
+        merged[key] = {**camera, "names": names}
+    return list(merged.values())
 
 
-def _is_found(camera: Mapping[str, Any]) -> bool:
+def _is_estimated(camera: Mapping[str, Any]) -> bool:
     """Return whether nothing but the model tells the focal length of a camera."""
     return camera["source"] == "guess" and bool(camera.get("refined_px"))
 
@@ -266,6 +298,10 @@ class Residual:
     error_px: float
     """Distance from the mark to where the model sees the point."""
 
+    def text(self) -> str:
+        """Return a few words."""
+        return f"{self.point} in {self.image} {self.error_px:.1f}"
+
 
 @documented
 @dataclass(frozen=True)
@@ -304,9 +340,11 @@ class ModelSummary:
     @property
     def sure(self) -> tuple[str, ...]:
         """Names of the images that are right with a probability of ``SURE`` or more."""
-        return tuple(
-            name for name, share in self.probabilities.items() if share >= SURE
-        )
+        sure = []
+        for name, probability in self.probabilities.items():
+            if probability >= SURE:
+                sure.append(name)
+        return tuple(sure)
 
     @property
     def likely(self) -> set[str]:
@@ -315,22 +353,16 @@ class ModelSummary:
 
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
-        lines = _some(
-            f"joined      {name} {one.text()}" for name, one in self.bridges.items()
-        )
-        lines += _some(
-            f"unsure      {line}" for line in by_story(texts_of(self.unsure))
-        )
-        lines += _some(
-            f"doubtful    {line}" for line in by_story(texts_of(self.doubtful))
-        )
-        alike = (
-            f"one view    {a} and {b}: no depth between them" for a, b in self.one_view
-        )
-        lines += _some(alike)
+        bridges = self.bridges.items()
+        unsure = by_story(texts_of(self.unsure))
+        doubtful = by_story(texts_of(self.doubtful))
+        alike = [f"{first} and {second}" for first, second in self.one_view]
         return [
             f"sure        {len(self.sure)}, right with a probability of {SURE:.0%} or more",
-            *lines,
+            *_some(f"joined      {name} {bridge.text()}" for name, bridge in bridges),
+            *_some(f"unsure      {line}" for line in unsure),
+            *_some(f"doubtful    {line}" for line in doubtful),
+            *_some(f"one view    {pair}: no depth between them" for pair in alike),
             *self._tie_point_lines(),
             f"points      {self.num_points3D}, each in {self.mean_track_length:.2f} images",
             f"error       {self.mean_reprojection_error_px:.2f} px on average",
@@ -339,12 +371,11 @@ class ModelSummary:
     def _tie_point_lines(self) -> list[str]:
         if not self.tie_points:
             return []
-        worst = self.tie_points[:NUM_WORST]
-        texts = [f"{one.point} in {one.image} {one.error_px:.1f}" for one in worst]
-        num_points = len({one.point for one in self.tie_points})
+        worst = ", ".join(residual.text() for residual in self.tie_points[:NUM_WORST])
+        num_points = len({residual.point for residual in self.tie_points})
+        num_marks = len(self.tie_points)
         return [
-            f"tie points  {num_points}, {len(self.tie_points)} marks; farthest off in px: "
-            f"{', '.join(texts)}"
+            f"tie points  {num_points}, {num_marks} marks; farthest off in px: {worst}"
         ]
 
 
@@ -427,46 +458,46 @@ class ReconstructionReport(Summarized):
     @property
     def added(self) -> tuple[str, ...]:
         """Names of the images that came into the model that was extended."""
+        if not self.extended:
+            return ()
         before = set(self.extended)
-        return tuple(
-            name for name in self.registered_names if before and name not in before
-        )
+        return tuple(name for name in self.registered_names if name not in before)
 
     @property
     def failures(self) -> dict[str, str]:
         """Images that could not be read, with the reason."""
-        return {
-            name: why for stage in self.stages for name, why in stage.failures.items()
-        }
+        failures = dict[str, str]()
+        for stage in self.stages:
+            failures.update(stage.failures)
+        return failures
 
     @property
     def warnings(self) -> dict[str, str]:
         """Images that were worked on in another way than asked for, with the reason."""
-        return {
-            name: why for stage in self.stages for name, why in stage.warnings.items()
-        }
+        warnings = dict[str, str]()
+        for stage in self.stages:
+            warnings.update(stage.warnings)
+        return warnings
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
         largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
+        of_largest = asdict(largest)
         found = asdict(self)
         del found["verification"]["random_seed"]
         options = found["mapping"]
+        missing = {name: why.to_mapping() for name, why in self.unregistered.items()}
         return {
             "status": self.status,
             "images_registered": len(largest.registered_names),
-            **{key: getattr(largest, key) for key in OF_LARGEST},
+            **{key: of_largest[key] for key in OF_LARGEST},
             **found,
-            "unregistered": {
-                name: why.to_mapping() for name, why in self.unregistered.items()
-            },
+            "unregistered": missing,
             "unsure": mappings_of(largest.unsure),
             "doubtful": mappings_of(largest.doubtful),
             "points3D": largest.num_points3D,
-            "bridges": {
-                name: asdict(bridge) for name, bridge in largest.bridges.items()
-            },
-            "tie_points": [asdict(residual) for residual in largest.tie_points],
+            "bridges": of_largest["bridges"],
+            "tie_points": list(of_largest["tie_points"]),
             "num_models": len(self.models),
             "models": [list(model.registered_names) for model in self.models],
             "added": self.added,
@@ -481,57 +512,83 @@ class ReconstructionReport(Summarized):
 
     def summary(self, *, with_warnings: bool = True) -> str:
         """Return one screen of text."""
-        registered = len(self.registered_names)
-        lines = [f"registered  {registered} of {self.images_total} images"]
-        if self.extended:
-            lines += [
-                f"extended    {len(self.extended)} were there, {len(self.added)} came in"
-            ]
-            lines += [f"            new {name}" for name in self.added]
+        num_registered = len(self.registered_names)
+        lines = [
+            f"registered  {num_registered} of {self.images_total} images",
+            *self._extension_lines(),
+            *self._missing_lines(),
+            f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified",
+            *_some(f"by hand     {text}" for text in self.by_hand),
+            *self._matching_lines(),
+            *self._camera_lines(),
+            *self._model_lines(),
+            *self._preset_lines(),
+        ]
+        if with_warnings:
+            warnings = self.warnings.items()
+            lines += _some(f"warning     {name}: {why}" for name, why in warnings)
+        seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
+        lines.append(f"seconds     {seconds}")
+        for advice in self.advice[:MAX_ADVICE]:
+            texts = filter(None, (advice.why, advice.command))
+            lines.append("try         " + "\n            ".join(texts))
+        return "\n".join(lines)
+
+    def _extension_lines(self) -> list[str]:
+        if not self.extended:
+            return []
+        num_before = len(self.extended)
+        return [
+            f"extended    {num_before} were there, {len(self.added)} came in",
+            *[f"            new {name}" for name in self.added],
+        ]
+
+    def _missing_lines(self) -> list[str]:
         missing = {name: why.text() for name, why in self.unregistered.items()}
-        lines += _some(f"        not {line}" for line in by_story(missing))
-        lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
-        lines += _some(f"by hand     {text}" for text in self.by_hand)
+        return _some(f"        not {line}" for line in by_story(missing))
+
+    def _matching_lines(self) -> list[str]:
+        """Return what guided matching and escalation have done."""
+        lines = []
         if self.guided:
+            num_pairs = self.guided["pairs"]
+            pairs = "pair" if num_pairs == 1 else "pairs"
             before = self.guided["matches_before"]
             after = self.guided["matches_after"]
-            pairs = (
-                f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"
+            lines.append(
+                f"guided      {num_pairs} {pairs} matched again: {after} inliers, "
+                f"{before} before"
             )
-            lines += [
-                f"guided      {pairs} matched again: {after} inliers, {before} before"
-            ]
         if self.matched_again:
-            texts = [one.text() for one in self.matched_again]
-            lines += [f"again       {', '.join(texts)} (effort {self.effort})"]
-        if self.cameras:
-            sources = Counter(
-                str(camera["source"]) for camera in self.cameras
-            ).most_common()
-            texts = [
-                f"{count} {SOURCES.get(source, source)}" for source, count in sources
-            ]
-            lines += [f"cameras     focal lengths: {', '.join(texts)}"]
-            lines += [f"            {note}" for note in camera_notes(self.cameras)]
-        if self.models:
-            lines += self.models[0].summary_lines()
+            texts = ", ".join(again.text() for again in self.matched_again)
+            lines.append(f"again       {texts} (effort {self.effort})")
+        return lines
+
+    def _camera_lines(self) -> list[str]:
+        """Return where focal lengths are from, and what may be wrong of them."""
+        if not self.cameras:
+            return []
+        counts = Counter(str(camera["source"]) for camera in self.cameras)
+        texts = []
+        for source, count in counts.most_common():
+            texts.append(f"{count} {SOURCES.get(source, source)}")
+        return [
+            f"cameras     focal lengths: {', '.join(texts)}",
+            *[f"            {note}" for note in camera_notes(self.cameras)],
+        ]
+
+    def _model_lines(self) -> list[str]:
+        if not self.models:
+            return []
+        lines = self.models[0].summary_lines()
         if len(self.models) > 1:
             sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
-            lines += [f"models      {len(self.models)}, of {sizes} images"]
-        given = [
-            f"{key}={value}" for key, value in self.mapping["mapper_options"].items()
-        ]
+            lines.append(f"models      {len(self.models)}, of {sizes} images")
+        return lines
+
+    def _preset_lines(self) -> list[str]:
+        """Return the preset and the mapper, unless they are the usual ones."""
+        options = self.mapping["mapper_options"]
+        given = [f"{key}={value}" for key, value in options.items()]
         chosen = ", ".join([self.preset, f"{self.mapping['name']} mapper", *given])
-        lines += [f"preset      {chosen}"] if chosen != USUAL else []
-        if with_warnings:
-            lines += _some(
-                f"warning     {name}: {why}" for name, why in self.warnings.items()
-            )
-        seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
-        lines += [f"seconds     {seconds}"]
-        for one in self.advice[:MAX_ADVICE]:
-            lines += [
-                "try         "
-                + "\n            ".join(filter(None, (one.why, one.command)))
-            ]
-        return "\n".join(lines)
+        return [] if chosen == USUAL else [f"preset      {chosen}"]

@@ -89,7 +89,8 @@ def _content(group: h5py.Group) -> Content:
 
 
 def _level_ends(group: h5py.Group) -> dict[int, int]:
-    levels, ends = (checked(group, key).tolist() for key in ("levels", "level_ends"))
+    levels = checked(group, "levels").tolist()
+    ends = checked(group, "level_ends").tolist()
     return dict(zip(levels, ends, strict=True))
 
 
@@ -145,10 +146,16 @@ class FeatureStore(GroupStore):
             content: what the files hold that they are from.
             lines: its straight lines; None where they were not measured.
         """
-        more = {} if lines is None else line_datasets(lines)
         with self._open("a") as file:
-            ends = {0: len(features)}
-            self._write_features(file, name, features, image_size, ends, content, more)
+            self._write_features(
+                file,
+                name,
+                features,
+                image_size,
+                level_ends={0: len(features)},
+                content=content,
+                more={} if lines is None else line_datasets(lines),
+            )
 
     def contents(self) -> dict[str, Content]:
         """Return for each image what the files hold that it was extracted from."""
@@ -167,21 +174,30 @@ class FeatureStore(GroupStore):
                 del file[name]
 
     def extend(self, name: str, features: LocalFeatures, level: int) -> None:
-        """Add the features of another level; what is there keeps its indices."""
+        """Add the features of another level; what is there keeps its indices.
+
+        Args:
+            name: of the image.
+            features: of this level alone, in px of the stored image.
+            level: number of the level in the recipe.
+        """
         with self._open("a") as file:
             group = self._group(file, name)
-            size = tuple(checked(group, "image_size").tolist())
-            ends = _level_ends(group)
-            there = self._features(group)
-            first_id = int(there.rectification_ids.max(initial=0))
+            known = self._features(group)
+            first_id = int(known.rectification_ids.max(initial=0))
             ids = features.rectification_ids
-            added = replace(
-                features, rectification_ids=np.where(ids, ids + first_id, 0)
+            numbered = np.where(ids, ids + first_id, 0)
+            added = replace(features, rectification_ids=numbered)
+            both = union(of_one_size([known, added]))
+            self._write_features(
+                file,
+                name,
+                both,
+                image_size=tuple(checked(group, "image_size").tolist()),
+                level_ends={**_level_ends(group), level: len(both)},
+                content=_content(group),
+                more=_line_datasets(group),
             )
-            both = union(of_one_size([there, added]))
-            ends[level] = len(both)
-            more = _line_datasets(group)
-            self._write_features(file, name, both, size, ends, _content(group), more)
 
     def _write_features(
         self,
@@ -217,10 +233,22 @@ class FeatureStore(GroupStore):
             return lines_from_datasets(_line_datasets(self._group(file, name)))
 
     def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
-        """Return the indices of the features of two levels, each once, rising."""
+        """Return the indices of the features of two levels, each once, rising.
+
+        Args:
+            name: of the image.
+            level: number of a level in the recipe.
+            base: number of another one, or the same.
+
+        Returns:
+            (N,) int64.
+        """
         ranges = self.level_ranges(name)
-        parts = sorted((ranges[k] for k in {base, level}), key=lambda part: part.start)
-        return np.concatenate([np.arange(part.start, part.stop) for part in parts])
+        indices = np.arange(ranges[level].start, ranges[level].stop)
+        if base == level:
+            return indices
+        others = np.arange(ranges[base].start, ranges[base].stop)
+        return np.sort(np.concatenate([others, indices]))
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
         if not has_entry(file, name):
@@ -240,9 +268,12 @@ class FeatureStore(GroupStore):
         """Return which features are of each level that an image has, in their order."""
         with self._open("r") as file:
             ends = _level_ends(self._group(file, name))
-        return dict(
-            zip(ends, map(range, [0, *ends.values()], ends.values()), strict=True)
-        )
+        ranges = dict[int, range]()
+        start = 0
+        for level, end in ends.items():
+            ranges[level] = range(start, end)
+            start = end
+        return ranges
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
@@ -333,9 +364,8 @@ class MatchStore(GroupStore):
         known: dict[str, Any] = {"tried": 0}
         learned = None
         if has_entry(file, key):
-            known = {
-                name: file[key].attrs[name] for name in KEPT if name in file[key].attrs
-            }
+            attributes = file[key].attrs
+            known = {name: attributes[name] for name in KEPT if name in attributes}
             learned = _read_learned(file[key], pair.names)
         known["tried"] |= 1 << pair.level
         known |= {"level": pair.level, "of_some": pair.of_some}
@@ -368,23 +398,22 @@ class MatchStore(GroupStore):
 
     def learned_levels(self, pairs: Iterable[Names]) -> dict[Names, int]:
         """Return the level of these by pair, without reading them; -1 where there are none."""
+        levels = dict[Names, int]()
         with self._open("r") as file:
-            groups = {names: file[pair_key(*names)] for names in pairs}
-            return {
-                n: int(group.attrs.get(LEARNED + "level", -1))
-                for n, group in groups.items()
-            }
+            for names in pairs:
+                attributes = file[pair_key(*names)].attrs
+                levels[names] = int(attributes.get(LEARNED + "level", -1))
+        return levels
 
     def measured_worths(self, pairs: Iterable[Names]) -> dict[Names, Worth]:
         """Return what the best measured matches of pairs are worth that use others."""
-        found = {}
+        worths = dict[Names, Worth]()
         with self._open("r") as file:
             for names in pairs:
-                inliers, consistent = file[pair_key(*names)].attrs.get(
-                    "measured_worth", (0, 0)
-                )
-                found[names] = int(inliers), int(consistent)
-        return found
+                attributes = file[pair_key(*names)].attrs
+                inliers, consistent = attributes.get("measured_worth", (0, 0))
+                worths[names] = (int(inliers), int(consistent))
+        return worths
 
     def choose(
         self,
@@ -410,20 +439,23 @@ class MatchStore(GroupStore):
         """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
 
         Which pairs are escalated depends on all others.
+
+        Args:
+            images: names of images.
+            pairs: of image names.
         """
         if not self.path.exists():
             return
         gone = set(images)
-        names = {pair_key(name, "")[:-1] for name in gone}
-        keys = {pair_key(*pair) for pair in pairs}
+        image_keys = {pair_key(name, "")[:-1] for name in gone}
+        pair_keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
             _write_state(file, _read_state(file).without_pairs(gone))
             for key, group in list(entries_of(file)):
-                is_asked = key in keys or not names.isdisjoint(key.split("/"))
-                is_escalated = (
-                    group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs
-                )
-                if is_asked or is_escalated:
+                is_of_image = not image_keys.isdisjoint(key.split("/"))
+                has_learned = LEARNED + "level" in group.attrs
+                is_escalated = has_learned or group.attrs["tried"] > 1
+                if key in pair_keys or is_of_image or is_escalated:
                     del file[key]
 
     def has(self, pairs: Sequence[Names]) -> Bools:
@@ -452,9 +484,20 @@ class MatchStore(GroupStore):
     def levels(
         self, pairs: Iterable[Names], attribute: str = "level"
     ) -> dict[Names, int]:
-        """Return the level that the matches of each pair are from, or its ``tried`` ones."""
+        """Return the level that the matches of each pair are from, or its ``tried`` ones.
+
+        Args:
+            pairs: of image names.
+            attribute: ``level``, or ``tried``.
+
+        Returns:
+            By pair a level, or a number with a bit for each level that was tried.
+        """
+        found = dict[Names, int]()
         with self._open("r") as file:
-            return {pair: int(file[pair_key(*pair)].attrs[attribute]) for pair in pairs}
+            for pair in pairs:
+                found[pair] = int(file[pair_key(*pair)].attrs[attribute])
+        return found
 
     def read(self, pairs: Sequence[Names]) -> Iterator[PairMatches]:
         """Yield the matches of each pair; StoreError at a pair without matches."""
@@ -487,7 +530,11 @@ def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatc
     indices = np.stack([rows, matches0[rows]], axis=1)
     scores = checked(group, f"{prefix}matching_scores0")[rows].astype(np.float32)
     return PairMatches(
-        names, indices, scores, len(matches0), int(group.attrs[f"{prefix}level"])
+        names=names,
+        indices=indices,
+        scores=scores,
+        num_keypoints1=len(matches0),
+        level=int(group.attrs[f"{prefix}level"]),
     )
 
 
@@ -517,23 +564,26 @@ class GuidedStore(GroupStore):
         """Write a batch of pairs, in the place of what is there of them."""
         with self._open("a") as file:
             for pair in pairs:
-                datasets = {"exact": pair.exact}
-                names = np.asarray(pair.names, dtype=h5py.string_dtype())
-                key = pair_key(*pair.names)
                 self._write(
-                    file, key, datasets, names=names, num_inliers=pair.num_inliers
+                    file,
+                    key=pair_key(*pair.names),
+                    datasets={"exact": pair.exact},
+                    names=np.asarray(pair.names, dtype=h5py.string_dtype()),
+                    num_inliers=pair.num_inliers,
                 )
 
     def read(self) -> list[GuidedPair]:
         """Read all pairs."""
         if not self.path.exists():
             return []
+        found = []
         with self._open("r") as file:
-            found = []
             for _, group in sorted(entries_of(file), key=lambda item: item[0]):
-                (first, second) = group.attrs["names"]
-                num = int(group.attrs["num_inliers"])
-                found.append(
-                    GuidedPair((str(first), str(second)), checked(group, "exact"), num)
+                first, second = group.attrs["names"]
+                pair = GuidedPair(
+                    names=(str(first), str(second)),
+                    exact=checked(group, "exact"),
+                    num_inliers=int(group.attrs["num_inliers"]),
                 )
+                found.append(pair)
         return found

@@ -64,23 +64,17 @@ class Workspace:
         self.guided = path / "guided.h5"  # what guided matching found, by pair
         self.pairs = path / "pairs.txt"  # those to match
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
-        self.snapshots = (
-            path / "sparse.snapshots"
-        )  # from which an interrupted mapping goes on
+        # From which an interrupted mapping goes on
+        self.snapshots = path / "sparse.snapshots"
         self.best = path / "sparse.best"  # the best models so far, with their matches
         self.learned = path / "sparse.learned"  # models of learned matches alone
-        self.config, self.log = (
-            path / "config.toml",
-            path / "run.log",
-        )  # options; of all runs
-        self.report, self.page = (
-            path / "report.json",
-            path / "report.html",
-        )  # of the last run
-        self.cameras = (
-            path / "cameras.json"
-        )  # what is known of the database's, and from where
-        # The database, by another program, and is to be mapped so
+        self.config = path / "config.toml"  # the options on record
+        self.log = path / "run.log"  # of all runs
+        self.report = path / "report.json"  # of the last run
+        self.page = path / "report.html"  # of the last run
+        # What is known of the database's cameras, and from where
+        self.cameras = path / "cameras.json"
+        # Whether another program has changed the database, and it is to be mapped so
         self.is_changed = False
         self._record: dict[str, Any] | None = None
 
@@ -127,15 +121,14 @@ class Workspace:
                 f"{self.path}: is the folder of the photographs; give another one as --output-path"
             )
         with suppress(OSError):  # not there, or refused when it is to be used
-            paths = list(self.path.iterdir())
-            for path in paths:
-                if (
-                    path.name.partition(".")[0] in OWN_STEMS
-                    or path.name == outputs.LOCK
-                ):
+            foreign = []
+            for path in self.path.iterdir():
+                stem = path.name.partition(".")[0]
+                if stem in OWN_STEMS or path.name == outputs.LOCK:
                     outputs.refuse_link(path)
                     outputs.refuse_what_waits(path)
-            foreign = [path.name for path in paths if not _may_be_ours(path)]
+                if not _may_be_ours(path):
+                    foreign.append(path.name)
             if foreign and not outputs.is_output_folder(self.path):
                 raise OptionError(
                     f"{self.path}: is not empty ({min(foreign)}) and was not made by "
@@ -230,11 +223,9 @@ class Workspace:
         """Return the options on record for a stage, begun or not; None if there are none."""
         record = self.recorded()
         options = record.get(stage, record.get(PLANNED, {}).get(stage))
-        return (
-            None
-            if options is None
-            else {k: v for k, v in options.items() if k != WEIGHTS}
-        )
+        if options is None:
+            return None
+        return {key: value for key, value in options.items() if key != WEIGHTS}
 
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage; OptionError when it was not run."""
@@ -251,9 +242,8 @@ class Workspace:
         """Return the folder of the photographs on record, None where none is known."""
         with suppress(WorkspaceError):
             record = self.recorded()
-            path = {**record.get("copy", {}), **record.get("extract", {})}.get(
-                "image_path"
-            )
+            options = {**record.get("copy", {}), **record.get("extract", {})}
+            path = options.get("image_path")
             return Path(path) if path else None
         return None
 
@@ -308,22 +298,24 @@ class Workspace:
         recipe: str = "",
         overwrite: bool = False,
     ) -> None:
-        """Put the options of a stage, nested mappings of plain values, on record before it begins.
+        """Put the options of a stage on record before it begins.
 
-        ``plan`` has options of later stages, those of stages that have begun stay as they are;
-        ``recipe`` is a name for the record only. ``overwrite`` discards the results of this stage
-        and the later ones first; with the first stage their options are forgotten, too. Raises
-        ConflictError when other options made the results that are there.
+        Args:
+            stage: that begins.
+            options: its options, nested mappings of plain values.
+            plan: options of later stages; those of stages that have begun stay as they are.
+            recipe: its name, for the record only.
+            overwrite: first discard the results of this stage and the later ones; with the first
+                stage their options are forgotten, too.
+
+        Raises:
+            ConflictError: other options made the results that are there.
         """
         self._refuse_foreign_results(stage)
         outputs.remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
         record = self.recorded()
         if overwrite:
-            self.refuse_foreign_models()
-            outputs.remove_own(self._results(stage))
-            record = rewound(record, stage)
-            if not any(name in record for name in STAGES):
-                record = {}
+            record = self._record_without_results(stage)
         if stage in record:
             why = first_difference(record[stage], options, OF_DATABASE.get(stage, ()))
             if why:
@@ -336,12 +328,18 @@ class Workspace:
             "recipe": recipe or record.get("recipe", ""),
         }
         planned = {**changed.pop(PLANNED, {}), **(plan or {})}
-        later = {
-            name: dict(values)
-            for name, values in planned.items()
-            if name not in changed
-        }
-        self._write_record({**changed, PLANNED: later} if later else changed)
+        for name, values in planned.items():
+            if name not in changed:
+                changed.setdefault(PLANNED, {})[name] = dict(values)
+        self._write_record(changed)
+
+    def _record_without_results(self, stage: str) -> Mapping[str, Any]:
+        """Remove the results of a stage and of those after it, and return the record without."""
+        self.refuse_foreign_models()
+        outputs.remove_own(self._results(stage))
+        record = rewound(self.recorded(), stage)
+        has_stages = not record.keys().isdisjoint(STAGES)
+        return record if has_stages else {}
 
     def rewind(self, why: str = "what it was made from has changed") -> None:
         """Remove the database and what was made from it, for inputs that have changed.
@@ -352,9 +350,9 @@ class Workspace:
         if self.users_database:
             raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
         self.record_mapped(None)
-        outputs.remove_own(
-            path for path in self._results("verify") if path != self.sparse
-        )
+        results = self._results("verify")
+        results.remove(self.sparse)
+        outputs.remove_own(results)
         self._write_record(rewound(self.recorded(), "verify"))
 
     @property
@@ -372,7 +370,9 @@ class Workspace:
                 f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
                 "use another --output-path"
             )
-        for path in () if self.begun else self._results("extract"):
+        if self.begun:
+            return
+        for path in self._results("extract"):
             if path.exists() and path != self.users_database:
                 raise ConflictError(
                     f"{path}: exists and was not made here; it is left as it is, use "
@@ -381,15 +381,14 @@ class Workspace:
 
     def refuse_foreign_models(self) -> None:
         """Refuse to remove models beside which others have put something; ConflictError."""
-        files = list(self.sparse.glob("*"))
-        for folder in [
-            path for path in files if path.is_dir() and path.name.isdecimal()
-        ]:
-            files.remove(folder)
-            files += [
-                path for path in folder.iterdir() if path.name not in FILES_OF_MODEL
-            ]
-        if foreign := [path for path in files if not path.name.startswith(".")]:
+        foreign = list[Path]()
+        for path in self.sparse.glob("*"):
+            is_model = path.is_dir() and path.name.isdecimal()
+            for file in path.iterdir() if is_model else [path]:
+                is_own = is_model and file.name in FILES_OF_MODEL
+                if not is_own and not file.name.startswith("."):
+                    foreign.append(file)
+        if foreign:
             raise ConflictError(
                 f"{foreign[0]}: was not made by this run and would be removed with its models; "
                 "move it elsewhere, and run the same command again"
@@ -413,8 +412,11 @@ class Workspace:
             "pairs": [self.pairs],
             "extract": [self.features],
         }
-        later = STAGES[STAGES.index(stage) :]
-        return [path for name, paths in made.items() if name in later for path in paths]
+        results = list[Path]()
+        for name, paths in made.items():
+            if STAGES.index(name) >= STAGES.index(stage):
+                results += paths
+        return results
 
 
 def _may_be_ours(path: Path) -> bool:

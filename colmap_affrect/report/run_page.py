@@ -19,9 +19,9 @@ from colmap_affrect.project.report import (
     SOURCES,
     ModelSummary,
     ReconstructionReport,
-    as_mapped,
     by_story,
     camera_notes,
+    merge_shared_cameras,
     probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
@@ -207,7 +207,7 @@ def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, An
     """Return the first cameras, each with its photographs, and the sources of all focal lengths."""
     numbers = {name: number for number, name in enumerate(names, 1)}
     rows = []
-    for camera in as_mapped(report.cameras)[:MAX_NUM_CAMERAS]:
+    for camera in merge_shared_cameras(report.cameras)[:MAX_NUM_CAMERAS]:
         known = [name for name in camera["names"] if name in numbers]
         photographs = such_as(f"{numbers[name]} {name}" for name in known)
         rows.append((camera, photographs))
