@@ -29,7 +29,7 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.mend import watched
 from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
-from colmap_affrect.pairs.lists import PairOptions, read_pairs
+from colmap_affrect.pairs.lists import Pair, PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import Forecast, GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
@@ -48,7 +48,7 @@ from colmap_affrect.report.run_report import (
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
-from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
+from colmap_affrect.stages.foreign import ForeignDatabase, import_and_verify
 from colmap_affrect.stages.guide import guide, guided_counts
 from colmap_affrect.stages.map import image_names, unregistered
 from colmap_affrect.stages.map import map_images as map_pairs
@@ -198,12 +198,22 @@ def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> 
 def one_stage(
     name: str, context: Context, *, overwrite: bool = False
 ) -> Iterator[Context]:
-    """Lock the folder of a context for one stage, and bring its database up to date before."""
+    """Lock the folder of a context for one stage, and bring its database up to date before.
+
+    Args:
+        name: of the stage.
+        context: of the folder.
+        overwrite: the stage discards what is there.
+    """
     is_first = name == "extract"
-    discards = is_first and overwrite
     with (
         context.workspace.locked(),
-        watched(context, follows=not is_first, maps=name == "map", discards=discards),
+        watched(
+            context,
+            follows=not is_first,
+            maps=name == "map",
+            discards=is_first and overwrite,
+        ),
     ):
         yield context
 
@@ -246,7 +256,15 @@ def extract(
 ) -> StageReport:
     """Extract features into ``features.h5``, cameras and keypoints into ``database.db``.
 
-    Arguments are those of :func:`run`; options of later stages are kept for these.
+    Args:
+        image_path: folder of the photographs, searched with its sub-folders.
+        output_path: folder for all results, made if missing.
+        options: options to begin with; None for the usual ones. Those of later stages are kept
+            for these.
+        executor: see :func:`run`.
+        overwrite: discard results that are there.
+        progress: see :func:`run`.
+        keywords: fields of :class:`RunOptions`, see :func:`run`.
 
     Returns:
         How many images were extracted, and why others were not.
@@ -429,7 +447,7 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
         context.workspace.locked(),
         watched(context, follows=False, discards=overwrite),
     ):
-        report = copy_verified(context, foreign, chosen, overwrite=overwrite)
+        report = import_and_verify(context, foreign, chosen, overwrite=overwrite)
         return map_and_report(context, mapper, extension, earlier=[report], page=page)
 
 
@@ -466,14 +484,25 @@ def map_and_report(
     overwrite: bool = False,
     page: bool = True,
 ) -> RunReport:
-    """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
+    """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``.
+
+    Args:
+        context: of the workspace, whose pairs are verified.
+        mapper: that makes the models.
+        extend: a model that the images are registered into.
+        earlier: what the stages before have done in this run.
+        overwrite: discard the models that are there.
+        page: also write ``report.html``.
+
+    Returns:
+        The report that is also written to ``report.json``.
+    """
     workspace = context.workspace
-    options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
-    sizes = {
-        name: (one.width, one.height) for name, one in context.graph.cameras.items()
-    }
+    sizes = dict[str, tuple[int, int]]()
+    for name, camera in context.graph.cameras.items():
+        sizes[name] = (camera.width, camera.height)
     marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
@@ -481,49 +510,65 @@ def map_and_report(
         gone, "is gone since its features were extracted; these are used"
     )
     report = replace(report, warnings={**report.warnings, **lost})
-    copied = workspace.is_foreign
-    verified = context.num_verified_inliers()
-    pair_inliers = {
-        pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)
-    }
+    pair_inliers = dict[Pair, int]()
+    for pair, num_inliers in context.num_verified_inliers().items():
+        if context.by_hand.allows(*pair):
+            pair_inliers[pair] = num_inliers
     missing = unregistered(context, names, models, pair_inliers)
     again = matched_again(context)
-    strongest = max(pair_inliers.values(), default=0)
     result = RunReport(
         output_path=workspace.path,
         images_total=len(names),
         unregistered=missing,
         models=tuple(models),
-        num_pairs=num_matched_pairs(workspace.database)
-        if copied
-        else len(context.listed_pairs()),
         num_verified_pairs=len(pair_inliers),
         stages=summed((*earlier, report)),
-        recipe="" if copied else workspace.recipe(),
         versions=installed_versions(),
-        preset=options.preset_name,
+        preset=mapper.options.preset_name,
         verification=context.verification.to_mapping(),
-        mapping=options.to_mapping(),
-        guided={} if copied else guided_counts(context),
+        mapping=mapper.options.to_mapping(),
         cameras=cameras_of_report(workspace, models, before),
-        lines={} if copied else lines_of_report(context.features, names),
         extended=tuple(before),
-        advice=advice(context, missing, models, strongest, again.untried, again.effort),
+        advice=advice(
+            context,
+            missing,
+            models,
+            max(pair_inliers.values(), default=0),
+            again.untried,
+            again.effort,
+        ),
         by_hand=context.by_hand.texts(),
         effort=again.effort if again.tried or again.untried else "",
         matched_again=again.tried,
         untried=again.untried,
+        **_own_results(context, names),
     )
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
     replace_text(workspace.report, result.to_json())
     if page:
-        pictures = draw_pairs_to_check(context, result, pair_inliers)
-        cameras = context.graph.cameras
         content = RunContent(
-            names, pair_inliers, workspace.photographs(), marks, pictures, cameras
+            names,
+            pair_inliers,
+            workspace.photographs(),
+            marks,
+            draw_pairs_to_check(context, result, pair_inliers),
+            context.graph.cameras,
         )
         write_run_page(workspace, result, content, context.progress)
     return result
+
+
+def _own_results(context: Context, names: Sequence[str]) -> dict[str, Any]:
+    """Return the fields of a report that the database of another program has otherwise, or not."""
+    workspace = context.workspace
+    if workspace.is_foreign:
+        return {"num_pairs": num_matched_pairs(workspace.database), "recipe": ""}
+    return {
+        "num_pairs": len(context.listed_pairs()),
+        "recipe": workspace.recipe(),
+        "guided": guided_counts(context),
+        "lines": lines_of_report(context.features, names),
+    }
 
 
 def _names_and_gone(

@@ -8,6 +8,7 @@ import struct
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Any, BinaryIO, TypeVar
@@ -32,17 +33,15 @@ from colmap_affrect.project.regular_files import (
     require_regular,
 )
 
-MAX_NUM_PX = (
-    1 << 29
-)  # of a photograph; those of the largest cameras have 400 megapixels
+# Of a photograph; those of the largest cameras have 400 megapixels
+MAX_NUM_PX = 1 << 29
 MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
 USUAL_BYTES = 1 << 26
 """Of a photograph, with all that cameras put beside its pixels, as short films; 64 MiB. Only longer
 files are compared with their pixels."""
 MAX_BYTES_PER_PX = 16  # four channels of four bytes
-ONE_AT_A_TIME = (
-    Lock()
-)  # filters of warnings are of the process: threads would mix them up
+# Filters of warnings are of the process: threads would mix them up
+ONE_AT_A_TIME = Lock()
 PNG = b"\x89PNG\r\n\x1a\n"
 PNM = b"P"
 READERS = {
@@ -54,10 +53,8 @@ READERS = {
     PNM: PpmImageFile,
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
-NEW_SUBFILE_TYPE, REDUCED = (
-    254,
-    1,
-)  # TIFF's tag, and its bit of a smaller copy of another page
+NEW_SUBFILE_TYPE = 254  # TIFF's tag of what a page is
+REDUCED = 1  # its bit of a smaller copy of another page
 
 Found = TypeVar("Found")
 
@@ -78,9 +75,10 @@ def opened(file: BinaryIO) -> Image.Image:
     file.seek(0)
     if start.startswith(PNM):  # whose header Pillow reads byte by byte
         file = io.BytesIO(file.read(MAX_HEADER))
-    return next(read for magic, read in READERS.items() if start.startswith(magic))(
-        file, ""
-    )
+    for magic, reader in READERS.items():
+        if start.startswith(magic):
+            return reader(file, "")
+    raise ValueError(UNREADABLE)
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
@@ -228,12 +226,14 @@ def require_possible(path: Path) -> None:
 
 
 UNREADABLE = "not a readable image (damaged, empty, or of an unknown format)"
-LIMITS_OF_OPENCV = tuple(
-    f"OPENCV_IO_MAX_IMAGE_{what}" for what in ("PIXELS", "WIDTH", "HEIGHT")
+LIMITS_OF_OPENCV = (
+    "OPENCV_IO_MAX_IMAGE_PIXELS",
+    "OPENCV_IO_MAX_IMAGE_WIDTH",
+    "OPENCV_IO_MAX_IMAGE_HEIGHT",
 )
-OPENCV_CHECKS_SIZE = (
-    "validateInputImageSize"  # its function that compares a header with these
-)
+# OpenCV's function that compares a header with these
+OPENCV_CHECKS_SIZE = "validateInputImageSize"
+MODES_WITH_ALPHA = ("RGBA", "RGBa", "LA", "La", "PA")  # Pillow's
 IMAGE_SUFFIXES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pbm", ".pgm", ".pnm",
     ".ppm",
@@ -254,30 +254,39 @@ FOREIGN_FORMATS = {
     "AVIF or HEIF": rb"....ftyp(avi|hei|hev|mif|msf)",
 }
 """First bytes of formats that OpenCV may read, whatever the suffix, and pycolmap's wheel not."""
-TONE_PERCENTILES = (
-    0.5,
-    99.5,
-)  # black and white of a stretched photograph but for dust and glints
+# Black and white of a stretched photograph but for dust and glints
+TONE_PERCENTILES = (0.5, 99.5)
 # A photograph whose tones fill less of the range of its file is stretched
 MIN_TONE_RANGE = 0.5
 # Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
 MAX_TONE_STEP = 16
-FLOAT_RANGE = (
-    -0.5,
-    2.0,
-)  # of floats that are meant from 0 to 1: filters and highlights go beyond
+# Of floats that are meant from 0 to 1: filters and highlights go beyond
+FLOAT_RANGE = (-0.5, 2.0)
 NUM_TONES = 250_000  # about so many pixels are looked at
 # Along each border is passed over: scans have frames and captions there
 FRAME_FRAC = 0.1
+
+
+@dataclass(frozen=True)
+class TiffLayout:
+    """Where the tags of a TIFF are, in the letters of :mod:`struct`."""
+
+    where: int  # byte at which the offset of the first page's tags is
+    offset: str  # type of offsets
+    count: str  # type of the number of tags
+    entry_bytes: int  # length of a tag; its value is at the end
+
+
+TIFF_LAYOUT = TiffLayout(where=4, offset="I", count="H", entry_bytes=12)
+BIG_TIFF_LAYOUT = TiffLayout(where=8, offset="Q", count="Q", entry_bytes=20)
 # What files of more than 4 GiB have in the place of 42, with offsets of 64 bits
 BIG_TIFF = 43
 GRAY_AS_STORED = (
     cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 )
 COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-EIGHTH_OF_COLOR = (
-    cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
-)  # fast, of JPEG
+# Fast, of JPEG
+EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def read_gray(path: Path) -> GrayImage:
@@ -286,21 +295,28 @@ def read_gray(path: Path) -> GrayImage:
 
 
 def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorImage:
-    """Read an image in colour as :func:`read_gray`, shrunk to at most ``max_size_px``.
+    """Read an image in colour, without applying EXIF orientation.
 
-    With ``stretch`` low contrast fills the range (:func:`tones`).
+    Args:
+        path: the file.
+        max_size_px: longest side that the image is shrunk to.
+        stretch: whether low contrast fills the range (:func:`tones`).
+
+    Returns:
+        (H, W, 3) uint8, RGB.
+
+    Raises:
+        ImageError: it is no image.
     """
     size = header_size(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
     is_far_larger = size is not None and max(size) >= 8 * max_size_px
+    flags = EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED
     try:
-        image = decode(path, EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED)[
-            :, :, ::-1
-        ]
+        image = decode(path, flags)[:, :, ::-1]
     except ImageError:  # OpenCV makes no colour of one channel of floats
         image = np.repeat(decode(path)[:, :, None], 3, axis=2)
-    return shrink_to(
-        in_eight_bits(image, tones(image) if stretch else None), max_size_px
-    )
+    black_and_white = tones(image) if stretch else None
+    return shrink_to(in_eight_bits(image, black_and_white), max_size_px)
 
 
 def tones(image: NDArray[Any]) -> tuple[float, float] | None:
@@ -342,9 +358,8 @@ def range_of_floats(image: NDArray[Any]) -> tuple[float, float] | None:
     is_float = np.issubdtype(image.dtype, np.floating)
     if is_float and low >= FLOAT_RANGE[0] and high <= FLOAT_RANGE[1]:
         return None
-    return float(low), float(
-        max(high, low + np.finfo(np.float32).eps * max(abs(low), 1.0))
-    )
+    least = low + np.finfo(np.float32).eps * max(abs(low), 1.0)
+    return float(low), float(max(high, least))
 
 
 def in_eight_bits(
@@ -403,8 +418,22 @@ def decoded(
     *,
     keeps_numbers: bool = False,
 ) -> NDArray[Any]:
-    """Decode the bytes of a photograph, which may change them; see :func:`decode`."""
-    if name := foreign_format(data):
+    """Decode the bytes of a photograph, which may change them.
+
+    Args:
+        data: (N,) bytes of the file.
+        path: of the file, for errors.
+        flags: OpenCV's.
+        keeps_numbers: see :func:`decode`.
+
+    Returns:
+        (H, W) or (H, W, channels).
+
+    Raises:
+        ImageError: it is no image.
+    """
+    name = foreign_format(data)
+    if name:
         raise ImageError(
             f"{path}: is of the format {name}, which COLMAP cannot read; convert it to PNG or "
             "JPEG (colmap-affrect convert)"
@@ -437,10 +466,10 @@ def _why_not_decoded(error: cv2.error) -> str:
 def foreign_format(data: Bytes) -> str:
     """Return the format of data that COLMAP cannot read, whatever the suffix, else nothing."""
     beginning = data[:16].tobytes()
-    matching = (
-        n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL)
-    )
-    return next(matching, "")
+    for name, pattern in FOREIGN_FORMATS.items():
+        if re.match(pattern, beginning, re.DOTALL):
+            return name
+    return ""
 
 
 def stand_upright(data: Bytes) -> None:
@@ -454,19 +483,17 @@ def stand_upright(data: Bytes) -> None:
     content = data.data
     with suppress(struct.error):  # damaged
         (version,) = struct.unpack_from(f"{order}H", content, 2)
-        where, offset, number, size = (
-            (8, "Q", "Q", 20) if version == BIG_TIFF else (4, "I", "H", 12)
-        )
-        (start,) = struct.unpack_from(order + offset, content, where)
-        (count,) = struct.unpack_from(order + number, content, start)
-        first = start + struct.calcsize(number)
-        for entry in range(first, min(first + count * size, data.size), size):
-            if struct.unpack_from(f"{order}H", content, entry) == (
-                ExifTags.Base.Orientation,
-            ):
-                struct.pack_into(
-                    f"{order}H", content, entry + size - struct.calcsize(offset), 1
-                )
+        layout = BIG_TIFF_LAYOUT if version == BIG_TIFF else TIFF_LAYOUT
+        (start,) = struct.unpack_from(order + layout.offset, content, layout.where)
+        (count,) = struct.unpack_from(order + layout.count, content, start)
+        first = start + struct.calcsize(layout.count)
+        end = min(first + count * layout.entry_bytes, data.size)
+        for entry in range(first, end, layout.entry_bytes):
+            (tag,) = struct.unpack_from(f"{order}H", content, entry)
+            if tag == ExifTags.Base.Orientation:
+                next_entry = entry + layout.entry_bytes
+                value = next_entry - struct.calcsize(layout.offset)
+                struct.pack_into(f"{order}H", content, value, 1)
 
 
 def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
@@ -499,9 +526,8 @@ def alpha_mask(path: Path) -> Mask | None:
     alpha = image[:, :, 3] if is_there else read_header(path, _alpha_beside_gray)
     if alpha is None:
         return None
-    half = (
-        np.iinfo(alpha.dtype).max / 2 if np.issubdtype(alpha.dtype, np.integer) else 0.5
-    )
+    is_integer = np.issubdtype(alpha.dtype, np.integer)
+    half = np.iinfo(alpha.dtype).max / 2 if is_integer else 0.5
     mask = np.asarray(alpha > half)
     return mask if mask.any() and not mask.all() else None
 
@@ -516,9 +542,7 @@ def _alpha_beside_gray(file: BinaryIO) -> NDArray[Any] | None:
 
 def _has_alpha(file: BinaryIO) -> bool:
     image = opened(file)
-    return (
-        image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
-    )
+    return image.mode in MODES_WITH_ALPHA or "transparency" in image.info
 
 
 def encode_mask(mask: Mask) -> bytes:

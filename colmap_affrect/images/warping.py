@@ -17,7 +17,8 @@ ANTI_ALIASING_SIGMA = 0.8
 TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression
 # Points along a side of a tile at which its compression is measured
 SAMPLES_PER_TILE = 5
-MAX_DENSITY = 16  # samples per px of a warp along an axis; beyond, memory counts more than aliasing
+# Samples per px of a warp along an axis; beyond, memory counts more than aliasing
+MAX_DENSITY = 16
 
 
 def halved(image: Singles) -> Singles:
@@ -76,12 +77,8 @@ def _warp_affine(source: Singles, rectification: Rectification) -> GrayImage:
 
 def _anti_aliasing_sigma(compression: float, density: int) -> float:
     """Return the blur before a compression, in px of a grid ``density`` times the warp's."""
-    return (
-        ANTI_ALIASING_SIGMA
-        * sqrt(max(compression**2 - 1.0, 0.0))
-        * density
-        / compression
-    )
+    blur = ANTI_ALIASING_SIGMA * sqrt(max(compression**2 - 1.0, 0.0))
+    return blur * density / compression
 
 
 def _tiles(
@@ -101,10 +98,10 @@ def _warp_tile(
 ) -> Singles:
     """Render one tile of (width, height), with surroundings as far as the blur reaches."""
     compressions = _compressions(image_from_tile, size, source.shape[1::-1])
-    density_x, density_y = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY).astype(
-        int
-    )
-    sigma_x, sigma_y = map(_anti_aliasing_sigma, compressions, (density_x, density_y))
+    densities = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY)
+    density_x, density_y = densities.astype(int)
+    sigma_x = _anti_aliasing_sigma(compressions[0], density_x)
+    sigma_y = _anti_aliasing_sigma(compressions[1], density_y)
     reach_x = ceil(3 * sigma_x)
     reach_y = ceil(3 * sigma_y)
     columns = np.arange(-reach_x, (size[0] - 1) * density_x + reach_x + 1) / density_x
@@ -112,7 +109,10 @@ def _warp_tile(
     x, y, _ = _source_points(image_from_tile, columns, rows, source.shape[1::-1])
     dense = cv2.remap(source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     dense = cv2.GaussianBlur(
-        dense, (2 * reach_x + 1, 2 * reach_y + 1), sigma_x, sigmaY=sigma_y
+        dense,
+        ksize=(2 * reach_x + 1, 2 * reach_y + 1),
+        sigmaX=sigma_x,
+        sigmaY=sigma_y,
     )
     rows_end = dense.shape[0] - reach_y
     columns_end = dense.shape[1] - reach_x
@@ -144,16 +144,16 @@ def _source_points(
 
     Points further than an image size away are moved there: a border is reflected once.
     """
-    x, y, third = (
+    x, y, depth = (
         form[0] * columns + form[1] * rows[:, None] + form[2]
         for form in image_from_tile
     )
-    ahead = third > 0.0
-    third = np.where(ahead, third, 1.0)
+    is_ahead = depth > 0.0
+    depth = np.where(is_ahead, depth, 1.0)
     width, height = image_size
-    x = np.clip(x / third, -width, 2 * width)
-    y = np.clip(y / third, -height, 2 * height)
-    return x.astype(np.float32), y.astype(np.float32), ahead
+    x = np.clip(x / depth, -width, 2 * width)
+    y = np.clip(y / depth, -height, 2 * height)
+    return x.astype(np.float32), y.astype(np.float32), is_ahead
 
 
 def mask_values(mask: Mask) -> Bytes:

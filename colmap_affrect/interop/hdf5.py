@@ -84,7 +84,7 @@ from colmap_affrect.project.stores import (
 )
 from colmap_affrect.stages.descriptors import (
     Arrays,
-    matched,
+    iterate_matches,
     unit_rows,
     write_given_matches,
 )
@@ -277,7 +277,7 @@ def _matches(
 
     def matched_pairs(_: Mapping[str, int]) -> Iterator[tuple[Pair, Indices]]:
         try:
-            for pair, matches in matched(pairs, read):
+            for pair, matches in iterate_matches(pairs, read):
                 yield pair, matches.indices
         except OptionError as error:
             raise StoreError(f"{features.path}: {error}") from error

@@ -26,9 +26,8 @@ class ImageRows:
 
     ids: dict[str, int]
     cameras: dict[str, pycolmap.Camera]
-    num_keypoints: dict[
-        str, int
-    ]  # of the images that have keypoints on record, also none
+    # Of the images that have keypoints on record, also none
+    num_keypoints: dict[str, int]
 
 
 class ViewGraph:
@@ -130,17 +129,16 @@ class ViewGraph:
         Returns:
             By pair of image names (M, 2) features of both images.
         """
-        found = self._all_inliers()
-        return {
-            pair: rows for pair, rows in found.items() if len(rows) >= min_num_inliers
-        }
+        found = dict[Pair, Indices]()
+        for pair, matches in self._all_inliers().items():
+            if len(matches) >= min_num_inliers:
+                found[pair] = matches
+        return found
 
     def num_inliers(self, min_num_inliers: int) -> dict[Pair, int]:
         """Return the number of inliers of each pair that has at least so many."""
-        return {
-            pair: len(matches)
-            for pair, matches in self.inliers(min_num_inliers).items()
-        }
+        inliers = self.inliers(min_num_inliers)
+        return {pair: len(matches) for pair, matches in inliers.items()}
 
     def digest(self) -> str:
         """Return a SHA-256 of all rows but descriptors."""
@@ -171,17 +169,15 @@ class ViewGraph:
 
 
 def _read_images(database: pycolmap.Database) -> ImageRows:
-    images = database.read_all_images()
     cameras = cameras_of_images(database)
-    return ImageRows(
-        ids={image.name: image.image_id for image in images},
-        cameras={image.name: cameras[image.image_id] for image in images},
-        num_keypoints={
-            image.name: database.num_keypoints_for_image(image.image_id)
-            for image in images
-            if database.exists_keypoints(image.image_id)
-        },
-    )
+    rows = ImageRows(ids={}, cameras={}, num_keypoints={})
+    for image in database.read_all_images():
+        rows.ids[image.name] = image.image_id
+        rows.cameras[image.name] = cameras[image.image_id]
+        if database.exists_keypoints(image.image_id):
+            count = database.num_keypoints_for_image(image.image_id)
+            rows.num_keypoints[image.name] = count
+    return rows
 
 
 def _read_inliers(

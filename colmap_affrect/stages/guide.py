@@ -76,11 +76,11 @@ def current(context: Context) -> list[GuidedPair]:
     if not (context.workspace.guided.exists() and path.exists()):
         return []
     counts = context.graph.num_inliers(0)
-    return [
-        pair
-        for pair in context.guided.read()
-        if pair.num_inliers in (0, counts.get(pair.names))
-    ]
+    found = []
+    for pair in context.guided.read():
+        if pair.num_inliers in (0, counts.get(pair.names)):
+            found.append(pair)
+    return found
 
 
 def guided_counts(context: Context) -> dict[str, int]:
@@ -97,7 +97,7 @@ def guided_counts(context: Context) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class GuidedTask:
-    """A verified pair to match again; of its images the one with the lower id comes first."""
+    """A verified pair to match again; its image with the lower id comes first."""
 
     names: Pair  # of the two images
     model: PairModel  # its geometry, and all keypoints
@@ -153,11 +153,10 @@ class Guiding:
         self.options = options
         self.ids = context.graph.ids
         max_size_px = context.extraction.max_image_size_px
-        sizes = context.features.image_sizes()
         # Bands are as wide as features are exact: in pixels of the images as they were extracted.
-        self.scales = {
-            name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()
-        }
+        self.scales = dict[str, float]()
+        for name, size in context.features.image_sizes().items():
+            self.scales[name] = max(1.0, max(size) / max_size_px)
         self.verifier = PairVerifier(
             context.graph.ids,
             context.graph.cameras,
@@ -188,7 +187,7 @@ class Guiding:
         """Return the images of those pairs that were matched again, and have enough."""
         if not pairs:
             return set()
-        asked = {frozenset(pair) for pair in pairs}
+        asked = set(map(frozenset, pairs))
         listed = [
             pair for pair in self.context.listed_pairs() if frozenset(pair) in asked
         ]
@@ -201,9 +200,9 @@ class Guiding:
             return set(self.ids)
         if self.options.enabled != "auto":
             return set()
-        names = {name for pair in exact for name in pair}
+        num_images = len(set[str]().union(*exact))
         # Of two images alone there are no longer tracks.
-        limit = self.options.min_num_tracks if len(names) > 2 else 0
+        limit = self.options.min_num_tracks if num_images > 2 else 0
         return weakly_connected_images(exact, limit)
 
     def guide(self, pairs: Sequence[Pair], advance: Callable[[int], None]) -> None:
@@ -225,11 +224,12 @@ class Guiding:
             tasks = self._tasks(batch)
             found = list[tuple[GuidedTask, Indices]]()
             matched = executor.map(matcher, tasks, [features.path])
+            without_model = set(batch)
             for task, matches in zip(tasks, matched, strict=True):
                 moving = stationary.left(task.names, matches)
                 found.append((task, matches[moving]))
+                without_model.discard(task.names)
                 advance(1)
-            without_model = set(batch).difference(task.names for task in tasks)
             self.context.guided.write(
                 GuidedPair(names, NOTHING, 0) for names in sorted(without_model)
             )
@@ -244,20 +244,25 @@ class Guiding:
             for names in pairs:
                 first = self.ids[names[0]]
                 second = self.ids[names[1]]
-                keypoints = (
-                    database.read_keypoints(first),
-                    database.read_keypoints(second),
-                )
                 geometry = database.read_two_view_geometry(first, second)
                 model = pair_model(
-                    geometry, (cameras[first], cameras[second]), keypoints
+                    geometry,
+                    cameras=(cameras[first], cameras[second]),
+                    keypoints=(
+                        database.read_keypoints(first),
+                        database.read_keypoints(second),
+                    ),
                 )
                 if not model:
                     continue
-                inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-                scaled = model.scaled(self.scales[names[0]], self.scales[names[1]])
-                is_calibrated = geometry.config == CALIBRATED
-                tasks.append(GuidedTask(names, scaled, inliers, is_calibrated))
+                inliers = np.asarray(geometry.inlier_matches, np.int64)
+                task = GuidedTask(
+                    names=names,
+                    model=model.scaled(self.scales[names[0]], self.scales[names[1]]),
+                    inliers=inliers.reshape(-1, 2),
+                    is_calibrated=geometry.config == CALIBRATED,
+                )
+                tasks.append(task)
         return tasks
 
     def _keep(self, found: Sequence[tuple[GuidedTask, Indices]]) -> None:
@@ -272,14 +277,12 @@ class Guiding:
             geometry = self.verifier.geometry(task.names, frames, matches)
             if _is_better(geometry, task):
                 geometries[task.names] = geometry
-        counts = {
-            names: len(geometry.inlier_matches)
-            for names, geometry in geometries.items()
-        }
-        self.context.guided.write(
-            GuidedPair(task.names, task.inliers, counts.get(task.names, 0))
-            for task, _ in found
-        )
+        pairs = []
+        for task, _ in found:
+            better = geometries.get(task.names)
+            num_inliers = len(better.inlier_matches) if better else 0
+            pairs.append(GuidedPair(task.names, task.inliers, num_inliers))
+        self.context.guided.write(pairs)
         self._write(geometries)
 
     def _write(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:

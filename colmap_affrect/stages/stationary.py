@@ -8,7 +8,7 @@ same place, but not to the pixel: see :mod:`colmap_affrect.geometry.stationary`.
 
 import logging
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -31,6 +31,7 @@ logger = logging.getLogger(__name__)
 # Of the longer side; less is no motion: scans are not cut to the pixel
 MAX_MOTION_FRAC = 0.005
 NUM_CELLS = 48  # cells along the longer side
+IMAGES_IN_MEMORY = 256  # whose keypoints are kept
 MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
@@ -99,7 +100,7 @@ class StationaryFilter:
         """Name the files; what is known of places is read now."""
         self._features = features
         self._matches = matches
-        self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
+        self._points = lru_cache(IMAGES_IN_MEMORY)(self._read_points)
         self._places = dict[Size, Mask]()
         self._of_still_cameras = set(matches.state.still_cameras)
         for size, cells in matches.state.stationary:
@@ -112,18 +113,29 @@ class StationaryFilter:
     def _sizes(self) -> dict[str, Size]:
         return self._features.image_sizes()
 
+    def _read_points(self, name: str) -> Floats:
+        """Return the (N, 2) keypoints of an image in pixel-centre px."""
+        return self._features.read_frames(name)[:, :, 2]
+
     def filtered(self, found: PairMatches) -> PairMatches:
         """Return the matches of a pair without those of captions, frames and watermarks."""
         left = self.left(found.names, found.indices)
         return replace(found, indices=found.indices[left], scores=found.scores[left])
 
     def left(self, names: Pair, indices: Indices) -> Mask:
-        """Return which (M, 2) matches of a pair are kept.
+        """Return which matches of a pair are kept.
 
         Left out is what does not move at a place where nothing does, or beside it, since what is
         faint matches less; and what goes from one such place to another, as of equal letters. Of a
         pair that shows the same background, also what begins or ends on it, as of equal windows;
         and what does not move to the pixel, where the camera stood still.
+
+        Args:
+            names: of both images.
+            indices: (M, 2) int64 numbers of their features.
+
+        Returns:
+            (M,) bool.
         """
         size = self._common_size(names) if self._places else None
         if size is None or size not in self._places:
@@ -190,9 +202,8 @@ class StationaryFilter:
     def _learn_backgrounds(self, pairs: Sequence[Pair]) -> None:
         """Find where each photograph shows what stands still, and nothing that hides it."""
         votes: dict[str, _Votes] = defaultdict(_Votes.none)
-        for found in self._matches.read(
-            [p for p in pairs if self._common_size(p) in self._places]
-        ):
+        of_sizes = [pair for pair in pairs if self._common_size(pair) in self._places]
+        for found in self._matches.read(of_sizes):
             size = self._sizes[found.names[0]]
             are_still, first, second = self._still(found.names, found.indices, size)
             for name, cells in zip(found.names, (first, second), strict=True):
@@ -229,9 +240,7 @@ class StationaryFilter:
         images: dict[Size, Mask] = defaultdict(
             lambda: np.zeros((*cells, len(numbers)), bool)
         )
-        for found in self._matches.read(
-            [pair for pair in pairs if self._common_size(pair)]
-        ):
+        for found in self._matches.read(list(filter(self._common_size, pairs))):
             size = self._sizes[found.names[0]]
             are_still, first, _ = self._still(found.names, found.indices, size)
             matched[size] += _mask(first)
@@ -241,18 +250,17 @@ class StationaryFilter:
                 images[size][unmoved, numbers[name]] = True
         places = {}
         for size, counts in matched.items():
-            likely = (still[size] >= MIN_NUM_PAIRS) & (
-                still[size] >= MIN_SHARE * counts
-            )
+            likely = still[size] >= MIN_NUM_PAIRS
+            likely &= still[size] >= MIN_SHARE * counts
             likely &= images[size].sum(2) >= MIN_NUM_IMAGES
             if likely.any():
                 exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
-                num_likely = likely.sum()
-                num_matched = (counts >= MIN_NUM_PAIRS).sum()
-                num_exact = (likely & exact).sum()
-                is_most = bool(num_likely > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
-                is_most_exact = bool(num_exact > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
-                places[size] = _Places(likely & exact, is_most, is_most_exact)
+                limit = MAX_SHARE_OF_PHOTOGRAPH * (counts >= MIN_NUM_PAIRS).sum()
+                places[size] = _Places(
+                    still=likely & exact,
+                    is_most=bool(likely.sum() > limit),
+                    is_most_exact=bool((likely & exact).sum() > limit),
+                )
         return places
 
     def _evidence(self, pairs: Sequence[Pair], size: Size, likely: Mask) -> Array:
@@ -265,9 +273,7 @@ class StationaryFilter:
         limit_px = MAX_MOTION_FRAC * max(size)
         tolerance_px = _tolerance_px(size)
         own, connected = np.zeros((2, NUM_CELLS, NUM_CELLS))
-        for found in self._matches.read(
-            [p for p in pairs if self._common_size(p) == size]
-        ):
+        for found in self._matches_of_size(pairs, size):
             are_still, first, _ = self._still(found.names, found.indices, size)
             cells = first[are_still]
             if not _at(likely, cells).any():
@@ -286,9 +292,7 @@ class StationaryFilter:
         """Tell whether enough matches of some pairs move together outside of places."""
         num_pairs = 0
         names = set[str]()
-        for found in self._matches.read(
-            [p for p in pairs if self._common_size(p) == size]
-        ):
+        for found in self._matches_of_size(pairs, size):
             are_still, first, second = self._still(found.names, found.indices, size)
             are_moving = ~(are_still | _at(places, first) | _at(places, second))
             points, others = self._ends(found.names, found.indices[are_moving])
@@ -297,6 +301,13 @@ class StationaryFilter:
                 num_pairs += 1
                 names.update(found.names)
         return num_pairs >= MIN_NUM_PAIRS and len(names) >= MIN_NUM_IMAGES
+
+    def _matches_of_size(
+        self, pairs: Sequence[Pair], size: Size
+    ) -> Iterator[PairMatches]:
+        """Return the matches of the pairs whose photographs both have a size."""
+        of_size = [pair for pair in pairs if self._common_size(pair) == size]
+        return self._matches.read(of_size)
 
     def _still(
         self, names: Pair, indices: Indices, size: Size
@@ -317,9 +328,8 @@ class StationaryFilter:
 
     def _ends(self, names: Pair, indices: Indices) -> tuple[Floats, Floats]:
         """Return the (M, 2) px of matches in both images."""
-        first, second = (
-            self._points(name)[indices[:, side]] for side, name in enumerate(names)
-        )
+        first = self._points(names[0])[indices[:, 0]]
+        second = self._points(names[1])[indices[:, 1]]
         return first, second
 
     def _common_size(self, pair: Pair) -> Size | None:
