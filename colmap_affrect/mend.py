@@ -158,7 +158,7 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
         return
     verify_matches(context)
     if "escalate" in begun:
-        update_verified(context, context.listed_pairs(), replaces=True)
+        update_verified(context, pairs=context.listed_pairs(), replaces=True)
     if "guide" in begun:
         guide(context)
 

@@ -119,18 +119,25 @@ def _run(
     mapper = MAPPERS.make(options.mapper_options())
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    _check_extension(options.extend, mapper, workspace.path, overwrite=overwrite)
-    _check_by_hand(
-        options.by_hand, names, mapper, lambda name: header_size(image_path / name)
+    _check_extension(
+        options.extend, mapper, output_path=workspace.path, overwrite=overwrite
     )
-    forecast = Forecast(len(names), _num_pairs(names, options.pairs, image_path))
+    _check_by_hand(
+        options.by_hand,
+        names,
+        mapper,
+        size_of=lambda name: header_size(image_path / name),
+    )
+    forecast = Forecast(
+        len(names), _num_pairs(names, options=options.pairs, image_path=image_path)
+    )
     context = replace(context, progress=replace(context.progress, forecast=forecast))
     if options.extend:
         existing_names(options.extend.model_path, names)
     recipe.extraction.check_depth()
     weights_path = options.resources.weights_path
     resolve(recipe.required_weights, weights_path, progress=context.progress)
-    load_matchers(context, recipe.extraction, recipe.matching)
+    load_matchers(context, recipe.extraction, options=recipe.matching)
     later = options.later_stages()
     with workspace.locked(), watched(context, follows=False, discards=overwrite):
         reports = [
@@ -235,10 +242,10 @@ def _context(
         wanted = "give the output folder of a run; map_database and verify_matches take databases"
         raise OptionError(f"output_path={str(path)!r}: is a file; {wanted}")
     return Context(
-        Workspace(path),
-        Resources.given(resources, "resources"),
-        executor,
-        Progress.given(progress),
+        workspace=Workspace(path),
+        resources=Resources.given(resources, "resources"),
+        executor=executor,
+        progress=Progress.given(progress),
         by_hand=ByHand.given(by_hand, "by_hand"),
     )
 
@@ -328,7 +335,7 @@ def match(
     matcher = None if matching is None else MATCHERS.options(matching, "matching")
     context = _context(output_path, progress, resources, executor)
     with one_stage("match", context):
-        return match_pairs(context, matcher, overwrite=overwrite)
+        return match_pairs(context, pairs=matcher, overwrite=overwrite)
 
 
 def verify(
@@ -384,7 +391,7 @@ def map_images(
     with one_stage("map", _context(output_path, progress, by_hand=by_hand)) as context:
         mapper = chosen or MAPPERS.make(context.mapping)
         return map_and_report(
-            context, mapper, extension, overwrite=overwrite, page=page
+            context, mapper, extend=extension, overwrite=overwrite, page=page
         )
 
 
@@ -431,24 +438,28 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
     """
     require_bools(overwrite=overwrite, page=page)
     foreign = ForeignDatabase(
-        as_path(database_path, "database_path"),
-        as_path_or_none(image_path, "image_path"),
-        CameraOptions.given(cameras, "cameras"),
-        as_path_or_none(matches_path, "matches_path"),
-        match_type,
-        as_path_or_none(match_list_path, "match_list_path"),
+        path=as_path(database_path, "database_path"),
+        image_path=as_path_or_none(image_path, "image_path"),
+        cameras=CameraOptions.given(cameras, "cameras"),
+        matches_path=as_path_or_none(matches_path, "matches_path"),
+        match_type=match_type,
+        match_list_path=as_path_or_none(match_list_path, "match_list_path"),
     )
     context = _context(output_path, progress, by_hand=by_hand)
     mapper = _mapper_of(mapping)
     chosen = VerificationOptions.given(verification, "verification")
     extension = as_extension(extend)
-    _check_foreign(context, foreign, mapper, extension, overwrite=overwrite)
+    _check_foreign(context, foreign, mapper, extend=extension, overwrite=overwrite)
     with (
         context.workspace.locked(),
         watched(context, follows=False, discards=overwrite),
     ):
-        report = import_and_verify(context, foreign, chosen, overwrite=overwrite)
-        return map_and_report(context, mapper, extension, earlier=[report], page=page)
+        report = import_and_verify(
+            context, foreign, verification=chosen, overwrite=overwrite
+        )
+        return map_and_report(
+            context, mapper, extend=extension, earlier=[report], page=page
+        )
 
 
 def _mapper_of(mapping: MapperOptions | Mapping[str, Any] | str | None) -> Mapper:
@@ -467,11 +478,18 @@ def _check_foreign(
     if foreign.match_type not in get_args(MatchType):
         raise OptionError(f"match_type={foreign.match_type!r}: give 'raw' or 'inliers'")
     schema_version(foreign.path)
-    _check_extension(extend, mapper, context.workspace.path, overwrite=overwrite)
+    _check_extension(
+        extend, mapper, output_path=context.workspace.path, overwrite=overwrite
+    )
     if extend:
         read_to_extend(extend.model_path)
     sizes = read_sizes(foreign.path)
-    _check_by_hand(context.by_hand, read_names(foreign.path), mapper, sizes.get)
+    _check_by_hand(
+        context.by_hand,
+        names=read_names(foreign.path),
+        mapper=mapper,
+        size_of=sizes.get,
+    )
     foreign.check()
 
 
@@ -499,11 +517,11 @@ def map_and_report(
     """
     workspace = context.workspace
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
-    _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
+    _check_extension(extend, mapper, output_path=workspace.path, overwrite=overwrite)
     sizes = dict[str, tuple[int, int]]()
     for name, camera in context.graph.cameras.items():
         sizes[name] = (camera.width, camera.height)
-    marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
+    marks = _check_by_hand(context.by_hand, names, mapper, size_of=sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
     lost = dict.fromkeys(

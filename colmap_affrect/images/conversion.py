@@ -101,7 +101,9 @@ def convert_images(
         new_results(output_path, names=names) as (folder,),
         progress.stage("convert", len(names), "images") as advance,
     ):
-        conversion = _Conversion(image_path, folder, output_path, names)
+        conversion = _Conversion(
+            image_path=image_path, folder=folder, output_path=output_path, names=names
+        )
         for name in names:
             conversion.add(name)
             advance(1)
@@ -183,7 +185,9 @@ def _possible_names(name: str) -> Iterator[str]:
     path = PurePosixPath(name)
     for number in count(1):
         stem = path.stem if number == 1 else f"{path.stem}-{number}"
-        yield path.with_name(fitting_name(stem, path.suffix, LONGEST_NAME)).as_posix()
+        yield path.with_name(
+            fitting_name(stem, path.suffix, most=LONGEST_NAME)
+        ).as_posix()
 
 
 def _require_picture(path: Path, data: Bytes) -> None:

@@ -126,7 +126,7 @@ def _read_map(path: Path) -> NDArray[Any]:
     if path.suffix != ".npy":
         if prod(header_size(path) or (0,)) > MAX_NUM_VALUES:
             raise ValueError
-        return decode(path, cv2.IMREAD_UNCHANGED, keeps_numbers=True)
+        return decode(path, flags=cv2.IMREAD_UNCHANGED, keeps_numbers=True)
     # A map into memory, which takes none yet
     values = np.load(path, mmap_mode="r", allow_pickle=False)
     if values.size > MAX_NUM_VALUES:

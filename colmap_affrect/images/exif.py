@@ -124,8 +124,8 @@ def _tags_of_file(file: BinaryIO) -> CameraTags:
         equivalent_mm=number(tag.FocalLengthIn35mmFilm),
         px_per_mm=_resolution(
             number(tag.FocalPlaneXResolution),
-            number(tag.FocalPlaneYResolution),
-            number(tag.FocalPlaneResolutionUnit),
+            down=number(tag.FocalPlaneYResolution),
+            unit_number=number(tag.FocalPlaneResolutionUnit),
         ),
         original_size=_whole_size(
             number(tag.ExifImageWidth), number(tag.ExifImageHeight)
@@ -201,7 +201,9 @@ def exif_focal(
     stated = _statements(tags, sensor_width_mm)
     if not stated:
         lens_mm = tags.focal_mm or 0.0
-        return ExifFocal(None, why="no EXIF focal length in px", lens_mm=lens_mm)
+        return ExifFocal(
+            focal_px=None, why="no EXIF focal length in px", lens_mm=lens_mm
+        )
     return _reconcile(tags, stated)
 
 
@@ -250,10 +252,14 @@ def _reconcile(tags: CameraTags, stated: Mapping[str, float]) -> ExifFocal:
         key = next(each for each in plausible if each != RESOLUTION)
     focal_px = plausible[key]
     if key == RESOLUTION and tags.scale != 1.0:
-        return ExifFocal(focal_px, True, f"shrunk: {_sizes(tags)}")
+        return ExifFocal(
+            focal_px=focal_px, is_rescaled=True, why=f"shrunk: {_sizes(tags)}"
+        )
     wrong = " and ".join(_contradicting(stated, focal_px))
     why = f"EXIF's {wrong} is not that of these pixels, its {key} counts"
-    return ExifFocal(focal_px, key != colmaps_key, why if wrong else "")
+    return ExifFocal(
+        focal_px=focal_px, is_rescaled=key != colmaps_key, why=why if wrong else ""
+    )
 
 
 def _plausible_focals(stated: Mapping[str, float], longer: int) -> dict[str, float]:

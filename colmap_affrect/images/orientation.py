@@ -32,7 +32,7 @@ def forget_orientation(path: Path) -> None:
         _change_png(data)
     else:
         stand_upright(np.frombuffer(data, np.uint8))
-        _change_xmp(data, 0, len(data))
+        _change_xmp(data, start=0, end=len(data))
     if data != before:
         replace_bytes(path, bytes(data))  # not what it may be linked to
 
@@ -61,7 +61,7 @@ def _change_exif(data: bytearray, start: int, end: int) -> None:
 def _change_jpeg(data: bytearray) -> None:
     for start, end in _jpeg_segments(data):
         if data.startswith(JPEG_EXIF, start):
-            _change_exif(data, start + len(JPEG_EXIF), end)
+            _change_exif(data, start=start + len(JPEG_EXIF), end=end)
         elif data.startswith(JPEG_XMP, start):
             _change_xmp(data, start, end)
 

@@ -386,7 +386,7 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
             listed.append(line.strip())
     if not listed:
         raise OptionError(f"{image_list_path}: is empty")
-    return checked_names(image_path, listed, str(image_list_path))
+    return checked_names(image_path, names=listed, where=str(image_list_path))
 
 
 def checked_names(image_path: Path, names: Iterable[PathLike], where: str) -> list[str]:

@@ -53,7 +53,7 @@ def warp(
         (*rectification.canvas_size[::-1], *source.shape[2:]), dtype=np.uint8
     )
     for tile, image_from_tile in _tiles(warped, rectification):
-        tile[:] = np.rint(_warp_tile(source, image_from_tile, tile.shape[1::-1]))
+        tile[:] = np.rint(_warp_tile(source, image_from_tile, size=tile.shape[1::-1]))
     return warped
 
 
@@ -97,7 +97,7 @@ def _warp_tile(
     source: Singles, image_from_tile: Array, size: tuple[int, int]
 ) -> Singles:
     """Render one tile of (width, height), with surroundings as far as the blur reaches."""
-    compressions = _compressions(image_from_tile, size, source.shape[1::-1])
+    compressions = _compressions(image_from_tile, size, image_size=source.shape[1::-1])
     densities = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY)
     density_x, density_y = densities.astype(int)
     sigma_x = _anti_aliasing_sigma(compressions[0], density_x)
@@ -106,7 +106,9 @@ def _warp_tile(
     reach_y = ceil(3 * sigma_y)
     columns = np.arange(-reach_x, (size[0] - 1) * density_x + reach_x + 1) / density_x
     rows = np.arange(-reach_y, (size[1] - 1) * density_y + reach_y + 1) / density_y
-    x, y, _ = _source_points(image_from_tile, columns, rows, source.shape[1::-1])
+    x, y, _ = _source_points(
+        image_from_tile, columns, rows, image_size=source.shape[1::-1]
+    )
     dense = cv2.remap(source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     dense = cv2.GaussianBlur(
         dense,
@@ -126,7 +128,9 @@ def _compressions(
     columns, rows = (np.linspace(0, extent - 1, SAMPLES_PER_TILE) for extent in size)
     points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = points[points @ image_from_tile[2, :2] + image_from_tile[2, 2] > 0.0]
-    unit = lafs_from_keypoints(points, np.ones(len(points)), np.zeros(len(points)))
+    unit = lafs_from_keypoints(
+        points, radii_px=np.ones(len(points)), angles_rad=np.zeros(len(points))
+    )
     spans = transform_lafs(image_from_tile, unit)
     seen = is_inside(spans[:, :, 2], image_size)
     return np.asarray(
@@ -183,7 +187,10 @@ def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Byte
     for tile, image_from_tile in _tiles(mask, rectification):
         rows, columns = map(np.arange, tile.shape)
         x, y, ahead = _source_points(
-            region_from_image @ image_from_tile, columns, rows, region.shape[::-1]
+            region_from_image @ image_from_tile,
+            columns,
+            rows,
+            image_size=region.shape[::-1],
         )
         inside = cv2.remap(
             values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT

@@ -45,7 +45,7 @@ def checks_arguments(
         if not kinds:
             kinds.update(get_type_hints(function))
         for name, value in names.bind(*args, **kwargs).arguments.items():
-            require_type(name, value, kinds.get(name, Any))
+            require_type(name, value, kind=kinds.get(name, Any))
         return function(*args, **kwargs)
 
     return checked
@@ -77,7 +77,7 @@ def require_type(name: str, value: Any, kind: Any) -> None:
 def require_bools(**given: Any) -> None:
     """Refuse arguments, by their names, that are neither True nor False."""
     for name, value in given.items():
-        require_type(name, value, bool)
+        require_type(name, value, kind=bool)
 
 
 def _shown(value: Any) -> str:
@@ -119,10 +119,8 @@ def _is_instance(value: Any, kind: Any) -> bool:
 
 
 def _has_public_names_of(value: Any, protocol: type) -> bool:
-    for name in vars(protocol):
-        if not name.startswith("_") and not hasattr(value, name):
-            return False
-    return True
+    names = [name for name in vars(protocol) if not name.startswith("_")]
+    return all(hasattr(value, name) for name in names)
 
 
 def _is_tuple(value: Any, inner: tuple[Any, ...]) -> bool:

@@ -106,4 +106,4 @@ def opened(path: Path) -> Iterator[GivenFile]:
         except SystemError as error:  # h5py's, for a name that is no UTF-8
             raise ValueError(error) from error
     with file:
-        yield GivenFile(path, file, shapes)
+        yield GivenFile(path=path, file=file, shapes=shapes)

@@ -83,10 +83,7 @@ class MatchState:
 
         Of images that have gone nothing is left; others may get their names.
         """
-        backgrounds = []
-        for name, cells in self.backgrounds:
-            if name not in images:
-                backgrounds.append((name, cells))
+        backgrounds = filter(lambda known: known[0] not in images, self.backgrounds)
         return MatchState(
             stationary=self.stationary,
             still_cameras=self.still_cameras,

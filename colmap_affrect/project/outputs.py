@@ -126,7 +126,11 @@ def new_results(
         made = [folders[target.parent] / target.name for target in targets]
         yield made
         for target in targets:  # native writers say nothing of a full disk
-            require_space(folders[target.parent].with_name("rest"), SPARE_BYTES, target)
+            require_space(
+                folders[target.parent].with_name("rest"),
+                num_bytes=SPARE_BYTES,
+                named=target,
+            )
         with uninterrupted():
             if not replaces:  # somebody may have made one meanwhile
                 _refuse_existing(targets)

@@ -122,7 +122,9 @@ class Mapped(BaseModel):
     @property
     def made_from(self) -> MappedFrom:
         """What they were made from."""
-        return MappedFrom(self.verified, self.by_hand, self.extends)
+        return MappedFrom(
+            verified=self.verified, by_hand=self.by_hand, extends=self.extends
+        )
 
 
 class _Record(BaseModel):
@@ -142,7 +144,7 @@ def read_record(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     other = f"use another --output-path than {path.parent}"
-    with damage(path, f"restore it, or {other}", WorkspaceError):
+    with damage(path, mend=f"restore it, or {other}", error_class=WorkspaceError):
         values = tomllib.loads(read_regular_text(path))
         if values.pop("format_version", None) != FORMAT_VERSION:
             raise WorkspaceError(
@@ -200,8 +202,7 @@ def first_difference(
 
 def _part_names_first(key: str) -> tuple[bool, str]:
     """Return by what options are sorted: with another part most other options differ, too."""
-    is_name = key.rpartition(".")[2] == "name"
-    return not is_name, key
+    return key.rpartition(".")[2] != "name", key
 
 
 def _may_differ(key: str, before: object, after: object) -> bool:

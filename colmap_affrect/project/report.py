@@ -138,10 +138,8 @@ def _contradiction_notes(
     cameras: Sequence[Mapping[str, Any]], contradiction: Contradiction
 ) -> list[str]:
     """Return a line where models are far from the focal lengths of some sources."""
-    wrong = []
-    for camera in cameras:
-        if _is_contradicted(camera, contradiction.sources):
-            wrong.append(camera)
+    sources = contradiction.sources
+    wrong = [camera for camera in cameras if _is_contradicted(camera, sources)]
     if not wrong:
         return []
     known_px = wrong[0]["focal_px"]
@@ -340,11 +338,8 @@ class ModelSummary:
     @property
     def sure(self) -> tuple[str, ...]:
         """Names of the images that are right with a probability of ``SURE`` or more."""
-        sure = []
-        for name, probability in self.probabilities.items():
-            if probability >= SURE:
-                sure.append(name)
-        return tuple(sure)
+        probabilities = self.probabilities.items()
+        return tuple(name for name, probability in probabilities if probability >= SURE)
 
     @property
     def likely(self) -> set[str]:
@@ -377,6 +372,14 @@ class ModelSummary:
         return [
             f"tie points  {num_points}, {num_marks} marks; farthest off in px: {worst}"
         ]
+
+
+NO_MODEL = ModelSummary(
+    registered_names=(),
+    num_points3D=0,
+    mean_track_length=0.0,
+    mean_reprojection_error_px=0.0,
+)
 
 
 @documented
@@ -481,7 +484,7 @@ class ReconstructionReport(Summarized):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
-        largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
+        largest = self.models[0] if self.models else NO_MODEL
         of_largest = asdict(largest)
         found = asdict(self)
         del found["verification"]["random_seed"]

@@ -192,7 +192,7 @@ class FeatureStore(GroupStore):
             self._write_features(
                 file,
                 name,
-                both,
+                features=both,
                 image_size=tuple(checked(group, "image_size").tolist()),
                 level_ends={**_level_ends(group), level: len(both)},
                 content=_content(group),
@@ -258,10 +258,12 @@ class FeatureStore(GroupStore):
     @staticmethod
     def _features(group: h5py.Group) -> LocalFeatures:
         return LocalFeatures(
-            checked(group, "lafs").astype(np.float64),
-            checked(group, "scores"),
-            np.ascontiguousarray(checked(group, "descriptors").T, dtype=np.float32),
-            checked(group, "rectification_ids"),
+            lafs=checked(group, "lafs").astype(np.float64),
+            responses=checked(group, "scores"),
+            descriptors=np.ascontiguousarray(
+                checked(group, "descriptors").T, dtype=np.float32
+            ),
+            rectification_ids=checked(group, "rectification_ids"),
         )
 
     def level_ranges(self, name: str) -> dict[int, range]:
@@ -376,7 +378,7 @@ class MatchStore(GroupStore):
     def _write_learned(self, file: h5py.File, learned: Learned) -> None:
         group = file[pair_key(*learned.matches.names)]
         for name, values in hloc_matches(learned.matches).items():
-            self._write_dataset(group, LEARNED + name, values)
+            self._write_dataset(group, name=LEARNED + name, values=values)
         group.attrs[LEARNED + "level"] = learned.matches.level
         group.attrs[LEARNED + "worth"] = learned.worth
 
@@ -542,7 +544,9 @@ def _read_learned(group: h5py.Group, names: Names) -> Learned | None:
     if LEARNED + "level" not in group.attrs:
         return None
     num_inliers, num_consistent = group.attrs[LEARNED + "worth"].tolist()
-    return Learned(_read_matches(group, names, LEARNED), (num_inliers, num_consistent))
+    return Learned(
+        _read_matches(group, names, prefix=LEARNED), (num_inliers, num_consistent)
+    )
 
 
 @dataclass(frozen=True)

@@ -317,7 +317,9 @@ class Workspace:
         if overwrite:
             record = self._record_without_results(stage)
         if stage in record:
-            why = first_difference(record[stage], options, OF_DATABASE.get(stage, ()))
+            why = first_difference(
+                record[stage], now=options, free=OF_DATABASE.get(stage, ())
+            )
             if why:
                 raise ConflictError(
                     f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"

@@ -84,7 +84,7 @@ class Inputs(Options):
                 f"{self.from_database}: holds no images; import some first"
             )
         if not self.image_list_path:
-            return checked_names(folder, known, self.from_database)
+            return checked_names(folder, names=known, where=self.from_database)
         names = list_images(folder, listed)
         unknown = sorted(set(names) - set(known))
         if unknown:
@@ -121,7 +121,7 @@ class Inputs(Options):
                 depth = options.depth.file(name)
                 files += [depth] if depth else []
                 files += self.camera_files
-            found[name] = content_of(files, known.get(name), cameras)
+            found[name] = content_of(files, known=known.get(name), options=cameras)
         return found
 
     def cameras_digest(self) -> str:
@@ -175,11 +175,8 @@ class Inputs(Options):
 def source_files(path: Path) -> list[Path]:
     """Return the files of a database, a table, or the folder of a model."""
     files = path.iterdir() if path.is_dir() else database_files(path)
-    found = []
-    for file in files:
-        if file.is_file() and not file.name.endswith("-shm"):
-            found.append(file)
-    return sorted(found)
+    found = [file for file in files if not file.name.endswith("-shm")]
+    return sorted(filter(Path.is_file, found))
 
 
 class Resources(Options):
@@ -291,7 +288,9 @@ class Context:
 
     def to_map(self, extends: str = "") -> MappedFrom:
         """Return what models are made from now, perhaps with the digest of one that they extend."""
-        return MappedFrom(self.graph.digest(), self.by_hand.digest(), extends)
+        return MappedFrom(
+            verified=self.graph.digest(), by_hand=self.by_hand.digest(), extends=extends
+        )
 
     def listed_pairs(self) -> PairList:
         """Return the pairs of the list whose images have features."""
@@ -308,11 +307,8 @@ class Context:
     def usable(self, pairs: Iterable[Pair]) -> list[Pair]:
         """Return the pairs whose images the database has, but those rejected by hand."""
         ids = self.graph.ids
-        found = list[Pair]()
-        for first, second in pairs:
-            if first in ids and second in ids and self.by_hand.allows(first, second):
-                found.append((first, second))
-        return found
+        known = [pair for pair in pairs if pair[0] in ids and pair[1] in ids]
+        return [pair for pair in known if self.by_hand.allows(*pair)]
 
     def num_verified_inliers(self) -> dict[Pair, int]:
         """Return the number of inliers of each verified pair; another program has its threshold."""

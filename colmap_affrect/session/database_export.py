@@ -62,13 +62,11 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
     has_files = workspace.database.exists() and workspace.cameras.exists()
     if has_files and counts == graph.num_keypoints:
         return {}
-    rejected = add_images(workspace, graph, context.inputs, list(counts))
+    rejected = add_images(workspace, graph, context.inputs, names=list(counts))
     ids = graph.ids
     known = graph.num_keypoints
-    lacking = []
-    for name, count in counts.items():
-        if name in ids and count != known.get(name):
-            lacking.append(name)
+    in_database = [name for name in counts if name in ids]
+    lacking = [name for name in in_database if counts[name] != known.get(name)]
     if not lacking:
         return rejected
     with graph.opened() as database:

@@ -129,11 +129,8 @@ class ViewGraph:
         Returns:
             By pair of image names (M, 2) features of both images.
         """
-        found = dict[Pair, Indices]()
-        for pair, matches in self._all_inliers().items():
-            if len(matches) >= min_num_inliers:
-                found[pair] = matches
-        return found
+        inliers = self._all_inliers().items()
+        return {pair: rows for pair, rows in inliers if len(rows) >= min_num_inliers}
 
     def num_inliers(self, min_num_inliers: int) -> dict[Pair, int]:
         """Return the number of inliers of each pair that has at least so many."""

@@ -63,7 +63,7 @@ def match_descriptors(
         "image 2": (keypoints2, descriptors2),
     }
     pair = ("image 1", "image 2")
-    return match_feature_sets(sets, [pair], options)[pair]
+    return match_feature_sets(sets, pairs=[pair], options=options)[pair]
 
 
 @checks_arguments
@@ -134,7 +134,9 @@ def iterate_matches(
 
     ordered = list(ordered_for_reuse(pairs, IMAGES_IN_MEMORY // 2))
     tasks = ((prepared(first), prepared(second)) for first, second in ordered)
-    found = map_ordered(lambda both: matcher.match(*both), tasks, available_cores())
+    found = map_ordered(
+        lambda both: matcher.match(*both), tasks, num_threads=available_cores()
+    )
     yield from zip(ordered, found, strict=True)
 
 
@@ -163,9 +165,13 @@ def _as_features(name: str, given: Arrays) -> ImageFeatures:
         check = CHECKS[kind]
         raise OptionError(f"{check['what']}: {name}; {check['advice']}")
     count = len(places)
-    lafs = lafs_from_keypoints(places, np.ones(count), np.zeros(count))
-    features = LocalFeatures(lafs, np.ones(count, np.float32), unit)
-    return ImageFeatures(features, (0, 0), "")
+    lafs = lafs_from_keypoints(
+        places, radii_px=np.ones(count), angles_rad=np.zeros(count)
+    )
+    features = LocalFeatures(
+        lafs=lafs, responses=np.ones(count, np.float32), descriptors=unit
+    )
+    return ImageFeatures(features=features, image_size=(0, 0), extractor="")
 
 
 def _check_arrays(name: str, points: NDArray[Any], rows: NDArray[Any]) -> None:
@@ -241,10 +247,12 @@ def match_database(
     known = set(names)
     with colmap_database.open_database(path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        todo = _unmatched(database, [p for p in listed if known.issuperset(p)], ids)
+        todo = _unmatched(
+            database, pairs=[p for p in listed if known.issuperset(p)], ids=ids
+        )
 
         def read(name: str) -> Arrays:
-            return _read_arrays(database, ids[name], f"{path}: {name}")
+            return _read_arrays(database, image_id=ids[name], where=f"{path}: {name}")
 
         with progress.stage("match", len(todo), "pairs") as advance:
             try:

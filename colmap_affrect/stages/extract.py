@@ -75,7 +75,7 @@ def extract(
         # Before it is on record
         refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)
     if image_names:
-        names = checked_names(folder, image_names, "image_names")
+        names = checked_names(folder, names=image_names, where="image_names")
     else:
         names = inputs.names()
     known = {} if overwrite else context.features.contents()
@@ -99,7 +99,9 @@ def extract(
         warnings |= _warnings_of_the_folder(inputs, names)
     warnings |= mask_warnings
     _log_warnings(warnings)
-    failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
+    failures = _extract_missing(
+        context, inputs, extractor, names=missing, contents=contents, warnings=warnings
+    )
     if len(failures) == len(names):
         why = f"none of the {len(names)} images can be used; the first: {failures[names[0]]}"
         raise ImageError(f"{folder}: {why}")
@@ -242,7 +244,7 @@ def extract_images(
     options = extractor.options
     escalated = {name for name, level in images if level}
     if escalated:
-        _refuse_changed(context, inputs, escalated)
+        _refuse_changed(context, inputs, names=escalated)
     executor = context.executor
     if not executor:
         levels = [options.levels[number] for number in {level for _, level in images}]

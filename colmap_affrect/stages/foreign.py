@@ -160,7 +160,7 @@ def _update_copy(
     digest = foreign.digest()
     if digest != workspace.made_from("copy") or not workspace.database.exists():
         refuse_unusable(source, warns=True)
-    workspace.record_options("copy", foreign.to_record(), overwrite=overwrite)
+    workspace.record_options("copy", options=foreign.to_record(), overwrite=overwrite)
     warnings = {}
     before = workspace.made_from("copy")
     if digest != before:
@@ -226,7 +226,9 @@ def _write_given_matches(
         given_matches(foreign.matches_path, names) as found,
         context.progress.stage("matches", len(found.pairs), "pairs") as advance,
     ):
-        write_given_matches(database, found, foreign.match_type, advance)
+        write_given_matches(
+            database, given=found, match_type=foreign.match_type, advance=advance
+        )
 
 
 def _match(context: Context, foreign: ForeignDatabase) -> None:

@@ -56,7 +56,12 @@ def guide(context: Context, options: GuidedOptions | None = None) -> StageReport
     todo, num_done = guiding.todo()
     with context.progress.stage("guide", len(todo), "pairs") as advance:
         guiding.guide(todo, advance)
-    return StageReport("guide", time.perf_counter() - start, len(todo), num_done)
+    return StageReport(
+        name="guide",
+        wall_s=time.perf_counter() - start,
+        num_done=len(todo),
+        num_kept=num_done,
+    )
 
 
 def exact_inliers(
@@ -76,11 +81,8 @@ def current(context: Context) -> list[GuidedPair]:
     if not (context.workspace.guided.exists() and path.exists()):
         return []
     counts = context.graph.num_inliers(0)
-    found = []
-    for pair in context.guided.read():
-        if pair.num_inliers in (0, counts.get(pair.names)):
-            found.append(pair)
-    return found
+    pairs = context.guided.read()
+    return [pair for pair in pairs if pair.num_inliers in (0, counts.get(pair.names))]
 
 
 def guided_counts(context: Context) -> dict[str, int]:
@@ -127,7 +129,7 @@ class GuidedMatcher:
         descriptors = (descriptors1, descriptors2)
         shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
         return guided_matches(
-            descriptors, shapes, task.model, task.inliers, self._options
+            descriptors, shapes, task.model, task.inliers, options=self._options
         )
 
     def _read(self, name: str) -> tuple[Singles, Array]:
@@ -231,7 +233,8 @@ class Guiding:
                 without_model.discard(task.names)
                 advance(1)
             self.context.guided.write(
-                GuidedPair(names, NOTHING, 0) for names in sorted(without_model)
+                GuidedPair(names=names, exact=NOTHING, num_inliers=0)
+                for names in sorted(without_model)
             )
             advance(len(without_model))
             self._keep(found)
@@ -281,7 +284,11 @@ class Guiding:
         for task, _ in found:
             better = geometries.get(task.names)
             num_inliers = len(better.inlier_matches) if better else 0
-            pairs.append(GuidedPair(task.names, task.inliers, num_inliers))
+            pairs.append(
+                GuidedPair(
+                    names=task.names, exact=task.inliers, num_inliers=num_inliers
+                )
+            )
         self.context.guided.write(pairs)
         self._write(geometries)
 

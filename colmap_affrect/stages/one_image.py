@@ -204,7 +204,7 @@ class ImageExtractor:
         gray = reading.shrink_to(image, limit)
         color = None
         if chosen.features.in_color:
-            color = reading.read_color(path, limit, stretch=stretches)
+            color = reading.read_color(path, max_size_px=limit, stretch=stretches)
         size = (gray.shape[1], gray.shape[0])
         if intrinsics is None:
             intrinsics = camera_matrix(original_size)
@@ -257,8 +257,8 @@ class ImageExtractor:
         return extract_rectified(
             photograph.gray if photograph.color is None else photograph.color,
             plan,
-            self.extractors[level],
-            chosen.features.max_num_rectified_features,
+            extractor=self.extractors[level],
+            max_num_rectified=chosen.features.max_num_rectified_features,
             with_original=chosen.base == level,
             mask=photograph.mask,
         )

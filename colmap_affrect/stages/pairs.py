@@ -52,19 +52,24 @@ def choose_pairs(
     listed = options.match_list_path
     if "exhaustive" in options.methods and not listed:
         num_pairs = _list_all_pairs(context, options, overwrite=overwrite)
-        return StageReport("pairs", time.perf_counter() - start, num_pairs)
+        return StageReport(
+            name="pairs", wall_s=time.perf_counter() - start, num_done=num_pairs
+        )
     pairs = _given_pairs(context, options)
-    workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
+    workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
     there = kept = _pairs_there(context)
     digest = content_of([Path(listed)]).digest if listed else ""
     if workspace.made_from("pairs") not in ("", digest):
         kept = set()
-    pairs |= kept | _similar_pairs(context, options, kept)
+    pairs |= kept | _similar_pairs(context, options, there=kept)
     warnings = _forget_lost(context, there - pairs)
     lists.write_pairs(workspace.pairs, sorted(pairs))
     workspace.record_made_from(pairs=digest)
     return StageReport(
-        "pairs", time.perf_counter() - start, len(pairs), warnings=warnings
+        name="pairs",
+        wall_s=time.perf_counter() - start,
+        num_done=len(pairs),
+        warnings=warnings,
     )
 
 
@@ -75,9 +80,9 @@ def _list_all_pairs(context: Context, options: PairOptions, *, overwrite: bool) 
     num_pairs = math.comb(len(names), 2)
     if len(names) > MANY_IMAGES:
         logger.warning(MANY_PAIRS, len(names), num_pairs)
-    workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
+    workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
     every = combinations(names, 2)  # too many to keep in memory
-    lists.write_pairs(workspace.pairs, every, names)
+    lists.write_pairs(workspace.pairs, pairs=every, names=names)
     workspace.record_made_from(pairs="")
     return num_pairs
 
@@ -97,13 +102,15 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
             options.max_distance_m,
         )
         by_gps = set(filter(known.issuperset, near))
-        _warn_of_images_without_neighbors(context, names, by_gps, options)
+        _warn_of_images_without_neighbors(context, names, pairs=by_gps, options=options)
         pairs |= by_gps
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
         named = known.union(context.inputs.names())  # some may have gone just now
         folder = Path(context.inputs.image_path)
-        listed = lists.read_pairs(Path(options.match_list_path), sorted(named), folder)
+        listed = lists.read_pairs(
+            Path(options.match_list_path), names=sorted(named), image_path=folder
+        )
         pairs.update(filter(known.issuperset, listed))
     return pairs
 

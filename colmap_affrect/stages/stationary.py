@@ -174,7 +174,9 @@ class StationaryFilter:
         for size, places in found.items():
             if not places.still.any():
                 continue
-            if places.is_most and not self._moves_elsewhere(pairs, size, places.still):
+            if places.is_most and not self._moves_elsewhere(
+                pairs, size, places=places.still
+            ):
                 idle = CAMERA_STANDS_STILL
             else:
                 self._places[size] = places.still | self._places.get(size, places.still)
@@ -280,11 +282,17 @@ class StationaryFilter:
                 continue
             points, others = self._ends(found.names, found.indices[are_still])
             ratios = stationary_log_ratios(
-                points, others - points, tolerance_px, limit_px
+                points,
+                motions=others - points,
+                tolerance_px=tolerance_px,
+                limit_px=limit_px,
             )
             own += _means(cells, ratios)
             connected += _means(
-                cells, means_of_regions(cells, ratios, NUM_CELLS, CONNECTED)
+                cells,
+                means_of_regions(
+                    cells, values=ratios, num_cells=NUM_CELLS, reach=CONNECTED
+                ),
             )
         return np.minimum(own, connected)
 
@@ -297,7 +305,10 @@ class StationaryFilter:
             are_moving = ~(are_still | _at(places, first) | _at(places, second))
             points, others = self._ends(found.names, found.indices[are_moving])
             near_px = max(size) / NUM_CELLS
-            if num_moving_together(points, others - points, near_px) >= MIN_MOVING:
+            if (
+                num_moving_together(points, motions=others - points, radius_px=near_px)
+                >= MIN_MOVING
+            ):
                 num_pairs += 1
                 names.update(found.names)
         return num_pairs >= MIN_NUM_PAIRS and len(names) >= MIN_NUM_IMAGES
