@@ -61,8 +61,7 @@ def watched(
     workspace = context.workspace
     path = workspace.database
     if workspace.users_database:
-        if path.exists() and path.stat().st_size:
-            refuse_unusable(path, FATAL_BEFORE_MAPPING)
+        _check_users_database(path)
         yield
         return
     why = "" if discards else _why_lost(workspace)
@@ -81,6 +80,11 @@ def watched(
             _seal(context)
         raise
     _seal(context)
+
+
+def _check_users_database(path: Path) -> None:
+    if path.exists() and path.stat().st_size:
+        refuse_unusable(path, FATAL_BEFORE_MAPPING)
 
 
 def _take_as_it_is(context: Context) -> None:

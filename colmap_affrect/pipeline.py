@@ -335,7 +335,7 @@ def match(
     matcher = None if matching is None else MATCHERS.options(matching, "matching")
     context = _context(output_path, progress, resources, executor)
     with one_stage("match", context):
-        return match_pairs(context, pairs=matcher, overwrite=overwrite)
+        return match_pairs(context, options=matcher, overwrite=overwrite)
 
 
 def verify(

@@ -187,15 +187,7 @@ def exif_focal(
         The focal length, or why there is none.
     """
     if tags.was_cropped or (has_crops and tags.scale < 1.0):
-        original = replace(tags, size=tags.original_size or tags.size)
-        what = "cropped, as others, or shrunk"
-        if tags.was_cropped:
-            what = "cropped or padded"
-        return ExifFocal(
-            focal_px=None,
-            why=f"{what}: {_sizes(tags)}",
-            uncropped_px=exif_focal(original, sensor_width_mm).focal_px or 0.0,
-        )
+        return _focal_of_crop(tags, sensor_width_mm)
     if tags.original_size and tags.scale < 1.0 and max(tags.size) <= MAX_THUMBNAIL_PX:
         return ExifFocal(None, why=f"a thumbnail: {_sizes(tags)}")
     stated = _statements(tags, sensor_width_mm)
@@ -205,6 +197,17 @@ def exif_focal(
             focal_px=None, why="no EXIF focal length in px", lens_mm=lens_mm
         )
     return _reconcile(tags, stated)
+
+
+def _focal_of_crop(tags: CameraTags, sensor_width_mm: float | None) -> ExifFocal:
+    """Return no focal length, but that of the whole photograph, if EXIF says it."""
+    original = replace(tags, size=tags.original_size or tags.size)
+    what = "cropped or padded" if tags.was_cropped else "cropped, as others, or shrunk"
+    return ExifFocal(
+        focal_px=None,
+        why=f"{what}: {_sizes(tags)}",
+        uncropped_px=exif_focal(original, sensor_width_mm).focal_px or 0.0,
+    )
 
 
 def _sizes(tags: CameraTags) -> str:

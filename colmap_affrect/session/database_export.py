@@ -65,12 +65,19 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
     rejected = add_images(workspace, graph, context.inputs, names=list(counts))
     ids = graph.ids
     known = graph.num_keypoints
-    in_database = [name for name in counts if name in ids]
+    in_database = ids.keys() & counts.keys()
     lacking = [name for name in in_database if counts[name] != known.get(name)]
-    if not lacking:
-        return rejected
-    with graph.opened() as database:
-        for name in lacking:
+    if lacking:
+        _write_keypoints(context, sorted(lacking))
+    return rejected
+
+
+def _write_keypoints(context: Context, names: Sequence[str]) -> None:
+    """Write the keypoints of images, in the place of those that are there."""
+    store = context.features
+    ids = context.graph.ids
+    with context.graph.opened() as database:
+        for name in names:
             ranges = store.level_ranges(name).values()
             colmap_database.write_keypoints(
                 database,
@@ -78,7 +85,6 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
                 store.read_frames(name),
                 [part.stop for part in ranges],
             )
-    return rejected
 
 
 def write_matches(

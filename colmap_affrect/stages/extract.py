@@ -71,9 +71,7 @@ def extract(
     folder = Path(inputs.image_path)
     inputs.check()
     workspace.require_own(folder)
-    if inputs.from_database and not workspace.database.exists():
-        # Before it is on record
-        refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)
+    _check_source(workspace, inputs)
     if image_names:
         names = checked_names(folder, names=image_names, where="image_names")
     else:
@@ -102,9 +100,7 @@ def extract(
     failures = _extract_missing(
         context, inputs, extractor, names=missing, contents=contents, warnings=warnings
     )
-    if len(failures) == len(names):
-        why = f"none of the {len(names)} images can be used; the first: {failures[names[0]]}"
-        raise ImageError(f"{folder}: {why}")
+    _require_one_usable(folder, names, failures)
     failures |= write_images_and_keypoints(context)
     return StageReport(
         name="extract",
@@ -114,6 +110,22 @@ def extract(
         failures=failures,
         warnings=warnings,
     )
+
+
+def _check_source(workspace: Workspace, inputs: Inputs) -> None:
+    """Refuse a database to begin with that cannot be used, before it is on record."""
+    if inputs.from_database and not workspace.database.exists():
+        refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)
+
+
+def _require_one_usable(
+    folder: Path, names: Sequence[str], failures: Mapping[str, str]
+) -> None:
+    if len(failures) == len(names):
+        first = failures[names[0]]
+        raise ImageError(
+            f"{folder}: none of the {len(names)} images can be used; the first: {first}"
+        )
 
 
 def _record(
@@ -245,11 +257,7 @@ def extract_images(
     escalated = {name for name, level in images if level}
     if escalated:
         _refuse_changed(context, inputs, names=escalated)
-    executor = context.executor
-    if not executor:
-        levels = [options.levels[number] for number in {level for _, level in images}]
-        num_at_once = one_image.num_images_at_once(levels)
-        executor = Threads(min(num_at_once, len(images)))
+    executor = context.executor or _threads(extractor, images)
     files = inputs.photographs.files(images[0][0])
     if options.depth.path:
         files.append(Path(options.depth.path))
@@ -261,6 +269,14 @@ def extract_images(
             if found.warning:
                 logger.warning("%s: %s", name, found.warning)
         yield found
+
+
+def _threads(extractor: ImageExtractor, images: Sequence[tuple[str, int]]) -> Threads:
+    """Return as many threads as cores and memory allow."""
+    numbers = {level for _, level in images}
+    levels = [extractor.options.levels[number] for number in numbers]
+    num_at_once = one_image.num_images_at_once(levels)
+    return Threads(min(num_at_once, len(images)))
 
 
 def _tasks(
