@@ -165,7 +165,7 @@ def reason(error: BaseException) -> str:
     return one_line(" ".join(text.split()))[:MAX_REASON] or type(error).__name__
 
 
-def made_again(stage: str, folder: Path) -> str:
+def how_to_make_again(stage: str, folder: Path) -> str:
     """Say how what a stage has left in an output folder is made again."""
     if stage == "extract":
         return (

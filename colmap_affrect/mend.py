@@ -38,7 +38,7 @@ CHANGED = "was changed since the last run"
 
 
 @contextmanager
-def watched(
+def mend_and_seal(
     context: Context,
     *,
     follows: bool = True,
@@ -73,7 +73,7 @@ def watched(
         _make_again(context, why, follows=follows)
     workspace.seal.unlink(missing_ok=True)
     try:
-        with context.graph.kept_open():
+        with context.graph.keep_open():
             yield
     except AffrectError:
         if path.exists() and not damage_of(path):  # else it is looked through next time
@@ -100,7 +100,7 @@ def _seal(context: Context) -> None:
     """Write the digest and the stamp of the database beside it."""
     workspace = context.workspace
     path = workspace.database
-    if path.exists() and workspace.begun:
+    if path.exists() and workspace.started_stages:
         # One that is not sealed is looked through next time.
         with suppress(AffrectError):
             replace_text(workspace.seal, f"{context.graph.digest()}\n{_stamp(path)}\n")
@@ -114,7 +114,7 @@ def _stamp(path: Path) -> str:
 def _why_lost(workspace: Workspace) -> str:
     """Say why the database is not what the last command left, empty if it is."""
     path = workspace.database
-    begun = workspace.begun
+    begun = workspace.started_stages
     if not path.exists():
         return "is missing" if "verify" in begun else ""
     sealed = list[str]()
@@ -139,7 +139,7 @@ def _why_lost(workspace: Workspace) -> str:
 def _make_again(context: Context, why: str, *, follows: bool) -> None:
     """Put a database aside, and make it again from what it was made from."""
     workspace = context.workspace
-    begun = workspace.begun
+    begun = workspace.started_stages
     foreign = None
     source = f"{workspace.features.name} and {workspace.matches.name}"
     if workspace.is_foreign:

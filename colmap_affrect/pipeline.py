@@ -26,7 +26,7 @@ from colmap_affrect.mappers.existing import (
     read_to_extend,
 )
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
-from colmap_affrect.mend import watched
+from colmap_affrect.mend import mend_and_seal
 from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import Pair, PairOptions, read_pairs
@@ -35,7 +35,7 @@ from colmap_affrect.progress import Forecast, GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
-from colmap_affrect.project.report import StageReport, installed_versions, summed
+from colmap_affrect.project.report import StageReport, installed_versions, sum_by_stage
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.advice import advice
 from colmap_affrect.report.pairs import draw_pairs_to_check
@@ -139,7 +139,7 @@ def _run(
     resolve(recipe.required_weights, weights_path, progress=context.progress)
     load_matchers(context, recipe.extraction, options=recipe.matching)
     later = options.later_stages()
-    with workspace.locked(), watched(context, follows=False, discards=overwrite):
+    with workspace.locked(), mend_and_seal(context, follows=False, discards=overwrite):
         reports = [
             extract_features(context, inputs, recipe, later=later, overwrite=overwrite),
             list_pairs(context, options.pairs),
@@ -215,7 +215,7 @@ def one_stage(
     is_first = name == "extract"
     with (
         context.workspace.locked(),
-        watched(
+        mend_and_seal(
             context,
             follows=not is_first,
             maps=name == "map",
@@ -452,7 +452,7 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
     _check_foreign(context, foreign, mapper, extend=extension, overwrite=overwrite)
     with (
         context.workspace.locked(),
-        watched(context, follows=False, discards=overwrite),
+        mend_and_seal(context, follows=False, discards=overwrite),
     ):
         report = import_and_verify(
             context, foreign, verification=chosen, overwrite=overwrite
@@ -540,7 +540,7 @@ def map_and_report(
         unregistered=missing,
         models=tuple(models),
         num_verified_pairs=len(pair_inliers),
-        stages=summed((*earlier, report)),
+        stages=sum_by_stage((*earlier, report)),
         versions=installed_versions(),
         preset=mapper.options.preset_name,
         verification=context.verification.to_mapping(),

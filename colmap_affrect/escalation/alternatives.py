@@ -98,7 +98,7 @@ def look_at_learned(escalation: Escalation, mapper: Mapper) -> None:
     looked_at = LookedAt(
         _set_of(context), score(found), is_sure, present_score(context)
     )
-    context.matches.keep(looked_at=looked_at)
+    context.matches.update_state(looked_at=looked_at)
 
 
 def is_to_be_looked_at(context: Context) -> bool:
@@ -194,7 +194,7 @@ def take_over_chosen(escalation: Escalation) -> None:
     if folder.exists():
         guide(context, context.guiding)
         _take_over(context, folder)
-    context.matches.keep(follows="")
+    context.matches.update_state(follows="")
 
 
 def follow_keypoints(context: Context) -> None:
@@ -202,7 +202,7 @@ def follow_keypoints(context: Context) -> None:
 
     Mapping again would be of the same pairs, and might end elsewhere.
     """
-    if context.workspace.mapped_from() != context.to_map():
+    if context.workspace.model_inputs() != context.current_model_inputs():
         _take_over(context, context.workspace.sparse)
 
 
@@ -213,7 +213,7 @@ def _take_over(context: Context, sparse_path: Path) -> None:
         new.mkdir()
         for folder in model_folders(sparse_path):
             copy_with_keypoints(folder, new / folder.name, workspace.database)
-    workspace.record_mapped(context.to_map())
+    workspace.record_mapping(context.current_model_inputs())
 
 
 # The best models so far
@@ -226,7 +226,7 @@ def keep_best(context: Context) -> None:
     """
     workspace = context.workspace
     is_small = len(context.features.names()) <= SMALL
-    if not is_small or workspace.mapped_from() != context.to_map():
+    if not is_small or workspace.model_inputs() != context.current_model_inputs():
         return
     present = present_score(context)
     if present < best_score(context):

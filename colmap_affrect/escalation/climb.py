@@ -53,10 +53,10 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         while step := escalation.next_step():
             keep_best(context)
             escalated = escalation.taken(step, escalated)
-        before = context.workspace.mapped_from()
+        before = context.workspace.model_inputs()
         reports += _mapped_on(context, mapper, recipe)
         has_mapped = (
-            context.workspace.mapped_from() != before
+            context.workspace.model_inputs() != before
         )  # perhaps there is no model
         if (
             has_mapped
@@ -92,7 +92,7 @@ def _mapped_first(
         return []
     forget_others(context)  # of other pairs
     reports = [guide(context, recipe.guided), map_images(context, mapper)[0]]
-    matches.keep(modelled=state.listed)
+    matches.update_state(modelled=state.listed)
     return reports
 
 

@@ -75,7 +75,7 @@ def begin(
     options = options or context.escalation
     context.workspace.record_options("escalate", options.to_mapping())
     if context.matches.state.effort != context.effort:
-        context.matches.keep(effort=context.effort)
+        context.matches.update_state(effort=context.effort)
     escalation = Escalation(context, options)
     if escalation.has_begun:
         escalation.write()
@@ -94,7 +94,7 @@ class Tried:
 def matched_again(context: Context) -> Tried:
     """Return what escalation did in a workspace, and what is left for images to match again."""
     workspace = context.workspace
-    if workspace.is_foreign or "escalate" not in workspace.begun:
+    if workspace.is_foreign or "escalate" not in workspace.started_stages:
         return Tried()
     escalation = Escalation(context, context.escalation)
     state = escalation.state
@@ -241,7 +241,7 @@ class Escalation:
             level: number of the level in the recipe.
         """
         if pairs:
-            self.matches.keep(step=Begun(level, tuple(pairs)), has_stepped=True)
+            self.matches.update_state(step=Begun(level, tuple(pairs)), has_stepped=True)
         learned = self.matches.learned(pairs)
         known = {
             pair: one for pair, one in learned.items() if one.matches.level == level
@@ -256,7 +256,7 @@ class Escalation:
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
         self.write()
-        self.matches.keep(step=None, has_stepped=True)
+        self.matches.update_state(step=None, has_stepped=True)
 
     def plan_learning(self) -> bool:
         """Put on record which pairs are to be matched by a learned level, beside what is there.
@@ -278,7 +278,7 @@ class Escalation:
             return False
         step = learned_step(situation)
         if step.pairs:
-            self.matches.keep(learning=Begun(step.level, tuple(step.pairs)))
+            self.matches.update_state(learning=Begun(step.level, tuple(step.pairs)))
         return bool(step.pairs)
 
     def learn(self) -> int:
@@ -391,7 +391,7 @@ class Escalation:
 
     def _keep_learned(self, batch: Sequence[Trial], _: int) -> None:
         """Write learned matches beside those in use."""
-        self.matches.keep_learned(
+        self.matches.write_learned(
             [Learned(trial.found, trial.worth) for trial in batch]
         )
 

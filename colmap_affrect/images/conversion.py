@@ -196,11 +196,11 @@ def _require_picture(path: Path, data: Bytes) -> None:
     OpenCV fills up what is missing of a JPEG or PNG; Pillow says so.
     """
     reading.require_possible(path)
-    reading.decoded(data.copy(), path)
+    reading.decode_bytes(data.copy(), path)
     if not data[:8].tobytes().startswith((JPEG, PNG)):
         return
     try:
-        with reading.opened(io.BytesIO(data.data)) as image:
+        with reading.open_image(io.BytesIO(data.data)) as image:
             image.load()
     except Exception as error:  # damaged files raise nearly anything in Pillow
         raise ImageError(f"{path}: is damaged ({error})") from error

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from PIL import ExifTags
 
-from colmap_affrect.images.reading import opened, read_header, stored_size
+from colmap_affrect.images.reading import open_image, read_header, stored_size
 
 # Of 35 mm film, to which equivalents refer (by COLMAP's rounding)
 FILM_DIAGONAL_MM = 43.27
@@ -100,7 +100,7 @@ def read_camera_tags(path: Path) -> CameraTags | None:
 
 
 def _tags_of_file(file: BinaryIO) -> CameraTags:
-    image = opened(file)
+    image = open_image(file)
     tag = ExifTags.Base
     size = stored_size(image)
     tags = dict[int, Any]()

@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from PIL import ExifTags
 
-from colmap_affrect.images.reading import PNG, opened, read_header, stand_upright
+from colmap_affrect.images.reading import PNG, open_image, read_header, stand_upright
 from colmap_affrect.project.atomic_files import replace_bytes
 
 UPRIGHT = 1  # EXIF's number
@@ -43,7 +43,7 @@ def orientation(path: Path) -> int:
 
 
 def _orientation(file: BinaryIO) -> int:
-    return int(opened(file).getexif().get(ExifTags.Base.Orientation, UPRIGHT))
+    return int(open_image(file).getexif().get(ExifTags.Base.Orientation, UPRIGHT))
 
 
 def _change_xmp(data: bytearray, start: int, end: int) -> None:

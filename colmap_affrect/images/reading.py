@@ -26,7 +26,12 @@ from PIL.TiffImagePlugin import TiffImageFile
 from colmap_affrect.data import ColorImage, GrayImage, Mask
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
-from colmap_affrect.images.pnm import MAX_HEADER, ended, pnm_header, with_usual_white
+from colmap_affrect.images.pnm import (
+    MAX_HEADER,
+    pnm_header,
+    with_line_end,
+    with_usual_white,
+)
 from colmap_affrect.project.regular_files import (
     NotAFileError,
     open_regular,
@@ -69,7 +74,7 @@ def read_header(path: Path, read: Callable[[BinaryIO], Found]) -> Found | None:
         return None
 
 
-def opened(file: BinaryIO) -> Image.Image:
+def open_image(file: BinaryIO) -> Image.Image:
     """Open an image by its header; what is damaged raises nearly anything."""
     start = file.read(len(PNG))
     file.seek(0)
@@ -95,7 +100,7 @@ def pages(path: Path) -> list[int]:
 
 
 def _tiff_pages(file: BinaryIO) -> list[int]:
-    image = opened(file)
+    image = open_image(file)
     found = []
     if isinstance(image, TiffImageFile):
         for page in range(image.n_frames):
@@ -115,7 +120,7 @@ def _claimed_size(file: BinaryIO) -> tuple[int, int]:
     if start.startswith(PNG):
         return struct.unpack(">II", start[16:])
     file.seek(0)
-    return stored_size(opened(file))
+    return stored_size(open_image(file))
 
 
 def why_unusable(path: Path) -> str:
@@ -173,7 +178,7 @@ def _require_plausible(path: Path, num_bytes: int) -> None:
 
 def _num_px_of_pages(file: BinaryIO) -> int:
     """Return the number of pixels of a picture, of a TIFF those of all its pages."""
-    image = opened(file)
+    image = open_image(file)
     num = 0
     for page in range(getattr(image, "n_frames", 1)):
         image.seek(page)
@@ -408,10 +413,10 @@ def decode(
         ImageError: it is no image.
     """
     require_possible(path)
-    return decoded(read_photograph(path), path, flags, keeps_numbers=keeps_numbers)
+    return decode_bytes(read_photograph(path), path, flags, keeps_numbers=keeps_numbers)
 
 
-def decoded(
+def decode_bytes(
     data: Bytes,
     path: Path,
     flags: int = GRAY_AS_STORED,
@@ -441,7 +446,7 @@ def decoded(
     stand_upright(data)
     header = pnm_header(data)
     if header and header.is_text:
-        data = ended(data)
+        data = with_line_end(data)
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error as error:
@@ -534,14 +539,14 @@ def alpha_mask(path: Path) -> Mask | None:
 
 def _alpha_beside_gray(file: BinaryIO) -> NDArray[Any] | None:
     """Read the alpha channel of a gray TIFF, which OpenCV drops; None of one that Pillow turns."""
-    image = opened(file)
+    image = open_image(file)
     if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
         return None
     return np.asarray(image.convert("RGBA").getchannel("A"))
 
 
 def _has_alpha(file: BinaryIO) -> bool:
-    image = opened(file)
+    image = open_image(file)
     return image.mode in MODES_WITH_ALPHA or "transparency" in image.info
 
 
@@ -558,7 +563,7 @@ def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     )
 
 
-def grown(mask: Mask, num_px: int) -> Mask:
+def grow_mask(mask: Mask, num_px: int) -> Mask:
     """Add the pixels of an (H, W) mask's surroundings, so many in each direction."""
     kernel = np.ones((2 * num_px + 1, 2 * num_px + 1), np.uint8)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)

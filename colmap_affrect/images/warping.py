@@ -21,7 +21,7 @@ SAMPLES_PER_TILE = 5
 MAX_DENSITY = 16
 
 
-def halved(image: Singles) -> Singles:
+def half_size(image: Singles) -> Singles:
     """Return an (H, W) image blurred and resampled to half its size, as kornia's ``pyrdown``."""
     kernel = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
     smooth = cv2.sepFilter2D(

@@ -73,7 +73,7 @@ from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import Advance, GivenProgress, Progress
 from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import cannot_write, require_space
-from colmap_affrect.project.given_h5 import GivenFile, opened
+from colmap_affrect.project.given_h5 import GivenFile, open_given_file
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
 from colmap_affrect.project.stores import (
@@ -216,7 +216,7 @@ def _import(
     with (
         # Verification may take hours, and half a database must not be left behind.
         new_results(database_path, names=names) as (new,),
-        opened(features_path) as features,
+        open_given_file(features_path) as features,
     ):
         keys = keys_of(features, names, image_path)
         refuse_colliding_keys(list(keys))

@@ -83,7 +83,7 @@ class GivenFile:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[GivenFile]:
+def open_given_file(path: Path) -> Iterator[GivenFile]:
     """Open a file for reading; of links nothing is seen, data that are elsewhere are refused."""
     if not path.is_file():
         raise OptionError(f"{path}: no such file")

@@ -99,7 +99,7 @@ OF_DATABASE = {"extract": ("cameras",)}
 """Options of a stage that decide only on the database, which others make anew."""
 
 
-class MappedFrom(NamedTuple):
+class ModelInputs(NamedTuple):
     """What models were made from."""
 
     verified: str  # digest of the database
@@ -110,7 +110,7 @@ class MappedFrom(NamedTuple):
 OWN = "own"  # a model of the folder itself is extended
 
 
-class Mapped(BaseModel):
+class MappingRecord(BaseModel):
     """The models that are there."""
 
     model_config = ConfigDict(extra="forbid")
@@ -120,9 +120,9 @@ class Mapped(BaseModel):
     number: int
 
     @property
-    def made_from(self) -> MappedFrom:
+    def inputs(self) -> ModelInputs:
         """What they were made from."""
-        return MappedFrom(
+        return ModelInputs(
             verified=self.verified, by_hand=self.by_hand, extends=self.extends
         )
 
@@ -133,7 +133,7 @@ class _Record(BaseModel):
     recipe: str = ""
     planned: dict[Stage, dict[str, Any]] = {}
     made_from: dict[str, str] = {}
-    mapped: Mapped | None = None
+    mapped: MappingRecord | None = None
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def read_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def rewound(record: Mapping[str, Any], stage: str) -> dict[str, Any]:
+def rewind_record(record: Mapping[str, Any], stage: str) -> dict[str, Any]:
     """Return a record in which a stage and those after it are only planned, with their options."""
     planned = dict(record.get(PLANNED, {}))
     kept = dict(record)

@@ -253,7 +253,7 @@ class StageReport(Summarized):
         return f"{self.name}: {self.num_done} done{kept}{failed}{warned} in {self.wall_s:.1f} s"
 
 
-def summed(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
+def sum_by_stage(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
     """Return one report of each stage, in the order in which they began: the last, all seconds."""
     found = dict[str, StageReport]()
     for report in reports:

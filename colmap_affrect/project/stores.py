@@ -29,9 +29,9 @@ from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.project.group_store import (
     GroupStore,
-    checked,
     entries_of,
     has_entry,
+    read_checked,
 )
 from colmap_affrect.project.line_report import (
     LINE_DATASETS,
@@ -77,7 +77,7 @@ def _entries_of(path: Path, _: str) -> Entries:
     found: Entries = {}
     with FeatureStore(path)._open("r") as file:
         for name, group in entries_of(file):
-            width, height = checked(group, "image_size").tolist()
+            width, height = read_checked(group, "image_size").tolist()
             found[name] = _content(group), len(group["keypoints"]), (width, height)
     return dict(sorted(found.items()))
 
@@ -89,13 +89,13 @@ def _content(group: h5py.Group) -> Content:
 
 
 def _level_ends(group: h5py.Group) -> dict[int, int]:
-    levels = checked(group, "levels").tolist()
-    ends = checked(group, "level_ends").tolist()
+    levels = read_checked(group, "levels").tolist()
+    ends = read_checked(group, "level_ends").tolist()
     return dict(zip(levels, ends, strict=True))
 
 
 def _line_datasets(group: h5py.Group) -> dict[str, NDArray[Any]]:
-    return {key: checked(group, key) for key in LINE_DATASETS if key in group}
+    return {key: read_checked(group, key) for key in LINE_DATASETS if key in group}
 
 
 def frame_datasets(lafs: Floats) -> dict[str, Singles]:
@@ -193,7 +193,7 @@ class FeatureStore(GroupStore):
                 file,
                 name,
                 features=both,
-                image_size=tuple(checked(group, "image_size").tolist()),
+                image_size=tuple(read_checked(group, "image_size").tolist()),
                 level_ends={**_level_ends(group), level: len(both)},
                 content=_content(group),
                 more=_line_datasets(group),
@@ -258,12 +258,12 @@ class FeatureStore(GroupStore):
     @staticmethod
     def _features(group: h5py.Group) -> LocalFeatures:
         return LocalFeatures(
-            lafs=checked(group, "lafs").astype(np.float64),
-            responses=checked(group, "scores"),
+            lafs=read_checked(group, "lafs").astype(np.float64),
+            responses=read_checked(group, "scores"),
             descriptors=np.ascontiguousarray(
-                checked(group, "descriptors").T, dtype=np.float32
+                read_checked(group, "descriptors").T, dtype=np.float32
             ),
-            rectification_ids=checked(group, "rectification_ids"),
+            rectification_ids=read_checked(group, "rectification_ids"),
         )
 
     def level_ranges(self, name: str) -> dict[int, range]:
@@ -296,7 +296,7 @@ class FeatureStore(GroupStore):
 
     def _values(self, name: str, dataset: str) -> NDArray[Any]:
         with self._open("r") as file:
-            return checked(self._group(file, name), dataset)
+            return read_checked(self._group(file, name), dataset)
 
 
 def pair_key(name1: str, name2: str) -> str:
@@ -332,7 +332,7 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             return _read_state(file)
 
-    def keep(self, **changes: Any) -> None:
+    def update_state(self, **changes: Any) -> None:
         """Change fields of the state."""
         with self._open("a") as file:
             _change_state(file, changes)
@@ -382,7 +382,7 @@ class MatchStore(GroupStore):
         group.attrs[LEARNED + "level"] = learned.matches.level
         group.attrs[LEARNED + "worth"] = learned.worth
 
-    def keep_learned(self, found: Iterable[Learned]) -> None:
+    def write_learned(self, found: Iterable[Learned]) -> None:
         """Write learned matches beside those in use."""
         with self._open("a") as file:
             for learned in found:
@@ -475,7 +475,9 @@ class MatchStore(GroupStore):
             for pair in pairs:
                 group = file[pair_key(*pair)]
                 if group.attrs["of_some"]:
-                    found[pair] = int(np.count_nonzero(checked(group, "matches0") >= 0))
+                    found[pair] = int(
+                        np.count_nonzero(read_checked(group, "matches0") >= 0)
+                    )
         return found
 
     def num_pairs(self) -> int:
@@ -527,10 +529,10 @@ def _write_state(file: h5py.File, state: MatchState) -> None:
 
 def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatches:
     """Read the matches of a pair, or those whose datasets begin with a prefix."""
-    matches0 = checked(group, f"{prefix}matches0").astype(np.int64)
+    matches0 = read_checked(group, f"{prefix}matches0").astype(np.int64)
     rows = np.flatnonzero(matches0 >= 0)
     indices = np.stack([rows, matches0[rows]], axis=1)
-    scores = checked(group, f"{prefix}matching_scores0")[rows].astype(np.float32)
+    scores = read_checked(group, f"{prefix}matching_scores0")[rows].astype(np.float32)
     return PairMatches(
         names=names,
         indices=indices,
@@ -586,7 +588,7 @@ class GuidedStore(GroupStore):
                 first, second = group.attrs["names"]
                 pair = GuidedPair(
                     names=(str(first), str(second)),
-                    exact=checked(group, "exact"),
+                    exact=read_checked(group, "exact"),
                     num_inliers=int(group.attrs["num_inliers"]),
                 )
                 found.append(pair)

@@ -22,12 +22,12 @@ from colmap_affrect.project.record import (
     PLANNED,
     STAGES,
     WEIGHTS,
-    Mapped,
-    MappedFrom,
+    MappingRecord,
+    ModelInputs,
     first_difference,
     read_record,
     record_text,
-    rewound,
+    rewind_record,
 )
 
 logger = logging.getLogger(__name__)
@@ -58,7 +58,8 @@ class Workspace:
         self.users_database = users_database
         self.database = users_database or path / "database.db"
         self.mapped_database = path / "mapped.db"  # a copy with what is done by hand
-        self.seal = path / "database.db.seal"  # what the last command left in it
+        # A digest of what the last command left in the database (see colmap_affrect.mend)
+        self.seal = path / "database.db.seal"
         self.features = path / "features.h5"  # by image
         self.matches = path / "matches.h5"  # raw ones by pair
         self.guided = path / "guided.h5"  # what guided matching found, by pair
@@ -100,7 +101,7 @@ class Workspace:
                 if source.exists():
                     shutil.copy(source, path / source.name)
         made = Workspace(path)
-        made._write_record(rewound(self.recorded(), "verify"))
+        made._write_record(rewind_record(self.record(), "verify"))
         return made
 
     def refuse_run(self) -> None:
@@ -195,7 +196,7 @@ class Workspace:
         except OSError:  # of a disk that is read-only: nobody works there
             return False
 
-    def recorded(self) -> Mapping[str, Any]:
+    def record(self) -> Mapping[str, Any]:
         """Return the record, see :func:`~colmap_affrect.project.record.read_record`."""
         if self._record is None:
             self._record = read_record(self.config)
@@ -206,22 +207,22 @@ class Workspace:
         self._record = None
 
     @property
-    def begun(self) -> list[str]:
+    def started_stages(self) -> list[str]:
         """The stages that have been run, in their order."""
-        return [stage for stage in STAGES if stage in self.recorded()]
+        return [stage for stage in STAGES if stage in self.record()]
 
     @property
     def is_foreign(self) -> bool:
         """Whether the database is a copy of another program's, or was changed by one."""
-        return self.is_changed or "copy" in self.begun
+        return self.is_changed or "copy" in self.started_stages
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
-        return str(self.recorded().get("recipe", ""))
+        return str(self.record().get("recipe", ""))
 
-    def planned(self, stage: str) -> dict[str, Any] | None:
+    def options_on_record(self, stage: str) -> dict[str, Any] | None:
         """Return the options on record for a stage, begun or not; None if there are none."""
-        record = self.recorded()
+        record = self.record()
         options = record.get(stage, record.get(PLANNED, {}).get(stage))
         if options is None:
             return None
@@ -229,54 +230,54 @@ class Workspace:
 
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage; OptionError when it was not run."""
-        if stage not in self.begun:
+        if stage not in self.started_stages:
             first = f"run 'colmap-affrect {stage}' with this --output-path first"
             if self.users_database:
                 first = "call extract_features first, or move this folder along with its database"
             raise OptionError(
                 f"{self.path}: the {stage} stage has not been run there; {first}"
             )
-        return dict(self.recorded()[stage])
+        return dict(self.record()[stage])
 
     def photographs(self) -> Path | None:
         """Return the folder of the photographs on record, None where none is known."""
         with suppress(WorkspaceError):
-            record = self.recorded()
+            record = self.record()
             options = {**record.get("copy", {}), **record.get("extract", {})}
             path = options.get("image_path")
             return Path(path) if path else None
         return None
 
-    def made_from(self, what: str) -> str:
+    def input_digest(self, what: str) -> str:
         """Return the digest of the files that something was made from, empty if not known."""
-        return str(self.recorded().get(MADE_FROM, {}).get(what, ""))
+        return str(self.record().get(MADE_FROM, {}).get(what, ""))
 
-    def record_made_from(self, **digests: str) -> None:
+    def record_input_digests(self, **digests: str) -> None:
         """Put on record what things are made from now."""
-        record = self.recorded()
+        record = self.record()
         known = {**record.get(MADE_FROM, {}), **digests}
-        if any(self.made_from(what) != digest for what, digest in digests.items()):
+        if any(self.input_digest(what) != digest for what, digest in digests.items()):
             self._write_record({**record, MADE_FROM: known})
 
     @property
-    def mapped(self) -> Mapped | None:
+    def mapping_record(self) -> MappingRecord | None:
         """What is on record of the models that are there; None where they are to be made anew."""
-        values = self.recorded().get(MAPPED)
-        return Mapped(**values) if values else None
+        values = self.record().get(MAPPED)
+        return MappingRecord(**values) if values else None
 
-    def mapped_from(self) -> MappedFrom | None:
+    def model_inputs(self) -> ModelInputs | None:
         """Return what these models were made from, as far as it is known."""
-        return self.mapped.made_from if self.mapped else None
+        return self.mapping_record.inputs if self.mapping_record else None
 
-    def record_mapped(self, inputs: MappedFrom | None) -> None:
+    def record_mapping(self, inputs: ModelInputs | None) -> None:
         """Put on record what the models that are there were made from, and how many they are.
 
         Args:
             inputs: None where they are to be made anew.
         """
         values = {**inputs._asdict(), "number": self.num_models()} if inputs else None
-        if values != self.recorded().get(MAPPED):
-            self._write_record({**self.recorded(), MAPPED: values})
+        if values != self.record().get(MAPPED):
+            self._write_record({**self.record(), MAPPED: values})
 
     def num_models(self) -> int:
         """Return how many models there are, 0, 1, ..."""
@@ -286,7 +287,7 @@ class Workspace:
 
     def lacks_models(self) -> bool:
         """Return whether models that were made are gone, removed by somebody or half removed."""
-        number = self.mapped.number if self.mapped else 0
+        number = self.mapping_record.number if self.mapping_record else 0
         return not self.sparse.exists() or self.num_models() < number
 
     def record_options(
@@ -313,7 +314,7 @@ class Workspace:
         """
         self._refuse_foreign_results(stage)
         outputs.remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
-        record = self.recorded()
+        record = self.record()
         if overwrite:
             record = self._record_without_results(stage)
         if stage in record:
@@ -339,7 +340,7 @@ class Workspace:
         """Remove the results of a stage and of those after it, and return the record without."""
         self.refuse_foreign_models()
         outputs.remove_own(self._results(stage))
-        record = rewound(self.recorded(), stage)
+        record = rewind_record(self.record(), stage)
         has_stages = not record.keys().isdisjoint(STAGES)
         return record if has_stages else {}
 
@@ -351,11 +352,11 @@ class Workspace:
         """
         if self.users_database:
             raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
-        self.record_mapped(None)
+        self.record_mapping(None)
         results = self._results("verify")
         results.remove(self.sparse)
         outputs.remove_own(results)
-        self._write_record(rewound(self.recorded(), "verify"))
+        self._write_record(rewind_record(self.record(), "verify"))
 
     @property
     def _remedy(self) -> str:
@@ -367,12 +368,12 @@ class Workspace:
 
     def _refuse_foreign_results(self, stage: str) -> None:
         first = {"copy": "extract", "extract": "copy"}.get(stage)
-        if first in self.begun:
+        if first in self.started_stages:
             raise ConflictError(
                 f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
                 "use another --output-path"
             )
-        if self.begun:
+        if self.started_stages:
             return
         for path in self._results("extract"):
             if path.exists() and path != self.users_database:

@@ -32,7 +32,7 @@ from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.paths import GivenPath, resolved
-from colmap_affrect.project.record import Content, MappedFrom, content_of, file_sha256
+from colmap_affrect.project.record import Content, ModelInputs, content_of, file_sha256
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
@@ -243,7 +243,7 @@ class OnRecord(Generic[Built]):
         workspace = context.workspace
         if self._stage == "extract":
             workspace.require("extract")
-        record = workspace.planned(self._stage) or {}
+        record = workspace.options_on_record(self._stage) or {}
         values = {
             key: value for key, value in record.items() if key not in self._others
         }
@@ -286,9 +286,9 @@ class Context:
         if self.graph.path != self.workspace.database:
             object.__setattr__(self, "graph", ViewGraph(self.workspace.database))
 
-    def to_map(self, extends: str = "") -> MappedFrom:
+    def current_model_inputs(self, extends: str = "") -> ModelInputs:
         """Return what models are made from now, perhaps with the digest of one that they extend."""
-        return MappedFrom(
+        return ModelInputs(
             verified=self.graph.digest(), by_hand=self.by_hand.digest(), extends=extends
         )
 

@@ -76,7 +76,7 @@ def _write_keypoints(context: Context, names: Sequence[str]) -> None:
     """Write the keypoints of images, in the place of those that are there."""
     store = context.features
     ids = context.graph.ids
-    with context.graph.opened() as database:
+    with context.graph.open_to_change() as database:
         for name in names:
             ranges = store.level_ranges(name).values()
             colmap_database.write_keypoints(

@@ -1,9 +1,9 @@
 """The view graph of a command: images, cameras and verified pairs, read from the database once.
 
 All stages of a command share one (``Context.graph``). What changes the database goes through
-:meth:`ViewGraph.opened`, or is followed by :meth:`ViewGraph.forget`; then the graph is read anew
-when it is next asked for. While a command works, its lock keeps other runs out of the folder, and
-the database stays open from one stage to the next (:meth:`ViewGraph.kept_open`).
+:meth:`ViewGraph.open_to_change`, or is followed by :meth:`ViewGraph.forget`. Then the graph is read
+anew when it is next asked for. While a command works, its lock keeps other runs out of the folder,
+and the database stays open from one stage to the next (:meth:`ViewGraph.keep_open`).
 """
 
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ class ViewGraph:
         self._kept: pycolmap.Database | None = None
 
     @contextmanager
-    def kept_open(self) -> Iterator[None]:
+    def keep_open(self) -> Iterator[None]:
         """Open the database at most once while the block works, unless it is forgotten there."""
         self._is_kept_open = True
         try:
@@ -63,7 +63,7 @@ class ViewGraph:
         self._open.close()
 
     @contextmanager
-    def reading(self) -> Iterator[pycolmap.Database]:
+    def open_to_read(self) -> Iterator[pycolmap.Database]:
         """Open the database, or take it where it is open, to change nothing."""
         if not self._is_kept_open:
             with open_database(self.path) as database:
@@ -81,7 +81,7 @@ class ViewGraph:
             raise
 
     @contextmanager
-    def opened(self, *, for_pairs: bool = False) -> Iterator[pycolmap.Database]:
+    def open_to_change(self, *, for_pairs: bool = False) -> Iterator[pycolmap.Database]:
         """Open the database, perhaps to change it.
 
         Args:
@@ -89,7 +89,7 @@ class ViewGraph:
         """
         images = self._images if for_pairs else None
         try:
-            with self.reading() as database:
+            with self.open_to_read() as database:
                 yield database
         finally:
             self._forget_rows()
@@ -152,14 +152,14 @@ class ViewGraph:
     def _image_rows(self) -> ImageRows:
         self._forget_if_gone()
         if self._images is None:
-            with self.reading() as database:
+            with self.open_to_read() as database:
                 self._images = _read_images(database)
         return self._images
 
     def _all_inliers(self) -> dict[Pair, Indices]:
         self._forget_if_gone()
         if self._inliers is None:
-            with self.reading() as database:
+            with self.open_to_read() as database:
                 self._images = self._images or _read_images(database)
                 self._inliers = _read_inliers(database, self._images)
         return self._inliers

@@ -330,7 +330,9 @@ def _refuse_other_photographs(
     workspace: Workspace, image_path: str, contents: Mapping[str, Content]
 ) -> None:
     """Refuse another folder of photographs unless it has some that were worked on."""
-    before = (workspace.planned("extract") or {}).get("image_path", image_path)
+    before = (workspace.options_on_record("extract") or {}).get(
+        "image_path", image_path
+    )
     known = {} if before == image_path else FeatureStore(workspace.features).contents()
     if known and len(_changed(known, contents)) == len(known.keys() & contents.keys()):
         raise ConflictError(
@@ -367,7 +369,7 @@ def _forget_changed(
         gone = sorted(known.keys() - contents.keys())
     cameras = inputs.cameras_digest()
     reasons = [*_counted(changed, "changed"), *_counted(gone, "gone")]
-    if known and workspace.made_from("cameras") != cameras:
+    if known and workspace.input_digest("cameras") != cameras:
         reasons.append("cameras are given otherwise")
     why = ", ".join(reasons)
     if reasons:
@@ -379,7 +381,7 @@ def _forget_changed(
         if lost:
             context.features.remove(lost)
     _record_new_stamps(context, contents, known)
-    workspace.record_made_from(cameras=cameras)
+    workspace.record_input_digests(cameras=cameras)
     if not reasons:
         return {}
     return {inputs.image_path: f"{why}; all that hangs on them is made again"}

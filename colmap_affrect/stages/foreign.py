@@ -158,18 +158,18 @@ def _update_copy(
     workspace = context.workspace
     source = foreign.path
     digest = foreign.digest()
-    if digest != workspace.made_from("copy") or not workspace.database.exists():
+    if digest != workspace.input_digest("copy") or not workspace.database.exists():
         refuse_unusable(source, warns=True)
     workspace.record_options("copy", options=foreign.to_record(), overwrite=overwrite)
     warnings = {}
-    before = workspace.made_from("copy")
+    before = workspace.input_digest("copy")
     if digest != before:
         if before:
             warnings[str(source)] = "has changed; its copy and the models are made anew"
             logger.warning("%s: %s", source, warnings[str(source)])
         workspace.rewind()
         context.graph.forget()
-        workspace.record_made_from(copy=digest)
+        workspace.record_input_digests(copy=digest)
     if not workspace.database.exists():
         known = _copy(context, foreign)
         context.graph.forget()

@@ -228,7 +228,7 @@ class Guiding:
             matched = executor.map(matcher, tasks, [features.path])
             without_model = set(batch)
             for task, matches in zip(tasks, matched, strict=True):
-                moving = stationary.left(task.names, matches)
+                moving = stationary.keep_mask(task.names, matches)
                 found.append((task, matches[moving]))
                 without_model.discard(task.names)
                 advance(1)
@@ -242,7 +242,7 @@ class Guiding:
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
         """Return what is to be done for the pairs whose geometry says where matches may be."""
         tasks = []
-        with self.context.graph.reading() as database:
+        with self.context.graph.open_to_read() as database:
             cameras = cameras_of_images(database)
             for names in pairs:
                 first = self.ids[names[0]]
@@ -295,7 +295,7 @@ class Guiding:
     def _write(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
         if not geometries:
             return
-        with self.context.graph.opened(for_pairs=True) as database:
+        with self.context.graph.open_to_change(for_pairs=True) as database:
             for names, geometry in geometries.items():
                 first, second = names
                 database.update_two_view_geometry(

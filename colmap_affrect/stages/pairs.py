@@ -59,12 +59,12 @@ def choose_pairs(
     workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
     there = kept = _pairs_there(context)
     digest = content_of([Path(listed)]).digest if listed else ""
-    if workspace.made_from("pairs") not in ("", digest):
+    if workspace.input_digest("pairs") not in ("", digest):
         kept = set()
     pairs |= kept | _similar_pairs(context, options, there=kept)
     warnings = _forget_lost(context, there - pairs)
     lists.write_pairs(workspace.pairs, sorted(pairs))
-    workspace.record_made_from(pairs=digest)
+    workspace.record_input_digests(pairs=digest)
     return StageReport(
         name="pairs",
         wall_s=time.perf_counter() - start,
@@ -83,7 +83,7 @@ def _list_all_pairs(context: Context, options: PairOptions, *, overwrite: bool) 
     workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
     every = combinations(names, 2)  # too many to keep in memory
     lists.write_pairs(workspace.pairs, pairs=every, names=names)
-    workspace.record_made_from(pairs="")
+    workspace.record_input_digests(pairs="")
     return num_pairs
 
 

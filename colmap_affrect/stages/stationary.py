@@ -21,7 +21,7 @@ from colmap_affrect.geometry.stationary import (
     num_moving_together,
     stationary_log_ratios,
 )
-from colmap_affrect.images.reading import grown
+from colmap_affrect.images.reading import grow_mask
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Size
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
@@ -117,12 +117,12 @@ class StationaryFilter:
         """Return the (N, 2) keypoints of an image in pixel-centre px."""
         return self._features.read_frames(name)[:, :, 2]
 
-    def filtered(self, found: PairMatches) -> PairMatches:
+    def without_stationary(self, found: PairMatches) -> PairMatches:
         """Return the matches of a pair without those of captions, frames and watermarks."""
-        left = self.left(found.names, found.indices)
+        left = self.keep_mask(found.names, found.indices)
         return replace(found, indices=found.indices[left], scores=found.scores[left])
 
-    def left(self, names: Pair, indices: Indices) -> Mask:
+    def keep_mask(self, names: Pair, indices: Indices) -> Mask:
         """Return which matches of a pair are kept.
 
         Left out is what does not move at a place where nothing does, or beside it, since what is
@@ -142,7 +142,7 @@ class StationaryFilter:
             return np.ones(len(indices), bool)
         still, first, second = self._still(names, indices, size)
         places = self._places[size]
-        near = grown(places, 1)
+        near = grow_mask(places, 1)
         both = near if near.mean() <= MAX_SHARE_BESIDE else places
         if both.mean() > MAX_SHARE_BESIDE:
             both = np.zeros_like(places)
@@ -185,11 +185,11 @@ class StationaryFilter:
         if not self._places:
             return idle
         self._learn_backgrounds(pairs)
-        self._keep()
+        self._record()
         num_pairs = num_matches = 0
         for pair in pairs:
             (before,) = self._matches.read([pair])
-            after = self.filtered(before)
+            after = self.without_stationary(before)
             if len(after.indices) < len(before.indices):
                 self._matches.write([after])
                 num_pairs += 1
@@ -218,7 +218,7 @@ class StationaryFilter:
                     name, background
                 )
 
-    def _keep(self) -> None:
+    def _record(self) -> None:
         """Put what is known on record."""
         kept = []
         for size, mask in self._places.items():
@@ -226,7 +226,7 @@ class StationaryFilter:
         packed = []
         for name, background in self._backgrounds.items():
             packed.append((name, _packed(background)))
-        self._matches.keep(
+        self._matches.update_state(
             stationary=tuple(kept),
             still_cameras=tuple(sorted(self._of_still_cameras)),
             backgrounds=tuple(packed),

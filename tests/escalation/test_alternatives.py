@@ -74,7 +74,7 @@ def matched(
         photos, tmp_path_factory.mktemp("matched") / "out", recipe.name
     )
     escalation, _ = begin(Context(workspace), recipe.escalate)
-    escalation.matches.keep(learning=Begun(1, tuple(escalation.state.pairs)))
+    escalation.matches.update_state(learning=Begun(1, tuple(escalation.state.pairs)))
     assert escalation.learn() == len(escalation.state.pairs)
     return workspace
 
@@ -184,7 +184,7 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
         context.matches.state.modelled == context.matches.state.listed
     )  # are gone on from
     assert context.matches.state.follows == ""
-    assert context.workspace.mapped_from() == context.to_map()
+    assert context.workspace.model_inputs() == context.current_model_inputs()
     assert levels(context) == {1}
     ids = image_ids(context.workspace.database)
     with open_database(context.workspace.database) as database:
@@ -369,7 +369,7 @@ def test_what_was_looked_at_is_of_the_listed_pairs_and_of_what_is_said_by_hand(
     look_at_learned(escalation_of(context), mapper)
     assert looked_at_before(context)
     assert not looked_at_before(replace(context, by_hand=ByHand(left_out=(NAMES[0],))))
-    context.matches.keep(listed="another list")
+    context.matches.update_state(listed="another list")
     assert not looked_at_before(context)
 
 
@@ -395,7 +395,7 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     """Images may have got features: what is needed would look different."""
     escalation = escalation_of(context)
     pairs = list(escalation.state.pairs)
-    context.matches.keep(learning=None)
+    context.matches.update_state(learning=None)
     monkeypatch.setattr(SetState, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
     assert not escalation.plan_learning()  # all have learned matches
     context.matches.remove(pairs=pairs)
@@ -416,7 +416,7 @@ def test_matches_of_pairs_that_are_removed_take_learned_ones_along(
     context: Context,
 ) -> None:
     pairs = list(escalation_of(context).state.pairs)
-    context.matches.keep(looked_at=LookedAt("set", 1.0, True, 0.5))
+    context.matches.update_state(looked_at=LookedAt("set", 1.0, True, 0.5))
     context.matches.remove(pairs=pairs[:1])
     assert not context.matches.has(pairs).any()
     assert context.matches.state.looked_at is None
