@@ -17,7 +17,7 @@ from colmap_affrect.mappers.adjustment import Adjuster
 
 MAX_NUM_IMAGES = 100
 """Larger models are not looked at: the time grows with the cube of the images, and half of so many
-hardly stand at one place."""
+hardly stand at one place. It is a limit of time, other than that of ``focal_observability``."""
 NOT_HELD_DEG = 180.0
 """From this deviation on a direction may be any: what tracks tell is off by a few degrees, what
 they do not tell by thousands."""

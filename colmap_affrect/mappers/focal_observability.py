@@ -33,7 +33,8 @@ MIN_MOVE = 0.1
 # Of a trial: three times as many change growths by 4 % at most (measured)
 NUM_ITERATIONS = 100
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once, to save time
-# Larger models have points of many images, which tell focal lengths
+# Larger models have points of many images, which tell focal lengths. That is a fact of models, and
+# other than sparse.LARGE, which says how many photographs there are.
 MAX_NUM_IMAGES = 100
 MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time
 MAX_NUM_OBSERVATIONS = 3_000

@@ -16,8 +16,8 @@ from colmap_affrect.project.outputs import remove_own
 logger = logging.getLogger(__name__)
 
 SNAPSHOT_FRAMES = 100
-"""Images between two snapshots. A model of so many images is kept whatever comes after it, so that
-mapping can go on from a snapshot of it."""
+"""Images between two snapshots: a distance, not a limit as ``sparse.LARGE``. A model of so many
+images is kept whatever comes after it, so that mapping can go on from a snapshot of it."""
 # A snapshot may be incomplete when a run is killed; the one before is complete
 NUM_KEPT = 2
 

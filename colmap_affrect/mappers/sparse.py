@@ -37,7 +37,10 @@ NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from 
 FORWARD_MOTION = (
     "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 )
-LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
+LARGE = 100
+"""Images from which on COLMAP's own pipeline maps: the search among hypotheses would take too long.
+Other limits of so many images say other things, and may differ: of how many images models are
+(``focal_observability``, ``direction_uncertainty``), and when one is kept (``snapshots``)."""
 
 logger = logging.getLogger(__name__)
 

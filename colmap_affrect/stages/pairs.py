@@ -19,6 +19,8 @@ from colmap_affrect.session.database_export import write_images_and_keypoints
 
 logger = logging.getLogger(__name__)
 
+# From so many images on, with 45,000 pairs, retrieval is recommended (judged). It says nothing of
+# mapping, unlike mappers/sparse.LARGE.
 MANY_IMAGES = 300
 MANY_PAIRS = (
     "all pairs of %d images are %d; --pairs retrieval matches the promising ones only "

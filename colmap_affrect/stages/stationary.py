@@ -14,6 +14,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES
 from colmap_affrect.data import Mask
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.stationary import (
@@ -31,7 +32,6 @@ logger = logging.getLogger(__name__)
 # Of the longer side; less is no motion: scans are not cut to the pixel
 MAX_MOTION_FRAC = 0.005
 NUM_CELLS = 48  # cells along the longer side
-IMAGES_IN_MEMORY = 256  # whose keypoints are kept
 MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
@@ -100,7 +100,7 @@ class StationaryFilter:
         """Name the files; what is known of places is read now."""
         self._features = features
         self._matches = matches
-        self._points = lru_cache(IMAGES_IN_MEMORY)(self._read_points)
+        self._points = lru_cache(NUM_CACHED_IMAGES)(self._read_points)
         self._places = dict[Size, Mask]()
         self._of_still_cameras = set(matches.state.still_cameras)
         for size, cells in matches.state.stationary:
