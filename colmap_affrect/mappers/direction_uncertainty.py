@@ -17,7 +17,7 @@ from colmap_affrect.mappers.adjustment import Adjuster
 
 MAX_NUM_IMAGES = 100
 """Larger models are not looked at: the time grows with the cube of the images, and half of so many
-hardly stand at one place. It is a limit of time, other than that of ``focal_observability``."""
+hardly stand at one place."""
 NOT_HELD_DEG = 180.0
 """From this deviation on a direction may be any: what tracks tell is off by a few degrees, what
 they do not tell by thousands."""
@@ -40,6 +40,7 @@ def direction_sigmas_deg(
         the others do not exceed. Images of which it is not known are left out.
     """
     image_ids = sorted(model.reg_image_ids())
+    # A limit of time, other than that of focal_observability
     if not 3 <= len(image_ids) <= MAX_NUM_IMAGES:
         return {}
     if not all(model.images[image_id].is_ref_in_frame() for image_id in image_ids):

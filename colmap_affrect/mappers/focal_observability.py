@@ -33,8 +33,7 @@ MIN_MOVE = 0.1
 # Of a trial: three times as many change growths by 4 % at most (measured)
 NUM_ITERATIONS = 100
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once, to save time
-# Larger models have points of many images, which tell focal lengths. That is a fact of models, and
-# other than sparse.LARGE, which says how many photographs there are.
+# Larger models have points of many images, which tell focal lengths
 MAX_NUM_IMAGES = 100
 MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time
 MAX_NUM_OBSERVATIONS = 3_000
@@ -179,6 +178,7 @@ def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction
 
 
 def _is_tried(model: pycolmap.Reconstruction) -> bool:
+    # A limit of models, other than sparse.LARGE, which is one of photographs
     return model.num_reg_images() <= MAX_NUM_IMAGES and model.num_points3D() > 0
 
 

@@ -16,8 +16,8 @@ from colmap_affrect.project.outputs import remove_own
 logger = logging.getLogger(__name__)
 
 SNAPSHOT_FRAMES = 100
-"""Images between two snapshots: a distance, not a limit as ``sparse.LARGE``. A model of so many
-images is kept whatever comes after it, so that mapping can go on from a snapshot of it."""
+"""Images between two snapshots. A model of so many images is kept whatever comes after it, so that
+mapping can go on from a snapshot of it."""
 # A snapshot may be incomplete when a run is killed; the one before is complete
 NUM_KEPT = 2
 
@@ -37,6 +37,7 @@ def with_snapshots(
         folder: Of all snapshots; there is one for each task in it.
         num_images: Of the database.
     """
+    # So few images have no two snapshots; sparse.LARGE says how they are mapped
     if num_images < SNAPSHOT_FRAMES or task.extend:
         yield task
         return

@@ -37,10 +37,7 @@ NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from 
 FORWARD_MOTION = (
     "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 )
-LARGE = 100
-"""Images from which on COLMAP's own pipeline maps: the search among hypotheses would take too long.
-Other limits of so many images say other things, and may differ: of how many images models are
-(``focal_observability``, ``direction_uncertainty``), and when one is kept (``snapshots``)."""
+LARGE = 100  # images from which on COLMAP's own pipeline maps: the search would take too long
 
 logger = logging.getLogger(__name__)
 
@@ -93,6 +90,9 @@ class SparseMapper(IncrementalMapper):
                 raise KeyboardInterrupt
             show(count)
 
+        # Other limits of a hundred images say other things: how many a model has that
+        # is looked at closely (focal_observability, direction_uncertainty), and how
+        # many come between two snapshots.
         is_small = len(graph.keypoints) < LARGE and not task.extend
         if is_small:
             if FORWARD_MOTION not in self.options.mapper_options:

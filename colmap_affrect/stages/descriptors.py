@@ -29,7 +29,6 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.argument_types import checks_arguments
 
 SIFT_SIZE = 128  # values of the one kind of descriptors that whole numbers stand for
-# Of arrays of any size; a run's own features are read 40 images at a time (pairs/lists)
 IMAGES_IN_MEMORY = 60
 USUAL_FEATURES = 8000  # of an image, to tell how much there is to compare
 

@@ -19,8 +19,6 @@ from colmap_affrect.session.database_export import write_images_and_keypoints
 
 logger = logging.getLogger(__name__)
 
-# From so many images on, with 45,000 pairs, retrieval is recommended (judged). It says nothing of
-# mapping, unlike mappers/sparse.LARGE.
 MANY_IMAGES = 300
 MANY_PAIRS = (
     "all pairs of %d images are %d; --pairs retrieval matches the promising ones only "
@@ -80,6 +78,7 @@ def _list_all_pairs(context: Context, options: PairOptions, *, overwrite: bool) 
     workspace = context.workspace
     names = context.features.names()
     num_pairs = math.comb(len(names), 2)
+    # 45,000 pairs are too many to wait for; of mapping it says nothing
     if len(names) > MANY_IMAGES:
         logger.warning(MANY_PAIRS, len(names), num_pairs)
     workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
